@@ -1,0 +1,199 @@
+"""The compiled training loop: rollout, advantages, PPO update, curriculum, n times over.
+
+One program serves every chunk size, because the number of updates is an argument of it; and any
+chunk size gives the same run.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from swarmjax import curriculum as curricula
+from swarmjax import rollout
+from swarmjax.config import TrainConfig
+from swarmjax.curriculum import Curriculum, Schedule
+from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.learner import LearnerState
+from swarmjax.rollout import Ended
+from swarmjax.sim import gaps
+from swarmjax.task import env, observation
+from swarmjax.task.env import EnvState, World
+
+MAX_ROWS = 4096  # updates a call can report; a longer chunk is several calls
+
+Metrics = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """What fixes the compiled program.
+
+    Attributes:
+      config: the run's config.
+      world: the compiled environment.
+    """
+
+    config: TrainConfig
+    world: World
+
+    @property
+    def rows(self) -> int:
+        """Most updates of one call."""
+        return min(self.config.updates, MAX_ROWS)
+
+
+@struct.dataclass
+class TrainState:
+    """All that changes in a run: a checkpoint holds exactly this.
+
+    Attributes:
+      learners: [L].
+      arenas: [A], packed.
+      curriculum: where it stands.
+      key: random key of the next update.
+      update: [] updates done, int32.
+    """
+
+    learners: LearnerState
+    arenas: EnvState
+    curriculum: Curriculum
+    key: Array
+    update: Array
+
+
+def init(program: Program, schedule: Schedule) -> TrainState:
+    """Starts a run from the config's seed.
+
+    Args:
+      program: the compiled side.
+      schedule: the curriculum's numbers.
+
+    Returns:
+      The state before the first update.
+    """
+    config = program.config
+    run_key, learner_key, level_key = jax.random.split(jax.random.key(config.seed), 3)
+    curriculum = curricula.init()
+    index = curricula.assign(curriculum, config.arenas)
+    starts = rollout.draw_starts(
+        program.world, schedule.stages, index, curriculum.cohort, level_key
+    )
+    learners = jax.vmap(
+        lambda key: ppo.init(
+            key, config.algo, observation.SIZE, rollout.ACTION_SIZE, config.updates
+        )
+    )(jax.random.split(learner_key, config.learners))
+    return TrainState(
+        learners=learners,
+        arenas=starts.state,
+        curriculum=curriculum,
+        key=run_key,
+        update=jnp.zeros((), jnp.int32),
+    )
+
+
+def train_chunk(
+    program: Program, schedule: Schedule, state: TrainState, n: Array
+) -> tuple[TrainState, Metrics]:
+    """Trains for `n` updates; `jit` it with `program` bound and `state` donated.
+
+    Args:
+      program: the compiled side.
+      schedule: the curriculum's numbers.
+      state: before.
+      n: [] updates to do, at most `program.rows`, int32.
+
+    Returns:
+      The state after, and metrics with a leading axis of `program.rows`: the first n rows hold
+      an update each.
+    """
+    one = jax.eval_shape(lambda s: update(program, schedule, s)[1], state)
+    blank = jax.tree.map(lambda x: jnp.zeros((program.rows, *x.shape), x.dtype), one)
+
+    def body(i: Array, carry: tuple[TrainState, Metrics]) -> tuple[TrainState, Metrics]:
+        state, metrics = update(program, schedule, carry[0])
+        return state, jax.tree.map(lambda rows, x: rows.at[i].set(x), carry[1], metrics)
+
+    return jax.lax.fori_loop(0, n, body, (state, blank))
+
+
+def update(
+    program: Program, schedule: Schedule, state: TrainState
+) -> tuple[TrainState, Metrics]:
+    """One update: every arena drives for one rollout, the learners learn, the curriculum decides.
+
+    Args:
+      program: the compiled side.
+      schedule: the curriculum's numbers.
+      state: before.
+
+    Returns:
+      The state after, and the metrics of this update.
+    """
+    config, world = program.config, program.world
+    key, level_key, rollout_key, learn_key = jax.random.split(state.key, 4)
+    index = curricula.assign(state.curriculum, config.arenas)
+    starts = rollout.draw_starts(
+        world, schedule.stages, index, state.curriculum.cohort, level_key
+    )
+    arenas, trajectory, ended = rollout.collect(
+        world, state.learners, state.arenas, starts, rollout_key
+    )
+    batch = rollout.batch(
+        trajectory, discount=config.algo.discount, gae_lambda=config.algo.gae_lambda
+    )
+    learners, learned = jax.vmap(
+        lambda learner, b, k: ppo.update(learner, config.algo, b, k, config.updates)
+    )(state.learners, batch, jax.random.split(learn_key, config.learners))
+    counted = curricula.count(state.curriculum, ended.cohort, ended.targets, ended.reached)
+    curriculum, decision = curricula.advance(counted, schedule, state.update)
+    metrics = {
+        "update": state.update,
+        "stage": state.curriculum.stage,
+        "decision": decision.reason,
+        "decided_stage": decision.stage,
+        "stage_success": decision.success,
+        "transitions": jnp.sum(trajectory.valid, dtype=jnp.int32),
+        **{name: jnp.mean(value) for name, value in learned.items()},
+        **_episode_metrics(ended, state.curriculum.stage),
+    }
+    new = TrainState(
+        learners=learners,
+        arenas=arenas,
+        curriculum=curriculum,
+        key=key,
+        update=state.update + 1,
+    )
+    return new, metrics
+
+
+def _episode_metrics(ended: Ended, stage: Array) -> Metrics:
+    """Sums over the episodes that ended in this update on the stage that is being trained."""
+    mine = ended.stage == stage
+
+    def total(x: Array) -> Array:
+        keep = mine.reshape(mine.shape + (1,) * (x.ndim - mine.ndim))
+        return jnp.sum(jnp.where(keep, x, 0), axis=(0, 1))
+
+    contacts = total(ended.contacts)
+    return {
+        "episodes": total(ended.episodes),
+        "targets": total(ended.targets),
+        "reached": total(ended.reached),
+        "all_reached": total(ended.all_reached),
+        "episode_steps": total(ended.steps),
+        "episode_robot_steps": total(ended.robot_steps),
+        "sensed": total(ended.sensed),
+        "reward": total(ended.reward),
+        **{f"contacts_{kind}": contacts[i] for i, kind in enumerate(gaps.KINDS)},
+        "broken_arenas": jnp.sum(ended.broken),
+    }
+
+
+def load(config: TrainConfig) -> tuple[Program, Schedule]:
+    """Builds the program and the curriculum's numbers of a config."""
+    return Program(config, env.load(config)), curricula.schedule(config)

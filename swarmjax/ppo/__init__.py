@@ -1,0 +1,1 @@
+"""Proximal policy optimisation: one learner, pure functions, nothing about robots."""

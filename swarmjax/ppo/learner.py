@@ -1,0 +1,253 @@
+"""One PPO learner: its state, how it acts and how it learns.
+
+All functions are pure and serve a single learner; `jax.vmap` over state, batch and key serves L.
+G stands for groups of samples that are shuffled as one (arenas), N for the samples of a group.
+"""
+
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from swarmjax.config import AlgoConfig
+from swarmjax.ppo import losses, networks, normalizer
+from swarmjax.ppo.losses import Metrics, Minibatch
+from swarmjax.ppo.networks import Params
+from swarmjax.ppo.normalizer import Normalizer
+
+# Huang et al. 2022, "The 37 Implementation Details of Proximal Policy Optimization":
+# bound of normalised observations, continuous-action detail 7, and Adam's epsilon, core detail 3.
+_OBSERVATION_LIMIT = 10.0
+_ADAM_EPSILON = 1e-5
+_ADVANTAGE_EPSILON = 1e-8
+
+_Progress = tuple[Params, optax.OptState]
+
+
+@struct.dataclass(kw_only=True)
+class LearnerState:
+    """All that a learner remembers.
+
+    Attributes:
+        params: `{"actor": .., "critic": ..}`.
+        optimizer_state: Of the optimiser that `init` was given.
+        normalizer: Moments of the valid observations of all updates so far.
+    """
+
+    params: Params
+    optimizer_state: optax.OptState
+    normalizer: Normalizer
+
+
+@struct.dataclass(kw_only=True)
+class Batch:
+    """What one update learns from. Invalid samples may hold anything, NaN included.
+
+    Attributes:
+        observation: [G, N, O], raw.
+        action: [G, N, U], as drawn.
+        log_prob: [G, N], as `act` returned it.
+        advantage: [G, N], not normalised.
+        return_: [G, N], target of the critic.
+        valid: [G, N], bool or 0/1.
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    advantage: jax.Array
+    return_: jax.Array
+    valid: jax.Array
+
+
+def init(
+    key: jax.Array, config: AlgoConfig, observation_size: int, action_size: int, updates: int
+) -> LearnerState:
+    """Makes a learner that has seen nothing.
+
+    Args:
+        key: Random key, consumed.
+        config: Of networks and optimiser.
+        observation_size: O.
+        action_size: U.
+        updates: Number of updates of the whole run, at least 1: the learning rate's horizon.
+
+    Returns:
+        The learner's first state.
+    """
+    params = networks.init_params(key, config, observation_size, action_size)
+    return LearnerState(
+        params=params,
+        optimizer_state=_optimizer(config, updates).init(params),
+        normalizer=normalizer.init(observation_size),
+    )
+
+
+def normalize(learner: LearnerState, observation: jax.Array) -> jax.Array:
+    """Normalises raw observations [..., O] to what the networks take, within +-10."""
+    return normalizer.normalize(learner.normalizer, observation, _OBSERVATION_LIMIT)
+
+
+def act(
+    learner: LearnerState, config: AlgoConfig, observation: jax.Array, noise: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Draws actions from the policy.
+
+    Args:
+        learner: Whose policy.
+        config: The config that made the learner.
+        observation: [..., O], raw.
+        noise: [..., U], standard normal.
+
+    Returns:
+        The action mean + std * noise, [..., U], unbounded, and its log density, [...].
+    """
+    mean, std = networks.action_distribution(
+        learner.params, config, normalize(learner, observation)
+    )
+    chex.assert_equal_shape([mean, noise])
+    action = mean + std * noise
+    return action, networks.log_prob(mean, std, action)
+
+
+def mode(learner: LearnerState, config: AlgoConfig, observation: jax.Array) -> jax.Array:
+    """Returns the policy's most likely action, [..., U], for raw observations, [..., O]."""
+    mean, _ = networks.action_distribution(learner.params, config, normalize(learner, observation))
+    return mean
+
+
+def values(learner: LearnerState, config: AlgoConfig, observation: jax.Array) -> jax.Array:
+    """Returns the critic's expected discounted return, [...], for raw observations, [..., O]."""
+    return networks.value(learner.params, config, normalize(learner, observation))
+
+
+def update(
+    learner: LearnerState, config: AlgoConfig, batch: Batch, key: jax.Array, updates: int
+) -> tuple[LearnerState, Metrics]:
+    """Learns from one batch: `config.epochs` passes in `config.minibatches` steps each.
+
+    The batch's observations were normalised, and its log densities computed, by the normalizer as
+    it is before this update. All epochs keep to that one, so that the ratio of new to old density
+    starts at 1; only then does the normalizer take in the batch. A minibatch without a
+    valid sample is no step: it moves neither the parameters nor the learning rate's schedule.
+
+    Args:
+        learner: State before.
+        config: The config that made the learner.
+        batch: G groups of N samples; `config.minibatches` divides G.
+        key: Random key, consumed.
+        updates: As given to `init`.
+
+    Returns:
+        The state after, and metrics, each []: those of `losses.ppo_loss` and `grad_norm` (before
+        clipping), as means over all minibatches, and the policy's mean `std` after the update.
+    """
+    _check(config, batch)
+    samples = _samples(learner, batch)
+    expected_valid = jnp.sum(samples.valid) / config.minibatches
+    step = functools.partial(_step, config, updates, expected_valid)
+    epoch = functools.partial(_epoch, config, step, samples)
+    (params, optimizer_state), metrics = jax.lax.scan(
+        epoch, (learner.params, learner.optimizer_state), jax.random.split(key, config.epochs)
+    )
+    metrics = {name: jnp.mean(metric) for name, metric in metrics.items()}
+    metrics["std"] = jnp.mean(jnp.exp(params["actor"]["log_std"]))
+    moments = normalizer.update(learner.normalizer, batch.observation, batch.valid)
+    return LearnerState(params=params, optimizer_state=optimizer_state, normalizer=moments), metrics
+
+
+def _optimizer(config: AlgoConfig, updates: int) -> optax.GradientTransformation:
+    """One clip over all gradients, then Adam with a learning rate for each network."""
+    steps = updates * config.epochs * config.minibatches
+
+    def adam(learning_rate: float) -> optax.GradientTransformation:
+        schedule = {
+            "constant": optax.constant_schedule(learning_rate),
+            "linear": optax.linear_schedule(learning_rate, 0.0, steps),
+        }[config.learning_rate_schedule]
+        return optax.adam(schedule, eps=_ADAM_EPSILON)
+
+    return optax.chain(
+        optax.clip_by_global_norm(config.max_grad_norm),
+        optax.partition(
+            {
+                "actor": adam(config.actor_learning_rate),
+                "critic": adam(config.critic_learning_rate),
+            },
+            {"actor": "actor", "critic": "critic"},
+        ),
+    )
+
+
+def _check(config: AlgoConfig, batch: Batch) -> None:
+    chex.assert_rank([batch.observation, batch.action], 3)
+    chex.assert_rank([batch.valid], 2)
+    chex.assert_equal_shape([batch.log_prob, batch.advantage, batch.return_, batch.valid])
+    chex.assert_equal_shape_prefix([batch.observation, batch.action, batch.valid], 2)
+    chex.assert_is_divisible(batch.valid.shape[0], config.minibatches)
+
+
+def _samples(learner: LearnerState, batch: Batch) -> Minibatch:
+    """What the loss takes, still [G, N, ...]: normalised, and zero where not valid."""
+    valid = batch.valid.astype(bool)
+    samples = Minibatch(
+        observation=normalize(learner, batch.observation),
+        action=batch.action,
+        log_prob=batch.log_prob,
+        advantage=_normalize_advantages(batch.advantage, valid),
+        return_=batch.return_,
+        valid=valid,
+    )
+    # A NaN in an invalid sample would pass through the networks into every gradient.
+    return jax.tree.map(
+        lambda x: jnp.where(valid.reshape(valid.shape + (1,) * (x.ndim - 2)), x, 0), samples
+    )
+
+
+def _normalize_advantages(advantage: jax.Array, valid: jax.Array) -> jax.Array:
+    """Advantages with mean 0 and standard deviation 1 over the valid samples, [G, N]."""
+    count = jnp.maximum(jnp.sum(valid), 1)
+    mean = jnp.sum(jnp.where(valid, advantage, 0.0)) / count
+    variance = jnp.sum(jnp.where(valid, (advantage - mean) ** 2, 0.0)) / count
+    return (advantage - mean) / (jnp.sqrt(variance) + _ADVANTAGE_EPSILON)
+
+
+def _epoch(
+    config: AlgoConfig,
+    step: functools.partial[tuple[_Progress, Metrics]],
+    samples: Minibatch,
+    progress: _Progress,
+    key: jax.Array,
+) -> tuple[_Progress, Metrics]:
+    """One pass over all samples. Whole groups are shuffled: rows to gather, not single samples."""
+    groups = samples.valid.shape[0]
+    order = jax.random.permutation(key, groups).reshape(config.minibatches, -1)
+
+    def learn(progress: _Progress, rows: jax.Array) -> tuple[_Progress, Metrics]:
+        minibatch = jax.tree.map(lambda x: x[rows].reshape(-1, *x.shape[2:]), samples)
+        return step(progress, minibatch)
+
+    return jax.lax.scan(learn, progress, order)
+
+
+def _step(
+    config: AlgoConfig,
+    updates: int,
+    expected_valid: jax.Array,
+    progress: _Progress,
+    minibatch: Minibatch,
+) -> tuple[_Progress, Metrics]:
+    """One step of the optimiser; none at all if no sample is valid."""
+    params, optimizer_state = progress
+    gradient, metrics = jax.grad(losses.ppo_loss, has_aux=True)(
+        params, minibatch, config, expected_valid
+    )
+    metrics["grad_norm"] = optax.tree.norm(gradient)
+    steps, stepped_state = _optimizer(config, updates).update(gradient, optimizer_state, params)
+    stepped = (optax.apply_updates(params, steps), stepped_state)
+    # Adam moves by its momentum even where the gradient is zero.
+    any_valid = jnp.any(minibatch.valid)
+    return jax.tree.map(lambda new, old: jnp.where(any_valid, new, old), stepped, progress), metrics

@@ -1,0 +1,93 @@
+"""The PPO loss of one minibatch, B samples of which some may be invalid."""
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from swarmjax.config import AlgoConfig
+from swarmjax.ppo import networks
+from swarmjax.ppo.networks import Params
+
+Metrics = dict[str, jax.Array]
+
+
+@struct.dataclass(kw_only=True)
+class Minibatch:
+    """Samples to learn from. Invalid ones must be finite; they count for nothing.
+
+    Attributes:
+        observation: [B, O], normalised.
+        action: [B, U], as drawn.
+        log_prob: [B], of the action under the policy that drew it.
+        advantage: [B].
+        return_: [B], target of the critic.
+        valid: [B], bool or 0/1.
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    advantage: jax.Array
+    return_: jax.Array
+    valid: jax.Array
+
+
+def ppo_loss(
+    params: Params, minibatch: Minibatch, config: AlgoConfig, expected_valid: jax.Array
+) -> tuple[jax.Array, Metrics]:
+    """Computes the loss to minimise: policy + value_cost * value - entropy_cost * entropy.
+
+    Policy: the clipped surrogate of Schulman et al. 2017, "Proximal Policy Optimization
+    Algorithms", equation 7, negated. Value: half the squared error against the return, not
+    clipped (Andrychowicz et al. 2021, "What Matters in On-Policy Reinforcement Learning?", section
+    3.4: clipping it hurts). Each term is a
+    sum over the valid samples divided by `expected_valid`, so that every valid sample of a batch
+    weighs the same however unevenly its minibatches are filled, and the mean over the minibatches
+    is exactly the mean over the batch.
+
+    Args:
+        params: Of actor and critic.
+        minibatch: B samples.
+        config: Clip range and costs.
+        expected_valid: [], valid samples of the whole batch / number of minibatches; taken as 1
+            if less.
+
+    Returns:
+        The loss [] and its parts, each [] and weighted in the same way: `policy_loss`,
+        `value_loss`, `entropy` (nats), `approx_kl` (nats, at least 0) and `clip_fraction` (0..1).
+    """
+    chex.assert_rank([minibatch.observation, minibatch.action], 2)
+    chex.assert_rank(
+        [minibatch.log_prob, minibatch.advantage, minibatch.return_, minibatch.valid], 1
+    )
+    valid = minibatch.valid.astype(bool)
+
+    def mean(samples: jax.Array) -> jax.Array:
+        return jnp.sum(jnp.where(valid, samples, 0.0)) / jnp.maximum(expected_valid, 1.0)
+
+    action_mean, std = networks.action_distribution(params, config, minibatch.observation)
+    log_prob = networks.log_prob(action_mean, std, minibatch.action)
+    # Masked before exp: an overflow there would turn the zero gradient of a mask into NaN.
+    log_ratio = jnp.where(valid, log_prob - minibatch.log_prob, 0.0)
+    ratio = jnp.exp(log_ratio)
+    value = networks.value(params, config, minibatch.observation)
+    metrics = {
+        "policy_loss": -mean(_clipped_surrogate(ratio, minibatch.advantage, config.clip)),
+        "value_loss": mean(0.5 * (value - minibatch.return_) ** 2),
+        "entropy": mean(networks.entropy(std)),
+        # Unbiased and never negative: Schulman 2020, "Approximating KL Divergence", estimator k3.
+        "approx_kl": mean(ratio - 1.0 - log_ratio),
+        "clip_fraction": mean(jnp.abs(ratio - 1.0) > config.clip),
+    }
+    loss = (
+        metrics["policy_loss"]
+        + config.value_cost * metrics["value_loss"]
+        - config.entropy_cost * metrics["entropy"]
+    )
+    return loss, metrics
+
+
+def _clipped_surrogate(ratio: jax.Array, advantage: jax.Array, clip: float) -> jax.Array:
+    clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
+    return jnp.minimum(ratio * advantage, clipped * advantage)

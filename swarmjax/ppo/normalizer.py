@@ -1,0 +1,93 @@
+"""Running mean and variance of observations.
+
+Not Brax's `running_statistics`: importing that loads MuJoCo, MJX and Warp into code that knows
+nothing of robots, and a first batch without a valid sample (a learner whose robot is absent from
+the first stage) makes it divide 0 by 0.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+# An observation that has hardly moved so far is magnified by at most 1 / this.
+_MIN_STD = 1e-3
+
+
+@struct.dataclass(kw_only=True)
+class Normalizer:
+    """Mean and variance of the observations seen so far.
+
+    Attributes:
+        count: [], float32, number of observations. Beyond 2**24 it rounds, which is harmless:
+            it only weighs a batch against the past, and a relative error of 2**-24 is nothing.
+        mean: [O].
+        variance: [O], of the population; 1 before the first observation.
+    """
+
+    count: jax.Array
+    mean: jax.Array
+    variance: jax.Array
+
+    @property
+    def std(self) -> jax.Array:
+        """Standard deviation to divide by, [O], at least 1e-3."""
+        return jnp.maximum(jnp.sqrt(self.variance), _MIN_STD)
+
+
+def init(observation_size: int) -> Normalizer:
+    """Returns a normalizer that has seen nothing and changes nothing."""
+    return Normalizer(
+        count=jnp.zeros((), jnp.float32),
+        mean=jnp.zeros((observation_size,), jnp.float32),
+        variance=jnp.ones((observation_size,), jnp.float32),
+    )
+
+
+def update(normalizer: Normalizer, observation: jax.Array, valid: jax.Array) -> Normalizer:
+    """Takes a batch of observations in.
+
+    Merges the moments of two sets as in Chan, Golub and LeVeque 1983, "Algorithms for Computing
+    the Sample Variance: Analysis and Recommendations". The batch's own moments are taken in two
+    passes, so nothing is lost to the subtraction of large squares.
+
+    Args:
+        normalizer: Moments so far.
+        observation: [..., O]; may hold anything, NaN included, where not valid.
+        valid: [...], bool or 0/1, the observations to count.
+
+    Returns:
+        The moments of all observations; the same as before if none is valid.
+    """
+    chex.assert_shape(observation, (*valid.shape, *normalizer.mean.shape))
+    axes = tuple(range(valid.ndim))
+    keep = valid.astype(bool)[..., None]
+    batch_count = jnp.sum(keep, dtype=jnp.float32)
+    divisor = jnp.maximum(batch_count, 1.0)
+    batch_mean = jnp.sum(jnp.where(keep, observation, 0.0), axis=axes) / divisor
+    deviation = jnp.where(keep, observation - batch_mean, 0.0)
+    batch_variance = jnp.sum(deviation**2, axis=axes) / divisor
+
+    count = normalizer.count + batch_count
+    share = batch_count / jnp.maximum(count, 1.0)
+    shift = batch_mean - normalizer.mean
+    return Normalizer(
+        count=count,
+        mean=normalizer.mean + share * shift,
+        variance=(1.0 - share) * (normalizer.variance + share * shift**2) + share * batch_variance,
+    )
+
+
+def normalize(normalizer: Normalizer, observation: jax.Array, limit: float) -> jax.Array:
+    """Shifts and scales observations to mean 0 and standard deviation 1.
+
+    Args:
+        normalizer: Moments so far.
+        observation: [..., O].
+        limit: Bound of the result's magnitude.
+
+    Returns:
+        The normalised observations, [..., O], within plus or minus `limit`.
+    """
+    chex.assert_axis_dimension(observation, -1, normalizer.mean.shape[-1])
+    return jnp.clip((observation - normalizer.mean) / normalizer.std, -limit, limit)

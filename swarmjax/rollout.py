@@ -1,0 +1,297 @@
+"""Arenas times policy: many arenas driven by the learners for one rollout.
+
+Here, and only here, arenas and robots are laid out for the learners: [A, R, ...] becomes
+[L, A, N, ...], with N the robots of an arena that one learner drives.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from swarmjax.ppo import gae
+from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.learner import Batch, LearnerState
+from swarmjax.sim import physics
+from swarmjax.task import env, level, observation
+from swarmjax.task import stage as task_stage
+from swarmjax.task.env import EnvState, World
+from swarmjax.task.stage import Stage
+
+ACTION_SIZE = 2
+
+
+class Starts(NamedTuple):
+    """An episode that waits for each arena: its level is drawn once a rollout, not at every step.
+
+    An arena that ends two episodes in one rollout begins the second and third on the same level.
+
+    Attributes:
+      state: [A], packed.
+      observation: [A, R, O].
+    """
+
+    state: EnvState
+    observation: Array
+
+
+class Trajectory(NamedTuple):
+    """What the learners did and what came of it, [T, L, A, N, ...].
+
+    Attributes:
+      observation: [.., O], raw.
+      action: [.., U].
+      log_prob: of the action.
+      value: of the observation.
+      next_value: of the observation after the step, before any reset.
+      reward: of the step.
+      terminated: the robot arrived in this step.
+      truncated: the time ran out for the robot.
+      valid: a transition to learn from.
+    """
+
+    observation: Array
+    action: Array
+    log_prob: Array
+    value: Array
+    next_value: Array
+    reward: Array
+    terminated: Array
+    truncated: Array
+    valid: Array
+
+
+class Ended(NamedTuple):
+    """Episodes that ended, [T, A, ...], zero where none did.
+
+    Attributes:
+      episodes: 1 where one ended.
+      stage: on which it began.
+      cohort: in which it began; -1 where none ended.
+      targets: robots that took part.
+      reached: robots that arrived.
+      all_reached: 1 where every robot arrived.
+      steps: control steps.
+      robot_steps: control steps before arrival, over all robots.
+      sensed: those with an infrared ray shorter than its range.
+      contacts: [.., 3] of each kind, over all robots.
+      reward: sum over all robots, nothing discounted.
+      broken: 1 where it ended because the physics was no longer finite.
+    """
+
+    episodes: Array
+    stage: Array
+    cohort: Array
+    targets: Array
+    reached: Array
+    all_reached: Array
+    steps: Array
+    robot_steps: Array
+    sensed: Array
+    contacts: Array
+    reward: Array
+    broken: Array
+
+
+def to_learners(x: Array, learners: int) -> Array:
+    """Lays [A, R, ...] out as [L, A, N, ...]."""
+    if learners == 1:
+        return x[None]
+    return jnp.moveaxis(x, 1, 0)[:, :, None]
+
+
+def to_arenas(x: Array) -> Array:
+    """Lays [L, A, N, ...] out as [A, R, ...] again."""
+    if x.shape[0] == 1:
+        return x[0]
+    return jnp.moveaxis(x[:, :, 0], 0, 1)
+
+
+def draw_starts(world: World, stages: Stage, index: Array, cohort: Array, key: Array) -> Starts:
+    """Draws a fresh level for every arena.
+
+    Args:
+      world: the compiled environment.
+      stages: [S].
+      index: [A] stage of each arena's next episode.
+      cohort: [] the curriculum's cohort.
+      key: random key, consumed.
+
+    Returns:
+      The episodes that wait.
+    """
+    uniforms = jax.random.uniform(key, (*index.shape, level.uniform_count(world.spacing)))
+    stages = jax.tree.map(jnp.asarray, stages)
+
+    def start(uniform: Array, i: Array) -> tuple[EnvState, Array]:
+        drawn = level.sample(uniform, task_stage.select(stages, i), world.spacing, jnp)
+        return env.reset(world, drawn, i, cohort)
+
+    return Starts(*jax.vmap(start)(uniforms, index))
+
+
+def collect(
+    world: World, learners: LearnerState, arenas: EnvState, starts: Starts, key: Array
+) -> tuple[EnvState, Trajectory, Ended]:
+    """Drives all arenas for one rollout; an arena whose episode ends takes the one that waits.
+
+    Args:
+      world: the compiled environment.
+      learners: [L].
+      arenas: [A], packed.
+      starts: [A] episodes that wait.
+      key: random key, consumed.
+
+    Returns:
+      The arenas, packed; the trajectory; the episodes that ended.
+    """
+    axes = env.axes(world)
+    unpack = functools.partial(physics.unpack, world.physics)
+    step = functools.partial(_step, world, learners, axes, starts, _values(world, learners, starts.observation))
+    arenas = arenas.replace(sim=jax.vmap(unpack, out_axes=axes.sim)(arenas.sim))
+    seen = jax.vmap(functools.partial(env.observe, world), in_axes=(axes,))(arenas)
+    carry = (arenas, seen, _values(world, learners, seen))
+    keys = jax.random.split(key, world.config.algo.rollout)
+    (arenas, _, _), (trajectory, ended) = jax.lax.scan(step, carry, keys)
+    packed = jax.vmap(physics.pack, in_axes=(axes.sim,))(arenas.sim)
+    return arenas.replace(sim=packed), trajectory, ended
+
+
+def batch(trajectory: Trajectory, *, discount: float, gae_lambda: float) -> Batch:
+    """Turns a rollout into what the learners learn from.
+
+    Args:
+      trajectory: [T, L, A, N, ...].
+      discount: per control step.
+      gae_lambda: 0..1.
+
+    Returns:
+      [L] batches of A groups of T * N samples.
+    """
+    advantages, returns = gae.generalized_advantages(
+        trajectory.reward,
+        trajectory.value,
+        trajectory.next_value,
+        trajectory.terminated,
+        trajectory.truncated,
+        discount=discount,
+        gae_lambda=gae_lambda,
+    )
+
+    def group(x: Array) -> Array:
+        x = jnp.moveaxis(x, 0, 2)
+        return x.reshape(*x.shape[:2], -1, *x.shape[4:])
+
+    return Batch(
+        observation=group(trajectory.observation),
+        action=group(trajectory.action),
+        log_prob=group(trajectory.log_prob),
+        advantage=group(advantages),
+        return_=group(returns),
+        valid=group(trajectory.valid),
+    )
+
+
+_Carry = tuple[EnvState, Array, Array]
+
+
+def _step(
+    world: World,
+    learners: LearnerState,
+    axes: EnvState,
+    starts: Starts,
+    start_value: Array,
+    carry: _Carry,
+    key: Array,
+) -> tuple[_Carry, tuple[Trajectory, Ended]]:
+    """One control step of all arenas."""
+    arenas, seen, value = carry
+    count = value.shape[0]
+    mine = to_learners(seen, count)
+    noise = jax.random.normal(key, (*mine.shape[:-1], ACTION_SIZE))
+    act = functools.partial(ppo.act, config=world.config.algo)
+    action, log_prob = jax.vmap(lambda l, o, n: act(l, observation=o, noise=n))(
+        learners, mine, noise
+    )
+    drive_on = functools.partial(env.step, world)
+    arenas, came = jax.vmap(drive_on, in_axes=(axes, 0), out_axes=(axes, 0))(
+        arenas, to_arenas(action)
+    )
+    next_value = _values(world, learners, came.observation)
+    ended = _ended(arenas, came)
+    arenas = restart(arenas, starts.state, came.done)
+    seen = _pick(came.done, starts.observation, came.observation)
+    over = jnp.broadcast_to(came.done[None, :, None], next_value.shape)
+    transition = Trajectory(
+        observation=mine,
+        action=action,
+        log_prob=log_prob,
+        value=value,
+        next_value=next_value,
+        reward=to_learners(came.reward, count),
+        terminated=to_learners(came.terminated, count),
+        truncated=to_learners(came.truncated, count),
+        valid=to_learners(came.valid, count),
+    )
+    return (arenas, seen, jnp.where(over, start_value, next_value)), (transition, ended)
+
+
+def _values(world: World, learners: LearnerState, seen: Array) -> Array:
+    """Values [L, A, N] of observations [A, R, O]."""
+    count = jax.tree.leaves(learners)[0].shape[0]
+    value = functools.partial(ppo.values, config=world.config.algo)
+    return jax.vmap(lambda l, o: value(l, observation=o))(learners, to_learners(seen, count))
+
+
+def restart(arenas: EnvState, starts: EnvState, done: Array) -> EnvState:
+    """Puts the waiting episode in the place of one that is over.
+
+    Args:
+      arenas: [A], `sim` an `mjx.Data`.
+      starts: [A], packed.
+      done: [A].
+
+    Returns:
+      The arenas, `sim` an `mjx.Data`: of that only what is physically the state is replaced.
+    """
+    packed = physics.PhysicsState(
+        arenas.sim.qpos, arenas.sim.qvel, arenas.sim.qacc_warmstart
+    )
+    chosen = _pick(done, starts, arenas.replace(sim=packed))
+    return chosen.replace(sim=arenas.sim.replace(**chosen.sim._asdict()))
+
+
+def _pick[Tree](done: Array, yes: Tree, no: Tree) -> Tree:
+    """Chooses by arena, whatever axes follow."""
+
+    def pick(a: Array, b: Array) -> Array:
+        return jnp.where(done.reshape(done.shape + (1,) * (b.ndim - done.ndim)), a, b)
+
+    return jax.tree.map(pick, yes, no)
+
+
+def _ended(arenas: EnvState, came: env.TimeStep) -> Ended:
+    """Sums up the episodes that ended in this step, [A]."""
+    done, episode = came.done, arenas.episode
+    present = arenas.level.present
+    targets, reached = jnp.sum(present, axis=-1), jnp.sum(present & arenas.arrived, axis=-1)
+
+    def mine(x: Array) -> Array:
+        return _pick(done, x, jnp.zeros_like(x))
+
+    return Ended(
+        episodes=done.astype(jnp.int32),
+        stage=mine(arenas.stage),
+        cohort=jnp.where(done, arenas.cohort, -1),
+        targets=mine(targets),
+        reached=mine(reached),
+        all_reached=mine((reached == targets).astype(jnp.int32)),
+        steps=mine(arenas.clock),
+        robot_steps=mine(jnp.sum(episode.moving, axis=-1)),
+        sensed=mine(jnp.sum(episode.sensed, axis=-1)),
+        contacts=mine(jnp.sum(episode.contacts, axis=-2)),
+        reward=mine(jnp.sum(episode.reward, axis=-1)),
+        broken=(~came.sound).astype(jnp.int32),
+    )

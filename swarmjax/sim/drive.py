@@ -1,0 +1,80 @@
+"""Differential drive: from a policy's action to wheel speeds and to the motion they make."""
+
+from typing import Any, NamedTuple
+
+from swarmjax.config import RobotConfig
+
+Array = Any
+
+
+class Drive(NamedTuple):
+    """The numbers of a differential drive.
+
+    Attributes:
+      wheel_radius: m.
+      track: distance between the wheels, m.
+      max_wheel_speed: rad/s, of each wheel.
+      max_speed: upper end of the commanded forward speed (the lower end is 0), m/s.
+      max_turn_rate: the commanded turn rate lies in plus or minus this, rad/s.
+    """
+
+    wheel_radius: float
+    track: float
+    max_wheel_speed: float
+    max_speed: float
+    max_turn_rate: float
+
+
+def from_config(robot: RobotConfig) -> Drive:
+    """Takes the drive's numbers out of the robot's config."""
+    return Drive(*(getattr(robot, name) for name in Drive._fields))
+
+
+def command(action: Array, drive: Drive, xp: Any) -> Array:
+    """Scales an action to a command, clipping it to -1..1 first.
+
+    Args:
+      action: [..., 2], any real number; -1..1 spans the command's range.
+      drive: the drive.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [..., 2] forward speed (m/s, 0..max_speed) and turn rate (rad/s, within +-max_turn_rate).
+    """
+    action = xp.clip(action, -1.0, 1.0)
+    speed = (action[..., 0] + 1.0) * (0.5 * drive.max_speed)
+    return xp.stack([speed, action[..., 1] * drive.max_turn_rate], axis=-1)
+
+
+def wheel_speeds(command: Array, drive: Drive, xp: Any) -> Array:
+    """Wheel speeds of a command, each wheel clamped to its own limit.
+
+    The robot clamps each wheel separately, so a fast command loses its turn first: above
+    v = 0.2072 m/s nothing is left of it.
+
+    Args:
+      command: [..., 2] forward speed (m/s) and turn rate (rad/s).
+      drive: the drive.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [..., 2] left and right wheel speed, rad/s, within +-max_wheel_speed.
+    """
+    half_turn = command[..., 1] * (0.5 * drive.track)
+    speeds = xp.stack([command[..., 0] - half_turn, command[..., 0] + half_turn], axis=-1)
+    return xp.clip(speeds / drive.wheel_radius, -drive.max_wheel_speed, drive.max_wheel_speed)
+
+
+def body_velocity(wheels: Array, drive: Drive, xp: Any) -> Array:
+    """Velocity of the body that rolls on these wheels without slip.
+
+    Args:
+      wheels: [..., 2] left and right wheel speed, rad/s.
+      drive: the drive.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [..., 2] forward speed (m/s) and turn rate (rad/s).
+    """
+    left, right = wheels[..., 0] * drive.wheel_radius, wheels[..., 1] * drive.wheel_radius
+    return xp.stack([0.5 * (left + right), (right - left) / drive.track], axis=-1)

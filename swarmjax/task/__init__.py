@@ -1,0 +1,1 @@
+"""The navigation task of one arena: stages, levels, observation, reward, environment."""

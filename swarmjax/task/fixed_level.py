@@ -1,0 +1,63 @@
+"""The paper's fixed level: the same starts, targets and obstacles at every reset.
+
+The paper gives no coordinates. These restate the published example that its task comes from
+(deepworlds, find_and_avoid: a 0.7 m arena, one robot from (-0.26, 0.27) facing +x to (0.26,
+-0.23), a fence of 0.50 x 0.06 m centred on (-0.10, 0.16)), scaled with the arena, with the swarm
+in a row at the start and the targets clustered, 0.1 m apart, on the far side.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from swarmjax.task.stage import FENCE_HALF_LENGTH, Stage
+
+Array = Any
+
+EXAMPLE_SIDE = 0.7  # m; deepworlds find_and_avoid
+START = (-0.26, 0.27)  # m, in the example's arena
+TARGET = (0.26, -0.23)  # m, likewise
+FENCE = (-0.10, 0.16)  # m, centre, likewise
+FENCE_HALF_WIDTH = 0.03  # m; not scaled, as the wall of a real arena would not be
+BOX_HALF = 0.05  # m; the 0.1 m boxes of the stock e-puck world
+SPACING = 0.1  # m; between starts, and between targets: wider than a robot
+# Centres of the boxes in the example's arena, in the order in which they appear: between starts
+# and targets, at least 0.10 m clear of each other in arenas of 1 m and more. This project's own.
+BOXES = ((0.0, 0.02), (-0.17, -0.12), (0.17, 0.1), (0.02, -0.2))
+
+
+def most_robots(side: float) -> int:
+    """How many robots the row of starts holds in an arena of `side` m."""
+    scale = side / EXAMPLE_SIDE
+    return 1 + int((0.5 * side - 0.06 - START[0] * scale) // SPACING)
+
+
+def starts(robots: int, side: Array, xp: Any) -> Array:
+    """Returns starts [robots, 3]: a row along the upper wall, facing +x."""
+    scale = side / EXAMPLE_SIDE
+    row = SPACING * np.arange(robots, dtype=np.float32)
+    x = START[0] * scale + row
+    return xp.stack([x, xp.zeros_like(x) + START[1] * scale, xp.zeros_like(x)], axis=-1)
+
+
+def targets(robots: int, side: Array, xp: Any) -> Array:
+    """Returns targets [robots, 2]: columns of two, from the far corner back along the wall."""
+    scale = side / EXAMPLE_SIDE
+    index = np.arange(robots)
+    back = (SPACING * (index // 2)).astype(np.float32)
+    up = (SPACING * (index % 2)).astype(np.float32)
+    return xp.stack([TARGET[0] * scale - back, TARGET[1] * scale + up], axis=-1)
+
+
+def obstacles(count: int, stage: Stage, xp: Any) -> Array:
+    """Returns obstacles [count, 5]: the fence, or boxes, by the stage's layout."""
+    if not count:
+        return xp.zeros((0, 5), dtype=xp.float32)
+    scale = stage.side / EXAMPLE_SIDE
+    centres = np.resize(np.array(BOXES, np.float32), (count, 2))
+    one = xp.ones_like(xp.asarray(centres[:, 0]))
+    boxes = [centres[:, 0] * scale, centres[:, 1] * scale, 0 * one, BOX_HALF * one, BOX_HALF * one]
+    half_length = FENCE_HALF_LENGTH * stage.side
+    fence = [FENCE[0] * scale, FENCE[1] * scale, 0.0, half_length, FENCE_HALF_WIDTH]
+    fence = xp.stack([xp.asarray(value, dtype=xp.float32) for value in fence])
+    return xp.where(stage.fence, fence * one[:, None], xp.stack(boxes, axis=-1))

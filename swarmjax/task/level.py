@@ -1,0 +1,230 @@
+"""Levels: what an episode starts from, drawn at a fixed cost from an array of uniform numbers.
+
+Code takes the array module, so that NumPy and JAX draw the same level from the same numbers.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from swarmjax.task import fixed_level
+from swarmjax.task.placement import (
+    UNITS,
+    Gap,
+    lattice,
+    metres,
+    place,
+    score_things,
+    score_walls,
+    units,
+)
+from swarmjax.task.stage import Stage
+
+Array = Any
+
+PARKING = 5.0  # m; where absent robots and obstacles wait, outside the walls of any arena
+PARKING_SPACING = 0.5  # m
+PASSAGE = 0.10  # m; between obstacles, and between an obstacle and a wall: wider than a robot
+MARGIN = 0.02  # m; least free space beside anything at the start
+
+
+class Level(NamedTuple):
+    """Everything that an episode starts from.
+
+    Attributes:
+      side: [] of the arena, m.
+      present: [R] whether the robot takes part.
+      start: [R, 3] x (m), y (m), yaw (rad).
+      target: [R, 2] x (m), y (m).
+      obstacle_present: [M] whether the obstacle is there.
+      obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
+    """
+
+    side: Array
+    present: Array
+    start: Array
+    target: Array
+    obstacle_present: Array
+    obstacle: Array
+
+
+class Spacing(NamedTuple):
+    """Sizes that a level is drawn with, fixed for a program.
+
+    Attributes:
+      robots: largest number of robots, R.
+      obstacles: largest number of obstacles, M.
+      hull_radius: m.
+      target_radius: within which a robot has arrived, m.
+    """
+
+    robots: int
+    obstacles: int
+    hull_radius: float
+    target_radius: float
+
+
+class _Uniforms(NamedTuple):
+    """The uniform numbers by their use: [2], [M] or [R] each."""
+
+    obstacle_shift: Array
+    target_shift: Array
+    start_shift: Array
+    obstacle: Array
+    obstacle_yaw: Array
+    target: Array
+    start: Array
+    heading: Array
+
+
+class _Obstacles(NamedTuple):
+    """Obstacles already placed: centres [M, 2] (units), presence [M], outer radius [] (units)."""
+
+    centre: Array
+    there: Array
+    radius: Array
+
+
+def uniform_count(spacing: Spacing) -> int:
+    """How many uniform numbers a level takes."""
+    return 6 + 2 * spacing.obstacles + 3 * spacing.robots
+
+
+def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
+    """Draws a level of a stage.
+
+    Random levels place obstacles, then targets, then starts. None overlap. Obstacles are
+    `PASSAGE` clear of each other and of the walls, and one that finds no such place is left out.
+    Targets are so far apart and so clear of obstacles, where the arena has room, that a robot
+    gets past any two that have arrived: every target stays reachable in any order of arrival.
+
+    Args:
+      uniforms: [uniform_count(spacing)] float32 in [0, 1).
+      stage: fields [].
+      spacing: sizes.
+      xp: `numpy` or `jax.numpy`; both draw the same level.
+
+    Returns:
+      The level; what is absent is parked outside.
+    """
+    drawn = _split(uniforms, spacing)
+    random = _random(drawn, stage, spacing, xp)
+    fixed = _fixed(stage, spacing, xp)
+    level = [xp.where(stage.fixed, f, r) for f, r in zip(fixed, random, strict=True)]
+    return _park(Level(*level), xp)
+
+
+def _split(uniforms: Array, spacing: Spacing) -> _Uniforms:
+    """Deals the uniform numbers out."""
+    many, few = spacing.obstacles, spacing.robots
+    ends = np.cumsum([2, 2, 2, many, many, few, few, few])
+    starts = [0, *ends[:-1]]
+    return _Uniforms(*(uniforms[a:b] for a, b in zip(starts, ends, strict=True)))
+
+
+def _random(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
+    """Places obstacles, then targets, then starts at random."""
+    side = units(stage.side, xp)
+    present = xp.arange(spacing.robots) < stage.robots
+    around = _place_obstacles(drawn, stage, side, xp)
+    target = _place_targets(drawn, around, present, spacing, side, xp)
+    start = _place_starts(drawn, around, target, present, spacing, side, xp)
+    yaw = (drawn.heading * 2.0 - 1.0) * np.float32(math.pi)
+    turn = drawn.obstacle_yaw * np.float32(0.5 * math.pi)
+    half = 0.5 * stage.obstacle_size * xp.ones_like(turn)
+    return Level(
+        side=stage.side,
+        present=present,
+        start=xp.concatenate([metres(start, xp), yaw[:, None]], axis=-1),
+        target=metres(target, xp),
+        obstacle_present=around.there,
+        obstacle=xp.concatenate(
+            [metres(around.centre, xp), xp.stack([turn, half, half], axis=-1)], axis=-1
+        ),
+    )
+
+
+def _place_obstacles(drawn: _Uniforms, stage: Stage, side: Array, xp: Any) -> _Obstacles:
+    """Places boxes, turned at random, so that their outer circles leave a passage everywhere."""
+    radius = units(stage.obstacle_size * np.float32(math.sqrt(0.5)), xp) + 1
+    gap = 2 * radius + _units(PASSAGE)
+    points = lattice(drawn.obstacle_shift, side, xp)
+    score = score_walls(points, side, radius + _units(PASSAGE), xp)
+    there = xp.arange(drawn.obstacle.shape[0]) < stage.obstacles
+    centre, there = place(points, score, drawn.obstacle, there, Gap(gap, gap), xp)
+    return _Obstacles(centre, there, radius)
+
+
+def _place_targets(
+    drawn: _Uniforms, around: _Obstacles, present: Array, spacing: Spacing, side: Array, xp: Any
+) -> Array:
+    """Places targets so that parked robots leave a way through; returns [R, 2] units."""
+    hull, reach = spacing.hull_radius, spacing.target_radius
+    beside = Gap(
+        around.radius + _units(hull + MARGIN),
+        # A robot parked on this side of its target, and another one passing behind it.
+        around.radius + _units(reach + 3.0 * hull),
+    )
+    apart = Gap(_units(2.0 * hull + 2.0 * MARGIN), _units(2.0 * reach + 4.0 * hull))
+    points = lattice(drawn.target_shift, side, xp)
+    score = score_walls(points, side, _units(hull + MARGIN), xp)
+    score = xp.minimum(score, score_things(points, around.centre, around.there, beside, xp))
+    return place(points, score, drawn.target, present, apart, xp)[0]
+
+
+def _place_starts(
+    drawn: _Uniforms,
+    around: _Obstacles,
+    target: Array,
+    present: Array,
+    spacing: Spacing,
+    side: Array,
+    xp: Any,
+) -> Array:
+    """Places starts clear of everything that is or may come to be there; returns [R, 2] units."""
+    hull, reach = spacing.hull_radius, spacing.target_radius
+    beside = _units(hull + MARGIN) + around.radius
+    # No robot starts where it has arrived already; better, none starts where another may park.
+    from_target = Gap(_units(reach + MARGIN), _units(reach + 2.0 * hull + MARGIN))
+    apart = Gap(_units(2.0 * hull + MARGIN), _units(2.0 * hull + 2.0 * MARGIN))
+    points = lattice(drawn.start_shift, side, xp)
+    score = score_walls(points, side, _units(hull + MARGIN), xp)
+    walled = score_things(points, around.centre, around.there, Gap(beside, beside), xp)
+    clear = score_things(points, target, present, from_target, xp)
+    score = xp.minimum(score, xp.minimum(walled, clear))
+    return place(points, score, drawn.start, present, apart, xp)[0]
+
+
+def _fixed(stage: Stage, spacing: Spacing, xp: Any) -> Level:
+    """Returns the paper's level, scaled with the arena."""
+    count = xp.where(stage.fence, xp.minimum(stage.obstacles, 1), stage.obstacles)
+    return Level(
+        side=stage.side,
+        present=xp.arange(spacing.robots) < stage.robots,
+        start=fixed_level.starts(spacing.robots, stage.side, xp),
+        target=fixed_level.targets(spacing.robots, stage.side, xp),
+        obstacle_present=xp.arange(spacing.obstacles) < count,
+        obstacle=fixed_level.obstacles(spacing.obstacles, stage, xp),
+    )
+
+
+def _park(level: Level, xp: Any) -> Level:
+    """Moves what is absent outside, each thing to a place of its own."""
+    robots, obstacles = level.present.shape[0], level.obstacle_present.shape[0]
+    line = PARKING + PARKING_SPACING * np.arange(max(robots, obstacles), dtype=np.float32)
+    away = np.stack([line, line * 0 + PARKING], axis=-1)
+    robot = np.concatenate([away, 0 * away[:, :1]], axis=-1)[:robots]
+    box = -away[:obstacles]
+    present = level.present[:, None]
+    place = xp.where(level.obstacle_present[:, None], level.obstacle[:, :2], box)
+    return level._replace(
+        start=xp.where(present, level.start, robot),
+        target=xp.where(present, level.target, robot[:, :2]),
+        obstacle=xp.concatenate([place, level.obstacle[:, 2:]], axis=-1),
+    )
+
+
+def _units(metres: float) -> int:
+    """Rounds a length up to units, so that no distance comes out shorter than asked."""
+    return math.ceil(metres * UNITS)

@@ -1,0 +1,128 @@
+"""Placing things one after the other on the points of a lattice, in whole numbers.
+
+Integer arithmetic makes NumPy and JAX choose the same point from the same uniform number. The
+unit is 0.25 mm, so that squared distances within the largest arena fit an int32.
+"""
+
+from typing import Any, NamedTuple
+
+Array = Any
+
+UNITS = 4000  # per metre; (4 m * sqrt(2) * 4000)**2 = 5.1e8 < 2**30
+LATTICE = 24  # points along a side
+_FORBIDDEN = -(2**30)  # scores at or below half of this break a hard distance
+
+
+class Gap(NamedTuple):
+    """Least distance between two centres, in units.
+
+    Attributes:
+      hard: never less than this, if any point is that far.
+      soft: at least this where the arena has room.
+    """
+
+    hard: Array
+    soft: Array
+
+
+def units(metres: Array, xp: Any) -> Array:
+    """Rounds metres to units (int32)."""
+    return xp.round(metres * UNITS).astype(xp.int32)
+
+
+def metres(units: Array, xp: Any) -> Array:
+    """Turns units into metres (float32)."""
+    return units.astype(xp.float32) / UNITS
+
+
+def lattice(shift: Array, side: Array, xp: Any) -> Array:
+    """Points that cover a square around the origin, shifted by a part of their spacing.
+
+    Args:
+      shift: [2] in [0, 1), of the spacing.
+      side: [] of the square, units.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [LATTICE**2, 2] int32, units.
+    """
+    offset = xp.floor(shift * side.astype(xp.float32)).astype(xp.int32)
+    steps = xp.arange(LATTICE, dtype=xp.int32)[:, None] * side
+    axes = (steps + offset) // LATTICE - side // 2
+    x = xp.broadcast_to(axes[:, None, 0], (LATTICE, LATTICE))
+    y = xp.broadcast_to(axes[None, :, 1], (LATTICE, LATTICE))
+    return xp.stack([x.reshape(-1), y.reshape(-1)], axis=-1)
+
+
+def score_walls(points: Array, side: Array, gap: Array, xp: Any) -> Array:
+    """Scores points by their distance to the walls, a hard one.
+
+    Args:
+      points: [P, 2] units.
+      side: [] of the arena, units.
+      gap: [] least distance to a wall, units.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [P] 0 where the distance is kept, far below where it is not.
+    """
+    spare = side // 2 - xp.max(xp.abs(points), axis=-1) - gap
+    return xp.where(spare >= 0, 0, _FORBIDDEN + spare)
+
+
+def score_things(
+    points: Array, centres: Array, there: Array, gap: Gap, xp: Any
+) -> Array:
+    """Scores points by their distances to things already placed.
+
+    Args:
+      points: [P, 2] units.
+      centres: [N, 2] of the things, units.
+      there: [N] whether the thing counts.
+      gap: distances to keep.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [P] 0 where all soft distances are kept; below, the lower the worse, where one is not; far
+      below where a hard one is not.
+    """
+    apart = points[:, None, :] - centres[None, :, :]
+    square = xp.sum(apart * apart, axis=-1)
+    lacking = xp.minimum(square - gap.soft * gap.soft, 0)
+    worst = xp.where(square < gap.hard * gap.hard, _FORBIDDEN + square, lacking)
+    return xp.min(xp.where(there, worst, 0), axis=-1, initial=0)
+
+
+def place(
+    points: Array, score: Array, picks: Array, there: Array, gap: Gap, xp: Any
+) -> tuple[Array, Array]:
+    """Places things of one kind one after the other.
+
+    Args:
+      points: [P, 2] candidates, units.
+      score: [P] of the candidates against everything else.
+      picks: [N] uniform numbers in [0, 1).
+      there: [N] whether the thing is to be placed; it keeps others away only then.
+      gap: distances among these things.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      Centres [N, 2] (units), and [N] whether the thing is there and keeps all hard distances.
+    """
+    centres, sound = [], []
+    for i in range(picks.shape[0]):
+        best = _choose(score, picks[i], xp)
+        centres.append(points[best])
+        sound.append(there[i] & (score[best] > _FORBIDDEN // 2))
+        against = score_things(points, centres[-1][None], there[i][None], gap, xp)
+        score = xp.minimum(score, against)
+    return xp.stack(centres), xp.stack(sound)
+
+
+def _choose(score: Array, pick: Array, xp: Any) -> Array:
+    """Picks one of the points that score 0, each as likely as the next; else the best one."""
+    rank = xp.cumsum((score >= 0).astype(xp.int32))
+    free = rank[-1]
+    wanted = xp.floor(pick * free.astype(xp.float32)).astype(xp.int32)
+    wanted = xp.minimum(wanted, free - 1)
+    return xp.where(free > 0, xp.argmax(rank > wanted), xp.argmax(score))

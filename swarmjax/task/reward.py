@@ -1,0 +1,85 @@
+"""The reward: a table of small terms, each times its weight from the config.
+
+Equation 3 of the paper is `progress` with weight 1 and `proximity` with weight -0.001.
+A new term is one function here, one row of `TERMS`, one weight in `RewardConfig`, one test.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from swarmjax.config import RewardConfig
+
+
+class Step(NamedTuple):
+    """What a reward may look at: one control step of a swarm.
+
+    Attributes:
+      distance_before: [R] to the target, m.
+      distance: [R] to the target after the step, m.
+      infrared: [R, K] ray lengths after the step, m.
+      sensor_range: m.
+      arrives: [R] whether the robot arrived in this step.
+      contact_begins: [R, 3] whether a contact of each kind began in this step.
+    """
+
+    distance_before: Array
+    distance: Array
+    infrared: Array
+    sensor_range: float
+    arrives: Array
+    contact_begins: Array
+
+
+def progress(step: Step) -> Array:
+    """Metres nearer to the target: previous distance - current distance (equation 3)."""
+    return step.distance_before - step.distance
+
+
+def proximity(step: Step) -> Array:
+    """1 where any ray is shorter than the sensor's range, once a step (equation 3)."""
+    return jnp.any(step.infrared < step.sensor_range, axis=-1).astype(jnp.float32)
+
+
+def arrival(step: Step) -> Array:
+    """1 in the step in which the robot arrives."""
+    return step.arrives.astype(jnp.float32)
+
+
+def contact(step: Step) -> Array:
+    """How many contacts began in this step, of whatever kind."""
+    return jnp.sum(step.contact_begins, axis=-1).astype(jnp.float32)
+
+
+def time(step: Step) -> Array:
+    """1 for every control step."""
+    return jnp.ones_like(step.distance)
+
+
+TERMS: dict[str, Callable[[Step], Array]] = {
+    "progress": progress,
+    "proximity": proximity,
+    "arrival": arrival,
+    "contact": contact,
+    "time": time,
+}
+
+
+def total(step: Step, weights: RewardConfig) -> Array:
+    """Adds the weighted terms up.
+
+    Args:
+      step: one control step.
+      weights: weight of each term; a term of weight 0 is not computed.
+
+    Returns:
+      [R] reward.
+    """
+    reward = jnp.zeros_like(step.distance)
+    for name, term in TERMS.items():
+        weight = getattr(weights, name)
+        if weight:
+            reward = reward + weight * term(step)
+    return reward

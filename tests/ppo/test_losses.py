@@ -1,0 +1,144 @@
+"""The loss against NumPy, with masks."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+from swarmjax.config import AlgoConfig
+from swarmjax.ppo import networks
+from swarmjax.ppo.losses import Minibatch, ppo_loss
+
+B, O, U = 24, 3, 2
+CONFIG = AlgoConfig(hidden=(8,), clip=0.2, value_cost=0.7, entropy_cost=0.03)
+PARAMS = networks.init_params(jax.random.key(0), CONFIG, O, U)
+
+
+def _minibatch(valid_share: float = 0.6) -> Minibatch:
+    random = np.random.default_rng(0)
+    observation = random.normal(size=(B, O)).astype(np.float32)
+    action = random.normal(size=(B, U)).astype(np.float32)
+    mean, std = networks.action_distribution(PARAMS, CONFIG, observation)
+    log_prob = np.asarray(networks.log_prob(mean, std, action))
+    return Minibatch(
+        observation=observation,
+        action=action,
+        # Ratios from e**-0.9 to e**0.9, so many are outside 0.8..1.2 on either side.
+        log_prob=log_prob + random.normal(size=B).clip(-3, 3).astype(np.float32) * 0.3,
+        advantage=random.normal(size=B).astype(np.float32),
+        return_=random.normal(size=B).astype(np.float32),
+        valid=random.random(B) < valid_share,
+    )
+
+
+def _expected(minibatch: Minibatch, expected_valid: float) -> dict[str, float]:
+    mean, std = networks.action_distribution(PARAMS, CONFIG, minibatch.observation)
+    value = np.asarray(networks.value(PARAMS, CONFIG, minibatch.observation), np.float64)
+    log_prob = scipy.stats.norm.logpdf(minibatch.action, mean, std).sum(axis=-1)
+    total = dict.fromkeys(
+        ("policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction"), 0.0
+    )
+    for i in np.flatnonzero(minibatch.valid):
+        ratio = np.exp(log_prob[i] - minibatch.log_prob[i])
+        advantage = minibatch.advantage[i]
+        total["policy_loss"] -= min(ratio * advantage, np.clip(ratio, 0.8, 1.2) * advantage)
+        total["value_loss"] += (value[i] - minibatch.return_[i]) ** 2 / 2
+        total["entropy"] += scipy.stats.norm.entropy(scale=std).sum()
+        total["approx_kl"] += ratio - 1 - np.log(ratio)
+        total["clip_fraction"] += abs(ratio - 1) > 0.2
+    parts = {name: part / max(expected_valid, 1.0) for name, part in total.items()}
+    parts["loss"] = parts["policy_loss"] + 0.7 * parts["value_loss"] - 0.03 * parts["entropy"]
+    return parts
+
+
+# With 0.25 expected, the sums are divided by 1.
+@pytest.mark.parametrize("expected_valid", [0.25, 5.0, 14.0])
+def test_loss_and_its_parts_equal_numpy(expected_valid: float) -> None:
+    minibatch = _minibatch()
+    loss, metrics = ppo_loss(PARAMS, minibatch, CONFIG, jnp.float32(expected_valid))
+    expected = _expected(minibatch, expected_valid)
+    assert 0.0 < expected["clip_fraction"]
+    # Sums of 24 float32 terms of order 1 against float64.
+    np.testing.assert_allclose(loss, expected.pop("loss"), rtol=1e-5, atol=1e-5)
+    assert metrics.keys() == expected.keys()
+    for name, part in expected.items():
+        np.testing.assert_allclose(metrics[name], part, rtol=1e-5, atol=1e-5, err_msg=name)
+
+
+def test_a_clipped_ratio_has_no_gradient_and_an_unclipped_one_has() -> None:
+    minibatch = _minibatch()
+    mean, std = networks.action_distribution(PARAMS, CONFIG, minibatch.observation)
+    log_prob = networks.log_prob(mean, std, minibatch.action)
+    config = AlgoConfig(hidden=(8,), clip=0.2, entropy_cost=0.0)
+
+    def slope(ratio: float, advantage: float) -> float:
+        samples = minibatch.replace(
+            log_prob=log_prob - np.log(ratio),
+            advantage=np.full(B, advantage, np.float32),
+            valid=np.ones(B, bool),
+        )
+        gradient = jax.grad(lambda p: ppo_loss(p, samples, config, jnp.float32(B))[0])(PARAMS)
+        return float(jnp.abs(gradient["actor"]["mean"]["kernel"]).max())
+
+    # The minimum of equation 7 is flat only where moving on would gain more.
+    assert slope(1.3, 1.0) == 0.0
+    assert slope(0.7, -1.0) == 0.0
+    assert slope(1.3, -1.0) > 0.0
+    assert slope(0.7, 1.0) > 0.0
+
+
+def test_without_a_valid_sample_loss_and_gradient_are_zero() -> None:
+    minibatch = _minibatch(valid_share=0.0)
+    # A log ratio of about 1000: masked only after exp, its gradient would be NaN.
+    minibatch = minibatch.replace(log_prob=minibatch.log_prob - 1000.0)
+    (loss, metrics), gradient = jax.value_and_grad(ppo_loss, has_aux=True)(
+        PARAMS, minibatch, CONFIG, jnp.float32(0.0)
+    )
+    for leaf in jax.tree.leaves((loss, metrics, gradient)):
+        np.testing.assert_array_equal(leaf, np.zeros(leaf.shape))
+
+
+def test_float_masks_count_as_boolean_ones() -> None:
+    minibatch = _minibatch()
+    expected = ppo_loss(PARAMS, minibatch, CONFIG, jnp.float32(14.0))
+    got = ppo_loss(
+        PARAMS,
+        minibatch.replace(valid=minibatch.valid.astype(np.float32)),
+        CONFIG,
+        jnp.float32(14.0),
+    )
+    jax.tree.map(np.testing.assert_array_equal, got, expected)
+
+
+def test_mean_over_unevenly_filled_minibatches_is_the_loss_of_the_batch() -> None:
+    batch = _minibatch()
+    valid = np.zeros(B, bool)
+    valid[[0, 1, 2, 3, 4, 5, 6, 7, 9]] = True
+    batch = batch.replace(valid=valid)
+    loss = jax.value_and_grad(ppo_loss, has_aux=True)
+    whole = loss(PARAMS, batch, CONFIG, jnp.float32(9.0))
+    # Three minibatches of eight with 8, 1 and 0 valid samples: each expects 9 / 3 of them.
+    parts = [
+        loss(
+            PARAMS,
+            jax.tree.map(lambda x, start=start: x[start : start + 8], batch),
+            CONFIG,
+            jnp.float32(3.0),
+        )
+        for start in (0, 8, 16)
+    ]
+    mean = jax.tree.map(lambda *part: sum(part) / 3.0, *parts)
+    # The same float32 terms of order 1, added in another order.
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6), mean, whole)
+
+
+def test_shapes_that_would_broadcast_are_refused() -> None:
+    minibatch = _minibatch()
+    with pytest.raises(AssertionError):
+        ppo_loss(
+            PARAMS,
+            minibatch.replace(return_=minibatch.return_[:, None]),
+            CONFIG,
+            jnp.float32(1.0),
+        )

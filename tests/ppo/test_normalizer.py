@@ -1,0 +1,74 @@
+"""Running moments against NumPy's moments of all valid observations at once."""
+
+import jax
+import numpy as np
+import pytest
+
+from swarmjax.ppo import normalizer
+
+O = 3
+
+
+def test_masked_batches_give_the_moments_of_all_valid_observations() -> None:
+    random = np.random.default_rng(0)
+    state = normalizer.init(O)
+    seen = []
+    for size in (5, 40, 3):
+        observation = random.normal([10.0, -2.0, 0.0], [0.5, 3.0, 1.0], (size, 4, O))
+        valid = random.random((size, 4)) < 0.5
+        seen.append(observation[valid])
+        observation[~valid] = np.nan
+        state = normalizer.update(state, observation.astype(np.float32), valid)
+    expected = np.concatenate(seen)
+    assert state.count == len(expected)
+    # float32 against float64: means of order 10, so rounding of order 1e-6.
+    np.testing.assert_allclose(state.mean, expected.mean(axis=0), atol=5e-6)
+    np.testing.assert_allclose(state.variance, expected.var(axis=0), rtol=1e-5)
+
+
+def test_a_batch_without_a_valid_observation_changes_nothing() -> None:
+    fresh = normalizer.init(O)
+    used = normalizer.update(
+        fresh, np.arange(12, dtype=np.float32).reshape(4, O), np.ones(4, bool)
+    )
+    nothing = np.full((4, O), np.nan, np.float32)
+    for state in (fresh, used):
+        after = normalizer.update(state, nothing, np.zeros(4, bool))
+        jax.tree.map(np.testing.assert_array_equal, after, state)
+
+
+def test_small_deviations_on_a_large_offset_keep_their_variance() -> None:
+    observation = np.array([[1000.0], [1000.5], [1001.0]], np.float32)
+    state = normalizer.init(1)
+    for _ in range(2):
+        state = normalizer.update(state, observation, np.ones(3, bool))
+    # Deviations -0.5, 0, 0.5: variance 0.5 / 3. The mean rounds at 1000 * 2**-24 = 6e-5, which
+    # enters squared.
+    np.testing.assert_allclose(state.variance, [0.5 / 3.0], rtol=1e-6)
+
+
+def test_normalize_is_shift_scale_and_clip() -> None:
+    state = normalizer.Normalizer(
+        count=np.float32(9.0),
+        mean=np.array([1.0, 0.0, 5.0], np.float32),
+        variance=np.array([4.0, 0.25, 0.0], np.float32),
+    )
+    observation = np.array([[3.0, -9.0, 5.0], [0.0, 0.5, 5.001]], np.float32)
+    # Column 3 has never moved: it is divided by the smallest deviation, 0.001.
+    expected = [[1.0, -10.0, 0.0], [-0.5, 1.0, 1.0]]
+    # 5.001 - 5 in float32 is off by 2**-22 * 5 / 0.001 = 2.4e-4 at most.
+    np.testing.assert_allclose(
+        normalizer.normalize(state, observation, 10.0), expected, atol=5e-4
+    )
+
+
+def test_fresh_normalizer_leaves_observations_as_they_are() -> None:
+    observation = np.array([[0.5, -3.0, 9.0]], np.float32)
+    np.testing.assert_array_equal(
+        normalizer.normalize(normalizer.init(O), observation, 10.0), observation
+    )
+
+
+def test_mask_of_another_shape_is_refused() -> None:
+    with pytest.raises(AssertionError):
+        normalizer.update(normalizer.init(O), np.zeros((4, 2, O), np.float32), np.ones(4, bool))
