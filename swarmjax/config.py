@@ -133,8 +133,8 @@ def smallest_side(stage: StageConfig) -> float:
     """Side of the smallest arena in which a level of the stage can be laid out.
 
     The free square (side - 0.10)^2 must hold two squares of 0.15^2 for each robot and one of
-    (obstacle_size * sqrt(2) + 0.10)^2 for each obstacle, and one obstacle must leave a passage
-    on either side. An area alone promises no layout: it refuses what is hopeless.
+    (obstacle_size * sqrt(2) + 0.10)^2 for each obstacle, which leaves more than a passage on
+    either side of any one obstacle. An area promises no layout: it refuses what is hopeless.
 
     Args:
         stage: the stage; its `side` is not read.
@@ -144,8 +144,7 @@ def smallest_side(stage: StageConfig) -> float:
     """
     across = stage.obstacle_size * math.sqrt(2)
     area = stage.robots * 2 * DISC**2 + stage.obstacles * (across + PASSAGE) ** 2
-    fits = across + 2 * PASSAGE if stage.obstacles else 0.0
-    return max(fits, PASSAGE + math.sqrt(area))
+    return PASSAGE + math.sqrt(area)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -476,7 +475,7 @@ def build[C: _Section](cls: type[C], mapping: Mapping[str, Any], where: str = ""
             raise _unknown_key(str(key), cls, where)
     for item in known.values():
         if item.name not in mapping and _is_required(item):
-            raise ConfigError(f"{where}{item.name} is missing: give {where}{item.name}=<value>.")
+            raise ConfigError(f"{where}{item.name} is missing and has no default: give it.")
     values = {
         key: _convert(known[key].type, value, f"{where}{key}") for key, value in mapping.items()
     }
@@ -671,7 +670,7 @@ def _number(kind: type[int] | type[float], value: object) -> int | float:
         number: int | float = int(value) if isinstance(value, str) else value
     except ValueError:
         number = float(value)
-    if not math.isfinite(number):
+    if isinstance(number, float) and not math.isfinite(number):
         raise ValueError
     if kind is int and number != int(number):
         raise ValueError
@@ -863,8 +862,11 @@ def _compose(
         _check_choice(key, choice, key)
     for key in words.keys() - groups.keys():
         _parse(words[key])
+    chosen = _defaults(command) | groups
+    for group, choice in chosen.items():
+        _read_yaml(f"{group}/{choice}")  # names a broken file, where Hydra would not
     forced = [word if key in groups else f"++{word}" for key, word in words.items()]
-    return _resolve(_hydra(command, forced)), (_defaults(command) | groups).get("stage", "")
+    return _resolve(_hydra(command, forced)), chosen.get("stage", "")
 
 
 def _hydra(command: str, overrides: list[str]) -> "DictConfig":

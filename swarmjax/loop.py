@@ -157,7 +157,8 @@ def update(
         "decision": decision.reason,
         "decided_stage": decision.stage,
         "stage_success": decision.success,
-        "transitions": jnp.sum(trajectory.valid, dtype=jnp.int32),
+        "robots": jnp.sum(arenas.level.present),
+        "transitions": jnp.sum(trajectory.valid),
         **{name: jnp.mean(value) for name, value in learned.items()},
         **_episode_metrics(ended, state.curriculum.stage),
     }

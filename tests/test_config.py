@@ -1,0 +1,613 @@
+"""Every default, every check and every sentence of swarmjax/config.py."""
+
+import dataclasses
+import json
+import math
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from swarmjax import config, epuck
+from swarmjax.config import (
+    ConfigError,
+    EvaluateConfig,
+    ExportConfig,
+    RewardConfig,
+    RobotConfig,
+    RunConfig,
+    SimConfig,
+    StageConfig,
+    TrainConfig,
+    build,
+    help_text,
+    load_evaluate,
+    load_export,
+    load_resume,
+    load_train,
+    smallest_side,
+    to_dict,
+)
+
+ROOT = Path(config.__file__).resolve().parent.parent
+STAGE = {"name": "s", "robots": 2, "side": 1.0}
+CHOICES = "curriculum, expanded, final, s1, s2, s3, s4, s5, s6"
+
+
+def refusal(function, *arguments) -> str:
+    """Return the sentence with which a call is refused, and hold it to being one."""
+    with pytest.raises(ConfigError) as caught:
+        function(*arguments)
+    sentence = str(caught.value)
+    assert "\n" not in sentence
+    assert sentence[-1] in ".?"
+    return sentence
+
+
+@pytest.fixture
+def own_configs(tmp_path, monkeypatch):
+    """A copy of configs/ beside a project file, in which a test may write."""
+    shutil.copytree(ROOT / "configs", tmp_path / "configs")
+    (tmp_path / "pyproject.toml").touch()
+    monkeypatch.setattr(config, "_PACKAGE", tmp_path / "swarmjax")
+    return tmp_path / "configs"
+
+
+# Defaults and stages
+
+
+def test_stages_are_the_table_of_the_plan():
+    table = {
+        "s1": (2, 0.5, 0),
+        "s2": (2, 0.7, 0),
+        "s3": (3, 0.7, 1),
+        "s4": (3, 1.0, 2),
+        "s5": (5, 1.0, 2),
+        "s6": (5, 1.2, 3),
+        "final": (5, 1.2, 3),
+        "expanded": (5, 1.5, 3),
+    }
+    for name, numbers in table.items():
+        (stage,) = load_train([f"stage={name}"]).stage
+        assert (stage.robots, stage.side, stage.obstacles) == numbers
+        assert stage.name == name
+    files = {path.stem for path in (ROOT / "configs" / "stage").glob("*.yaml")}
+    assert files == table.keys() | {"curriculum"}
+
+
+def test_train_defaults_to_the_whole_curriculum():
+    train = load_train([])
+    assert [stage.name for stage in train.stage] == ["s1", "s2", "s3", "s4", "s5", "s6"]
+    assert train.stage_name == "curriculum"
+    # No file of configs/ sets what config.py already says.
+    assert train == TrainConfig(stage=train.stage, stage_name="curriculum")
+    # 4e6 // (128 * 32) = 4e6 // 4096 = 976, and 976 * 4096 = 3 997 696 is the last whole update.
+    assert train.updates == 976
+    assert train.learners == 1
+
+
+def test_defaults_of_the_reward_are_equation_3():
+    assert dataclasses.astuple(RewardConfig()) == (1.0, -0.001, 0.0, 0.0, 0.0)
+
+
+def test_robot_defaults_are_the_epuck():
+    robot = RobotConfig()
+    assert (robot.hull_radius, robot.mass) == (epuck.HULL_RADIUS, epuck.MASS)
+    assert (robot.track, robot.yaw_inertia) == (epuck.TRACK, epuck.YAW_INERTIA)
+
+
+def test_independent_policies_have_one_learner_a_robot():
+    assert load_train(["algo.policy=independent", "sim.max_robots=7"]).learners == 7
+
+
+def test_evaluate_defaults():
+    evaluate = load_evaluate(["policy=p.npz"])
+    assert evaluate == EvaluateConfig(policy="p.npz", stage=load_train(["stage=s6"]).stage[0])
+    assert (evaluate.steps, evaluate.episodes, evaluate.seed) == (1500, 1000, 1)
+
+
+def test_export_defaults():
+    assert load_export(["run=runs/a"]) == ExportConfig(run="runs/a")
+
+
+def test_configurations_are_frozen_and_hashable():
+    train = load_train([])
+    assert hash(train) == hash(load_train([]))
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        train.seed = 1  # type: ignore[misc]  # the assignment is what is tested
+
+
+def test_import_needs_neither_jax_nor_hydra():
+    code = "import sys, swarmjax.config; print({'jax', 'hydra', 'omegaconf'} & set(sys.modules))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "set()"
+
+
+# Round trip
+
+
+@pytest.mark.parametrize(
+    ("load", "words"),
+    [
+        (load_train, []),
+        (load_train, ["stage=s3", "algo.hidden=[8,16,32]", "run.chunk=all", "run.dir=a b"]),
+        (load_train, ["stage.sequence=[s2,s1]", "sim.iterations=4", "run.chunk=7"]),
+        (load_evaluate, ["policy=p", "stage=expanded", "workers=2"]),
+        (load_export, ["run=r", "step=3"]),
+    ],
+)
+def test_round_trip_through_json(load, words):
+    made = load(words)
+    assert build(type(made), json.loads(json.dumps(to_dict(made)))) == made
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    robots=st.integers(1, 5),
+    obstacles=st.integers(0, 4),
+    size=st.floats(0.02, 0.3),
+    extra=st.floats(0.0, 0.5),
+    rollout=st.integers(1, 64),
+    factor=st.integers(1, 16),
+    spare=st.integers(0, 1000),
+)
+def test_round_trip_of_any_sound_configuration(
+    robots, obstacles, size, extra, rollout, factor, spare
+):
+    probe = StageConfig(name="p", robots=robots, side=4.0, obstacles=obstacles, obstacle_size=size)
+    side = max(0.4, smallest_side(probe) + extra)
+    data = {
+        "stage": [dataclasses.asdict(probe) | {"side": side}],
+        "algo": {"rollout": rollout},
+        "arenas": 8 * factor,
+        "budget": 8 * factor * rollout + spare,
+    }
+    train = build(TrainConfig, data)
+    assert build(TrainConfig, json.loads(json.dumps(to_dict(train)))) == train
+    update = 8 * factor * rollout
+    assert train.updates * update <= train.budget < (train.updates + 1) * update
+
+
+# The converter
+
+
+@pytest.mark.parametrize("value", [4096, 4096.0, "4096", "4096.0", "4.096e3"])
+def test_whole_numbers_become_integers(value):
+    budget = build(TrainConfig, {"stage": [STAGE], "budget": value}).budget
+    assert (budget, type(budget)) == (4096, int)
+
+
+def test_hydra_reads_an_exponent_as_a_float_and_we_as_an_integer():
+    budget = load_train(["budget=1e6"]).budget
+    assert (budget, type(budget)) == (1_000_000, int)
+
+
+@pytest.mark.parametrize("value", [1, "1", "1e0"])
+def test_integers_become_floats(value):
+    progress = build(RewardConfig, {"progress": value}).progress
+    assert (progress, type(progress)) == (1.0, float)
+
+
+def test_a_long_integer_keeps_every_digit():
+    # 2**53 + 1 is the first integer that a float cannot hold.
+    with pytest.raises(ConfigError, match="9007199254740993"):
+        build(TrainConfig, {"stage": [STAGE], "seed": "9007199254740993"})
+
+
+@pytest.mark.parametrize(
+    "value", [True, None, "many", "", 1.5, math.nan, math.inf, "nan", "inf", [8], {"a": 1}]
+)
+def test_what_is_no_whole_number_is_refused(value):
+    sentence = refusal(build, TrainConfig, {"stage": [STAGE], "arenas": value})
+    assert sentence.startswith("arenas is ")
+    assert sentence.endswith(": give a whole number.")
+
+
+def test_a_whole_number_of_any_length_is_one_and_held_to_the_bounds():
+    sentence = refusal(build, TrainConfig, {"stage": [STAGE], "arenas": 10**400})
+    # Written short: 77 characters of the number and an ellipsis.
+    assert sentence == f"arenas is 1{'0' * 76}...: give 1 to 1048576."
+
+
+@pytest.mark.parametrize("value", [True, None, "fast", math.nan, -math.inf, "nan", [1.0]])
+def test_what_is_no_number_is_refused(value):
+    sentence = refusal(build, RewardConfig, {"progress": value}, "task.reward.")
+    assert sentence.startswith("task.reward.progress is ")
+    assert sentence.endswith(": give a number.")
+    # A number that no float can hold is no number here.
+    assert refusal(build, RewardConfig, {"progress": 10**400}).endswith(": give a number.")
+
+
+@pytest.mark.parametrize("value", [1, 0, "true", None])
+def test_only_true_and_false_are_booleans(value):
+    assert refusal(build, RunConfig, {"dry": value}, "run.").endswith("give true or false.")
+
+
+def test_null_only_where_it_is_allowed():
+    assert build(SimConfig, {"iterations": None}).iterations is None
+    assert refusal(build, SimConfig, {"substeps": None}, "sim.") == (
+        "sim.substeps is null: give a whole number."
+    )
+
+
+@pytest.mark.parametrize(("value", "made"), [("all", "all"), ("auto", "auto"), (3.0, 3), ("4", 4)])
+def test_chunk_takes_a_number_or_a_word(value, made):
+    assert build(RunConfig, {"chunk": value}).chunk == made
+
+
+def test_lists_become_tuples():
+    train = build(TrainConfig, {"stage": [STAGE], "algo": {"hidden": [8, 16.0]}})
+    assert train.algo.hidden == (8, 16)
+    assert isinstance(train.stage, tuple)
+
+
+def test_stages_of_a_curriculum_are_named_in_sentences():
+    good, bad = STAGE, STAGE | {"name": "t", "robots": 0}
+    assert refusal(build, TrainConfig, {"stage": [good, bad]}) == (
+        "stage t: robots is 0: give 1 to 100."
+    )
+    assert refusal(build, TrainConfig, {"stage": [bad]}) == "stage.robots is 0: give 1 to 100."
+    assert refusal(build, TrainConfig, {"stage": [good, 3]}) == (
+        "stage 1 is 3: give keys of its own, as stage 1: name."
+    )
+
+
+def test_a_missing_key_is_named():
+    assert refusal(load_evaluate, []) == "policy is missing and has no default: give it."
+    assert refusal(load_export, []) == "run is missing and has no default: give it."
+    assert refusal(build, TrainConfig, {"stage": [{"name": "s", "side": 1.0}]}) == (
+        "stage.robots is missing and has no default: give it."
+    )
+
+
+def test_sections_made_by_hand_are_held_to_their_bounds():
+    assert refusal(lambda: SimConfig(max_robots=0)) == "max_robots is 0: give 1 to 100."
+    assert refusal(lambda: RewardConfig(time=math.nan)) == ("time is nan: give any finite number.")
+
+
+# Command lines that are refused, with the sentence
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        # Words and keys.
+        (["arenas"], "'arenas' is not a setting: give key=value."),
+        (["--arenas=3"], "'--arenas=3' is not a setting: give key=value."),
+        (["+arenas=3"], "'+arenas=3' is not a setting: give key=value."),
+        (["a\nb"], "'a\\nb' is not a setting: give key=value."),
+        (["hydra/launcher=x"], "'hydra/launcher=x' is not a setting: give key=value."),
+        (["arena=3"], "arena is not a key: did you mean arenas?"),
+        (["algo.clp=1"], "algo.clp is not a key: did you mean algo.clip?"),
+        (["task.reward.progres=1"], "task.reward.progres is not a key: did you mean "
+         "task.reward.progress?"),
+        (["robots=3"], "robots is not a key: did you mean stage.robots?"),
+        (["name=s3"], "name is not a key: did you mean stage.name?"),
+        (["learning_rate=1"], "learning_rate is not a key: did you mean "
+         "algo.actor_learning_rate?"),
+        (["stage_name=x"], "stage_name is not a key: did you mean stage?"),
+        (["hydra.verbose=1"], "hydra is not a key: give one of stage, robot, task, algo, "
+         "curriculum, sim, run, seed, seeds, arenas, budget, realism, resume."),
+        # What Hydra's grammar refuses.
+        (["algo.hidden=[64"], "'algo.hidden=[64' cannot be read: quote a value with special "
+         "characters, as in \"algo.hidden='a=b'\"."),
+        (["arenas=1,2"], "'arenas=1,2' gives several values, and a run takes one: write a list "
+         "as arenas=[1,2]."),
+        (["arenas=${nope}"], "the settings cannot be resolved: Interpolation key 'nope' not "
+         "found."),
+        # Groups.
+        (["stage=s7"], f"stage is 's7': give one of {CHOICES} (nearest: s6)."),
+        (["stage=expand"], f"stage is 'expand': give one of {CHOICES} (nearest: expanded)."),
+        (["stage=../train"], f"stage is '../train': give one of {CHOICES}."),
+        (["stage=[s1,s2]"], f"stage is '[s1,s2]': give one of {CHOICES}."),
+        (["stage=null"], f"stage is 'null': give one of {CHOICES}."),
+        (["robot=wheeled"], "robot is 'wheeled': give one of planar."),
+        # Stages and curricula.
+        (["stage.side=0.9"], "stage.side cannot be given for curriculum, a curriculum: choose "
+         "one stage, as in stage=s6."),
+        (["stage.sequence=[s1,s9]"], f"stage.sequence is 's9': give one of {CHOICES} (nearest: "
+         "s6)."),
+        (["stage.sequence=[]"], "stage.sequence is []: give at least one stage."),
+        (["stage.sequence=s1"], "stage.sequence is 's1': give a list, as in [s1,s2]."),
+        (["stage.sequence=[s1,s1]"], "stage names s1 more than once: give each stage once."),
+        (["stage.sequence=[curriculum]"], "stage.sequence names curriculum, a curriculum itself: "
+         "give single stages."),
+        (["stage=s3", "stage.sequence=[s1]"], "stage.sequence is not a key: give one of name, "
+         "robots, side, obstacles, obstacle_size, level, layout."),
+        (["stage=s3", "stage.name=s4"], "stage.name is 's4' in s3.yaml: give the file's name."),
+        (["stage=s3", "stage.layout=fence"], "stage.layout is fence, but level is random: give "
+         "level=fixed."),
+        (["stage=s1", "stage.level=fixed", "stage.layout=fence"], "stage.obstacles is 0, but "
+         "layout is fence: give 1 or more."),
+        # Types and bounds.
+        (["task=3"], "task is 3: give keys of its own, as task.control_step."),
+        (["algo.hidden=64"], "algo.hidden is 64: give a list, as in [64,64]."),
+        (["algo.hidden=[]"], "algo.hidden is []: give at least one layer, as in [64,64]."),
+        (["algo.hidden=[64,0]"], "algo.hidden is [64,0]: give 1 to 4096."),
+        (["algo.activation=gelu"], "algo.activation is 'gelu': give tanh, relu or swish."),
+        (["run.chunk=some"], "run.chunk is 'some': give a whole number, all or auto."),
+        (["run.chunk=0"], "run.chunk is 0: give 1 to 2147483647."),
+        (["run.dir="], "run.dir is '': give text or null."),
+        (["seed=-1"], "seed is -1: give 0 to 2147483647."),
+        (["robot.max_speed=0"], "robot.max_speed is 0: give more than 0."),
+        (["robot.hull_radius=0.08"], "robot.hull_radius is 0.08: give more than 0, at most "
+         "0.075."),
+        (["curriculum.budget_share=1"], "curriculum.budget_share is 1: give more than 0, less "
+         "than 1."),
+        (["stage=s6", "stage.side=5"], "stage.side is 5: give 0.4 to 4."),
+        # Checks across keys.
+        (["robot.track=0.08"], "robot.track is 0.08, but hull_radius is 0.037 and the wheels lie "
+         "inside the hull: give less than 0.074."),
+        (["stage=s6", "stage.robots=6"], "stage.robots is 6, but sim.max_robots is 5: give 1 to "
+         "5."),
+        (["sim.max_obstacles=2"], "stage s6: obstacles is 3, but sim.max_obstacles is 2: give 0 "
+         "to 2."),
+        (["seeds=2"], "seeds is 2, but several seeds in one run are not built yet: give 1."),
+        (["arenas=100"], "arenas is 100, but algo.minibatches is 8: give a multiple of 8."),
+        (["budget=4095"], "budget is 4095, but one update takes arenas x algo.rollout = 4096 "
+         "control steps: give at least 4096."),
+        # 1e15 // 4096 = 244140625000, and (2**31 - 1) * 4096 = 8796093018112.
+        (["budget=1e15"], "budget is 1000000000000000, which is 244140625000 updates of 4096 "
+         "control steps, and updates are counted up to 2147483647: give at most 8796093018112."),
+    ],
+)  # fmt: skip
+def test_train_refuses(words, sentence):
+    assert refusal(load_train, words) == sentence
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["stage=curriculum"], "stage is curriculum, a curriculum: give one stage, as in "
+         "stage=s6."),
+        (["suite=all"], "suite is 'all', but is not built yet: leave it out."),
+        (["workers=0"], "workers is 0: give 1 to 1024."),
+        (["engine=mjx"], "engine is 'mjx': give c."),
+        (["algo=ppo"], "algo is not a key: give one of policy, stage, robot, task, suite, "
+         "realism, engine, steps, episodes, seed, workers, substeps, out."),
+    ],
+)  # fmt: skip
+def test_evaluate_refuses(words, sentence):
+    assert refusal(load_evaluate, ["policy=p", *words]) == sentence
+
+
+def test_export_refuses_an_unknown_format():
+    assert refusal(load_export, ["run=r", "format=pt"]) == "format is 'pt': give npz."
+
+
+def test_a_budget_of_one_update_is_enough():
+    assert load_train(["budget=4096"]).updates == 1
+
+
+def test_a_training_without_stages_is_refused():
+    assert refusal(build, TrainConfig, {"stage": []}) == "stage is []: give at least one stage."
+
+
+# The room that a stage needs
+
+
+def test_area_criterion_by_hand():
+    # Two robots: (side - 0.10)^2 >= 2 * 2 * 0.0225 = 0.09 = 0.3^2, so side >= 0.4.
+    stage = StageConfig(name="a", robots=2, side=0.5)
+    # Rounding of the square and its root, each 1e-16.
+    assert smallest_side(stage) == pytest.approx(0.4, abs=1e-12)
+    # 5 robots, 3 obstacles: 10 * 0.0225 + 3 * (0.141421 + 0.1)^2 = 0.225 + 3 * 0.0582843
+    # = 0.3998528, whose root is 0.6323392: side >= 0.7323392.
+    stage = StageConfig(name="b", robots=5, side=1.0, obstacles=3)
+    # Seven digits were worked out above.
+    assert smallest_side(stage) == pytest.approx(0.7323392, abs=1e-7)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 5), st.integers(1, 4), st.floats(0.02, 0.3))
+def test_an_obstacle_leaves_a_passage_on_either_side(robots, obstacles, size):
+    stage = StageConfig(name="c", robots=robots, side=4.0, obstacles=obstacles, obstacle_size=size)
+    # The area already asks for it: 0.10 + sqrt((d + 0.10)^2 + more) > d + 0.20, d the diagonal.
+    assert smallest_side(stage) > size * math.sqrt(2) + 2 * 0.10
+
+
+def test_too_small_an_arena_names_the_least_side():
+    data = STAGE | {"robots": 5, "obstacles": 3, "side": 0.73}
+    sentence = refusal(build, TrainConfig, {"stage": [data]})
+    assert sentence == (
+        "stage.side is 0.73, too small for robots=5, obstacles=3, obstacle_size=0.1: "
+        "give at least 0.74."
+    )
+    assert build(TrainConfig, {"stage": [data | {"side": 0.74}]}).stage[0].side == 0.74
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 100), st.integers(0, 32), st.floats(0.02, 0.3))
+def test_every_stage_fits_the_largest_arena(robots, obstacles, size):
+    StageConfig(name="a", robots=robots, side=4.0, obstacles=obstacles, obstacle_size=size)
+
+
+@pytest.mark.parametrize("name", ["a b", "../a", "a.b"])
+def test_a_stage_name_can_be_part_of_a_path(name):
+    sentence = refusal(build, TrainConfig, {"stage": [STAGE | {"name": name}]})
+    assert sentence == f"stage.name is '{name}': give letters, digits, _ and - only."
+
+
+# Overrides
+
+
+def test_groups_and_keys_in_any_order():
+    train = load_train(["stage.side=0.9", "robot=planar", "stage=s3", "algo=ppo", "algo.clip=0.1"])
+    (stage,) = train.stage
+    assert (stage.name, stage.side, stage.robots) == ("s3", 0.9, 3)
+    assert train.stage_name == "s3"
+    assert train.algo.clip == 0.1
+
+
+def test_of_a_key_given_twice_the_last_counts():
+    train = load_train(["stage=s1", "seed=1", "stage=s2", "seed=2"])
+    assert (train.stage_name, train.seed) == ("s2", 2)
+
+
+def test_keys_that_no_file_holds_can_be_given():
+    train = load_train(["task.reward.contact=-0.5", "sim.iterations=null", "run.tensorboard=false"])
+    assert train.task.reward.contact == -0.5
+    assert train.sim.iterations is None
+    assert train.run.tensorboard is False
+
+
+@pytest.mark.parametrize(
+    "path", ["runs/a=b", "a, b (1)", "it's", "~/é", "007", "1e3", "C:\\a\\", "[x]"]
+)
+def test_paths_are_taken_as_they_stand(path):
+    assert load_train([f"run.dir={path}"]).run.dir == path
+
+
+@pytest.mark.parametrize(("word", "made"), [("null", None), ("'null'", "null"), ('"a b"', "a b")])
+def test_null_and_quotes_keep_their_meaning_for_text(word, made):
+    assert load_train([f"run.dir={word}"]).run.dir == made
+
+
+def test_interpolation_reads_the_environment(monkeypatch):
+    monkeypatch.setenv("SCRATCH", "/scratch")
+    assert load_train(["run.dir=${oc.env:SCRATCH}/a"]).run.dir == "/scratch/a"
+
+
+def test_a_sequence_of_ones_own():
+    train = load_train(["stage.sequence=[s4,s2]"])
+    assert [stage.name for stage in train.stage] == ["s4", "s2"]
+    assert train.stage_name == "curriculum"
+
+
+def test_stage_name_of_a_configuration_made_by_hand():
+    one, two = StageConfig(name="a", robots=1, side=1.0), StageConfig(name="b", robots=1, side=1.0)
+    assert TrainConfig(stage=(one,), stage_name="other").stage_name == "a"
+    assert TrainConfig(stage=(one, two)).stage_name == "a-b"
+
+
+def test_a_hydra_of_the_caller_is_left_as_it_was():
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+
+    with initialize_config_dir(config_dir=str(ROOT / "configs"), version_base="1.3"):
+        outer = GlobalHydra.instance().hydra
+        assert load_train(["stage=s1"]).stage_name == "s1"
+        assert GlobalHydra.instance().hydra is outer
+    assert load_train(["stage=s2"]).stage_name == "s2"
+    assert not GlobalHydra.instance().is_initialized()
+
+
+# Files
+
+
+def test_a_stage_is_one_file(own_configs):
+    (own_configs / "stage" / "mine.yaml").write_text("name: mine\nrobots: 4\nside: 1e0\n")
+    assert load_train(["stage=mine"]).stage == (StageConfig(name="mine", robots=4, side=1.0),)
+    train = load_train(["stage.sequence=[s1,mine]"])
+    assert [stage.robots for stage in train.stage] == [2, 4]
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("name: yours\nrobots: 4\nside: 1\n", "stage.name is 'yours' in mine.yaml"),
+        ("name: mine\nside: 1\n", "stage.robots is missing"),
+        ("", "stage.name is missing"),
+        ("name: mine\nrobot: 4\nside: 1\n", "stage.robot is not a key: did you mean stage.robots?"),
+        ("name: [\n", "mine.yaml"),
+        ("- a\n", "mine.yaml"),
+    ],
+)
+def test_an_unsound_stage_file_is_one_sentence(own_configs, text, part):
+    (own_configs / "stage" / "mine.yaml").write_text(text)
+    assert part in refusal(load_train, ["stage=mine"])
+
+
+def test_configs_of_an_installed_package(tmp_path, monkeypatch):
+    package = tmp_path / "site-packages" / "swarmjax"
+    shutil.copytree(ROOT / "configs", package / "configs")
+    # Another package's folder of that name, which must not be taken for ours.
+    (tmp_path / "site-packages" / "configs").mkdir()
+    monkeypatch.setattr(config, "_PACKAGE", package)
+    assert load_train(["stage=s1"]).stage_name == "s1"
+    shutil.rmtree(package / "configs")
+    assert refusal(load_train, []).startswith("configs is missing: ")
+
+
+# Resume
+
+
+def test_resume_changes_budget_and_run_only():
+    stored = to_dict(load_train(["seed=7", "run.dir=old", "run.stop_after=3", "run.chunk=2"]))
+    before = json.dumps(stored)
+    resumed = load_resume(stored, ["budget=8e6", "resume=old", "run.tensorboard=false"])
+    assert (resumed.seed, resumed.budget, resumed.resume) == (7, 8_000_000, "old")
+    assert resumed.run == RunConfig(dir="old", chunk=2, tensorboard=False)
+    assert json.dumps(stored) == before
+    changed = {"budget": resumed.budget, "resume": "old", "run": resumed.run}
+    assert resumed == dataclasses.replace(build(TrainConfig, stored), **changed)
+
+
+def test_resume_may_stop_again():
+    stored = to_dict(load_train(["run.stop_after=3"]))
+    assert load_resume(stored, []).run.stop_after is None
+    assert load_resume(stored, ["run.stop_after=5"]).run.stop_after == 5
+
+
+@pytest.mark.parametrize("word", ["arenas=256", "stage=s3", "algo.clip=0.1", "run=3"])
+def test_resume_refuses_other_keys(word):
+    stored = to_dict(load_train([]))
+    assert refusal(load_resume, stored, [word]) == (
+        f"{word} cannot be given: resume keeps the rest of the stored run and takes budget, "
+        "resume, run.* only."
+    )
+
+
+def test_resume_checks_keys_and_values():
+    stored = to_dict(load_train([]))
+    assert refusal(load_resume, stored, ["budgt=3"]) == ("budgt is not a key: did you mean budget?")
+    assert refusal(load_resume, stored, ["run.dry=3"]) == "run.dry is 3: give true or false."
+    assert refusal(load_resume, stored, ["budget=[1"]).startswith("'budget=[1' cannot be read: ")
+    assert refusal(load_resume, stored | {"arenas": 3}, []).startswith("stored arenas is 3, but ")
+
+
+# Help
+
+
+def test_help_lists_every_key_once():
+    text = help_text(TrainConfig, "train")
+    listed = [line.split("=")[0].strip() for line in text.splitlines() if "=" in line][1:]
+
+    def leaves(mapping, where=""):
+        for key, value in mapping.items():
+            value = value[0] if key == "stage" else value
+            if isinstance(value, dict):
+                yield from leaves(value, f"{where}{key}.")
+            elif key != "stage_name":
+                yield f"{where}{key}"
+
+    assert listed[:3] == ["stage", "robot", "algo"]
+    assert listed[3:] == list(leaves(to_dict(load_train([]))))
+
+
+def test_help_gives_default_meaning_and_allowed_values():
+    lines = [" ".join(line.split()) for line in help_text(TrainConfig, "train").splitlines()]
+    assert lines[0] == "usage: python -m swarmjax.train key=value ..."
+    assert f"stage=curriculum ({CHOICES})" in lines
+    assert "stage.robots=<the stage> active robots (a whole number 1 to 100)" in lines
+    assert "arenas=128 arenas simulated at once (a whole number 1 to 1048576)" in lines
+    assert (
+        "run.chunk=auto updates per call of the compiled program "
+        "(a whole number 1 to 2147483647, all or auto)" in lines
+    )
+    assert "sim.impl=auto MJX implementation; auto: warp on an NVIDIA GPU (auto, jax or warp)" in (
+        lines
+    )
+
+
+def test_help_of_the_other_commands():
+    assert "policy=<required>" in help_text(EvaluateConfig, "evaluate")
+    export = help_text(ExportConfig, "export")
+    assert "run=<required>" in export
+    assert "Groups" not in export

@@ -20,7 +20,7 @@ from swarmjax.ppo.normalizer import Normalizer
 
 # Huang et al. 2022, "The 37 Implementation Details of Proximal Policy Optimization":
 # bound of normalised observations, continuous-action detail 7, and Adam's epsilon, core detail 3.
-_OBSERVATION_LIMIT = 10.0
+OBSERVATION_LIMIT = 10.0
 _ADAM_EPSILON = 1e-5
 _ADVANTAGE_EPSILON = 1e-8
 
@@ -88,7 +88,7 @@ def init(
 
 def normalize(learner: LearnerState, observation: jax.Array) -> jax.Array:
     """Normalises raw observations [..., O] to what the networks take, within +-10."""
-    return normalizer.normalize(learner.normalizer, observation, _OBSERVATION_LIMIT)
+    return normalizer.normalize(learner.normalizer, observation, OBSERVATION_LIMIT)
 
 
 def act(

@@ -109,14 +109,14 @@ def place(
     Returns:
       Centres [N, 2] (units), and [N] whether the thing is there and keeps all hard distances.
     """
-    centres, sound = [], []
+    centres, sound = [points[:0]], [there[:0]]
     for i in range(picks.shape[0]):
         best = _choose(score, picks[i], xp)
-        centres.append(points[best])
-        sound.append(there[i] & (score[best] > _FORBIDDEN // 2))
-        against = score_things(points, centres[-1][None], there[i][None], gap, xp)
+        centres.append(points[best][None])
+        sound.append((there[i] & (score[best] > _FORBIDDEN // 2))[None])
+        against = score_things(points, centres[-1], there[i][None], gap, xp)
         score = xp.minimum(score, against)
-    return xp.stack(centres), xp.stack(sound)
+    return xp.concatenate(centres), xp.concatenate(sound)
 
 
 def _choose(score: Array, pick: Array, xp: Any) -> Array:

@@ -10,14 +10,14 @@ from swarmjax.config import AlgoConfig
 from swarmjax.ppo import networks
 from swarmjax.ppo.losses import Minibatch, ppo_loss
 
-B, O, U = 24, 3, 2
+B, OBSERVATION, U = 24, 3, 2
 CONFIG = AlgoConfig(hidden=(8,), clip=0.2, value_cost=0.7, entropy_cost=0.03)
-PARAMS = networks.init_params(jax.random.key(0), CONFIG, O, U)
+PARAMS = networks.init_params(jax.random.key(0), CONFIG, OBSERVATION, U)
 
 
 def _minibatch(valid_share: float = 0.6) -> Minibatch:
     random = np.random.default_rng(0)
-    observation = random.normal(size=(B, O)).astype(np.float32)
+    observation = random.normal(size=(B, OBSERVATION)).astype(np.float32)
     action = random.normal(size=(B, U)).astype(np.float32)
     mean, std = networks.action_distribution(PARAMS, CONFIG, observation)
     log_prob = np.asarray(networks.log_prob(mean, std, action))
@@ -58,7 +58,7 @@ def test_loss_and_its_parts_equal_numpy(expected_valid: float) -> None:
     minibatch = _minibatch()
     loss, metrics = ppo_loss(PARAMS, minibatch, CONFIG, jnp.float32(expected_valid))
     expected = _expected(minibatch, expected_valid)
-    assert 0.0 < expected["clip_fraction"]
+    assert expected["clip_fraction"] > 0.0
     # Sums of 24 float32 terms of order 1 against float64.
     np.testing.assert_allclose(loss, expected.pop("loss"), rtol=1e-5, atol=1e-5)
     assert metrics.keys() == expected.keys()

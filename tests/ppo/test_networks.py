@@ -11,7 +11,7 @@ import scipy.stats
 from swarmjax.config import AlgoConfig
 from swarmjax.ppo import networks
 
-O, U = 3, 2
+OBSERVATION, U = 3, 2
 CONFIG = AlgoConfig(hidden=(8, 5), initial_std=0.6)
 ACTIVATIONS = {
     "tanh": np.tanh,
@@ -21,7 +21,7 @@ ACTIVATIONS = {
 
 
 def _params(config: AlgoConfig = CONFIG) -> networks.Params:
-    return networks.init_params(jax.random.key(0), config, O, U)
+    return networks.init_params(jax.random.key(0), config, OBSERVATION, U)
 
 
 def _forward(network: networks.Params, activation: str, head: str, x: np.ndarray) -> np.ndarray:
@@ -58,7 +58,7 @@ def test_layers_start_orthogonal_with_their_gain_and_no_bias(
 
 
 def test_std_starts_at_the_configured_one_for_every_observation() -> None:
-    observation = jax.random.normal(jax.random.key(1), (4, 6, O))
+    observation = jax.random.normal(jax.random.key(1), (4, 6, OBSERVATION))
     mean, std = networks.action_distribution(_params(), CONFIG, observation)
     assert mean.shape == (4, 6, U)
     # log and exp in float32.
@@ -69,7 +69,7 @@ def test_std_starts_at_the_configured_one_for_every_observation() -> None:
 def test_networks_equal_a_forward_pass_in_numpy(activation: str) -> None:
     config = AlgoConfig(hidden=(8, 5), activation=activation)
     params = _params(config)
-    observation = np.asarray(jax.random.normal(jax.random.key(1), (4, 6, O)))
+    observation = np.asarray(jax.random.normal(jax.random.key(1), (4, 6, OBSERVATION)))
     mean, _ = networks.action_distribution(params, config, observation)
     value = networks.value(params, config, observation)
     # Sums of at most eight float32 products of order 1; the means themselves are of order 0.01.
@@ -90,9 +90,7 @@ def test_networks_equal_a_forward_pass_in_numpy(activation: str) -> None:
 def test_log_prob_equals_scipy(mean: np.ndarray, action: np.ndarray, std: np.ndarray) -> None:
     expected = scipy.stats.norm.logpdf(action, mean, std).sum(axis=-1)
     # float32 relative rounding of terms up to 0.5 * (6 / 0.125)**2 = 1152.
-    np.testing.assert_allclose(
-        networks.log_prob(mean, std, action), expected, rtol=1e-5, atol=1e-5
-    )
+    np.testing.assert_allclose(networks.log_prob(mean, std, action), expected, rtol=1e-5, atol=1e-5)
 
 
 def test_entropy_equals_scipy() -> None:
@@ -104,7 +102,7 @@ def test_entropy_equals_scipy() -> None:
 
 
 def test_actor_and_critic_share_nothing() -> None:
-    observation = np.ones((1, O), np.float32)
+    observation = np.ones((1, OBSERVATION), np.float32)
     gradient = jax.grad(lambda params: networks.value(params, CONFIG, observation)[0])(_params())
     assert all(np.all(np.asarray(leaf) == 0.0) for leaf in jax.tree.leaves(gradient["actor"]))
     assert np.any(np.asarray(gradient["critic"]["torso"]["hidden_0"]["kernel"]) != 0.0)
@@ -113,4 +111,4 @@ def test_actor_and_critic_share_nothing() -> None:
 @pytest.mark.parametrize("network", [networks.action_distribution, networks.value])
 def test_wrong_observation_size_is_refused(network) -> None:  # noqa: ANN001 (either function)
     with pytest.raises(AssertionError):
-        network(_params(), CONFIG, np.zeros((2, O + 1), np.float32))
+        network(_params(), CONFIG, np.zeros((2, OBSERVATION + 1), np.float32))

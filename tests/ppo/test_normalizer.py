@@ -6,15 +6,15 @@ import pytest
 
 from swarmjax.ppo import normalizer
 
-O = 3
+OBSERVATION = 3
 
 
 def test_masked_batches_give_the_moments_of_all_valid_observations() -> None:
     random = np.random.default_rng(0)
-    state = normalizer.init(O)
+    state = normalizer.init(OBSERVATION)
     seen = []
     for size in (5, 40, 3):
-        observation = random.normal([10.0, -2.0, 0.0], [0.5, 3.0, 1.0], (size, 4, O))
+        observation = random.normal([10.0, -2.0, 0.0], [0.5, 3.0, 1.0], (size, 4, OBSERVATION))
         valid = random.random((size, 4)) < 0.5
         seen.append(observation[valid])
         observation[~valid] = np.nan
@@ -27,11 +27,11 @@ def test_masked_batches_give_the_moments_of_all_valid_observations() -> None:
 
 
 def test_a_batch_without_a_valid_observation_changes_nothing() -> None:
-    fresh = normalizer.init(O)
+    fresh = normalizer.init(OBSERVATION)
     used = normalizer.update(
-        fresh, np.arange(12, dtype=np.float32).reshape(4, O), np.ones(4, bool)
+        fresh, np.arange(12, dtype=np.float32).reshape(4, OBSERVATION), np.ones(4, bool)
     )
-    nothing = np.full((4, O), np.nan, np.float32)
+    nothing = np.full((4, OBSERVATION), np.nan, np.float32)
     for state in (fresh, used):
         after = normalizer.update(state, nothing, np.zeros(4, bool))
         jax.tree.map(np.testing.assert_array_equal, after, state)
@@ -57,18 +57,20 @@ def test_normalize_is_shift_scale_and_clip() -> None:
     # Column 3 has never moved: it is divided by the smallest deviation, 0.001.
     expected = [[1.0, -10.0, 0.0], [-0.5, 1.0, 1.0]]
     # 5.001 - 5 in float32 is off by 2**-22 * 5 / 0.001 = 2.4e-4 at most.
-    np.testing.assert_allclose(
-        normalizer.normalize(state, observation, 10.0), expected, atol=5e-4
-    )
+    np.testing.assert_allclose(normalizer.normalize(state, observation, 10.0), expected, atol=5e-4)
 
 
 def test_fresh_normalizer_leaves_observations_as_they_are() -> None:
     observation = np.array([[0.5, -3.0, 9.0]], np.float32)
     np.testing.assert_array_equal(
-        normalizer.normalize(normalizer.init(O), observation, 10.0), observation
+        normalizer.normalize(normalizer.init(OBSERVATION), observation, 10.0), observation
     )
 
 
 def test_mask_of_another_shape_is_refused() -> None:
     with pytest.raises(AssertionError):
-        normalizer.update(normalizer.init(O), np.zeros((4, 2, O), np.float32), np.ones(4, bool))
+        normalizer.update(
+            normalizer.init(OBSERVATION),
+            np.zeros((4, 2, OBSERVATION), np.float32),
+            np.ones(4, bool),
+        )

@@ -1,0 +1,38 @@
+"""What all commands share: `--help`, and errors of the user's in one sentence with exit code 2."""
+
+import sys
+from collections.abc import Callable, Sequence
+
+from swarmjax import config
+from swarmjax.config import ConfigError
+from swarmjax.policy import PolicyError
+
+USER_ERROR = 2
+
+
+def run(
+    name: str,
+    main: Callable[[Sequence[str]], int],
+    settings: type,
+    also: tuple[type[Exception], ...] = (),
+) -> int:
+    """Runs a command on the command line's arguments.
+
+    Args:
+      name: of the command, `train` say.
+      main: takes the arguments, returns the exit code.
+      settings: the dataclass of the command's keys, for `--help`.
+      also: further errors that are the user's to mend.
+
+    Returns:
+      The exit code: 2 for an error of the user's, which is printed in one sentence.
+    """
+    arguments = sys.argv[1:]
+    if {"-h", "--help"} & set(arguments):
+        sys.stdout.write(config.help_text(settings, name) + "\n")
+        return 0
+    try:
+        return main(arguments)
+    except (ConfigError, PolicyError, *also) as error:
+        sys.stderr.write(f"swarmjax.{name}: error: {error}\n")
+        return USER_ERROR

@@ -1,0 +1,103 @@
+"""`python -m swarmjax.export run=DIR`: a checkpoint becomes `policy.npz`, for NumPy alone.
+
+Usage: python -m swarmjax.export run=runs/NAME [step=UPDATE] [out=FILE]
+"""
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from swarmjax import checkpoint, command, config, policy, provenance
+from swarmjax.checkpoint import Leaves
+from swarmjax.config import ConfigError, ExportConfig, TrainConfig
+from swarmjax.ppo import normalizer
+from swarmjax.ppo import learner as ppo
+from swarmjax.task import observation
+
+
+def policy_arrays(leaves: Leaves) -> dict[str, np.ndarray]:
+    """Takes what a policy needs to act out of a checkpoint.
+
+    Args:
+      leaves: of a `TrainState`, as `checkpoint.to_leaves` names them.
+
+    Returns:
+      Arrays [L, ...] under the names of the `policy.npz` format.
+    """
+    prefix = "learners/params/actor/"
+    actor = {
+        "actor/" + name.removeprefix(prefix).removeprefix("torso/"): leaf
+        for name, leaf in leaves.items()
+        if name.startswith(prefix)
+    }
+    moments = {
+        name: leaves[f"learners/normalizer/{name}"] for name in ("count", "mean", "variance")
+    }
+    std = normalizer.Normalizer(**moments).std
+    scaling = {"normalizer/mean": moments["mean"], "normalizer/std": np.asarray(std)}
+    return actor | scaling
+
+
+def policy_meta(trained: TrainConfig, update: int) -> dict:
+    """Describes a policy: its layout with units, the config it was trained with, versions."""
+    robot = trained.robot
+    return {
+        "policy": trained.algo.policy,
+        "learners": trained.learners,
+        "activation": trained.algo.activation,
+        "observation": {
+            "names": list(observation.NAMES),
+            "units": list(observation.UNITS),
+            "limit": ppo.OBSERVATION_LIMIT,
+        },
+        "action": {
+            "names": ["speed", "turn_rate"],
+            "units": ["m/s", "rad/s"],
+            "low": [0.0, -robot.max_turn_rate],
+            "high": [robot.max_speed, robot.max_turn_rate],
+        },
+        "config": config.to_dict(trained),
+        "versions": provenance.versions(),
+        "update": update,
+    }
+
+
+def write_policy(path: Path, leaves: Leaves, trained: TrainConfig, update: int) -> None:
+    """Writes the policy of a checkpoint to `path`."""
+    policy.save(path, policy_arrays(leaves), policy_meta(trained, update))
+
+
+def read_config(run: Path) -> dict:
+    """Reads the config that a run directory was trained with.
+
+    Raises:
+      ConfigError: if there is none, or it is not JSON.
+    """
+    path = run / "config.json"
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError:
+        raise ConfigError(f"{run} is no run directory: it has no config.json.") from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ConfigError(f"{path} cannot be read: {error}.") from None
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    settings = config.load_export(arguments)
+    run = Path(settings.run)
+    trained = config.build(TrainConfig, read_config(run))
+    leaves, update, skipped = checkpoint.restore(run, settings.step)
+    for sentence in skipped:
+        sys.stderr.write(f"swarmjax.export: {sentence}: it was passed over.\n")
+    out = Path(settings.out) if settings.out else run / "policy.npz"
+    write_policy(out, leaves, trained, update)
+    sys.stdout.write(f"{out}: the policy of {run} after {update} updates.\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("export", main, ExportConfig, (checkpoint.CheckpointError,)))

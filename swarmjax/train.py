@@ -1,0 +1,152 @@
+"""`python -m swarmjax.train stage=... key=value`: trains a swarm, from the command line.
+
+With no argument it trains the default curriculum. `--help` lists every key.
+"""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+
+import jax
+
+from swarmjax import checkpoint, command, config, export, loop, provenance
+from swarmjax.checkpoint import CheckpointError
+from swarmjax.config import ConfigError, TrainConfig
+from swarmjax.curriculum import Schedule
+from swarmjax.display import Display
+from swarmjax.loop import Program, TrainState
+from swarmjax.trainer import Stop, Tally, TrainingError, compile_chunk, train
+
+INTERRUPTED = 130  # exit code: 128 + SIGINT, as a shell gives it
+FAILED = 1
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    settings = _settings(arguments)
+    program, schedule = loop.load(settings)
+    template = jax.eval_shape(partial(loop.init, program), schedule)
+    if settings.run.dry:
+        return _dry_run(program, schedule, template)
+    state, skipped = _first_state(program, schedule, template)
+    run = _open_run(settings)
+    with Stop() as stop, Display(settings.updates) as display:
+        for sentence in skipped:
+            display.say(f"{sentence}: it was passed over.")
+        display.say(f"{_opening(settings)}, into {run}; compiling")
+        try:
+            state, tally = train(run, program, schedule, state, display, stop)
+        except TrainingError as error:
+            display.say(f"swarmjax.train: error: {error} What was saved before is in {run}.")
+            return FAILED
+    _write_results(run, program, state, tally)
+    sys.stdout.write(_closing(run, settings, tally) + "\n")
+    return INTERRUPTED if stop.asked else 0
+
+
+def _settings(arguments: Sequence[str]) -> TrainConfig:
+    """Reads the command line; with `resume=` the stored config and what may be changed of it."""
+    given = dict(word.partition("=")[::2] for word in arguments)
+    if given.get("resume", "null") in ("", "null"):
+        return config.load_train(arguments)
+    run = Path(given["resume"])
+    settings = config.load_resume(export.read_config(run), arguments)
+    directory = given.get("run.dir", str(run))
+    return replace(settings, resume=str(run), run=replace(settings.run, dir=directory))
+
+
+def _first_state(
+    program: Program, schedule: Schedule, template: TrainState
+) -> tuple[TrainState, list[str]]:
+    """Starts from the seed, or from the newest sound checkpoint of the run that is resumed."""
+    if program.config.resume is None:
+        return jax.jit(partial(loop.init, program))(schedule), []
+    leaves, _, skipped = checkpoint.restore(Path(program.config.resume))
+    return checkpoint.from_leaves(leaves, template), skipped
+
+
+def _open_run(settings: TrainConfig) -> Path:
+    """Makes the run directory and writes `config.json` into it."""
+    name = f"{datetime.now():%Y%m%d-%H%M%S}-{settings.stage_name}-seed{settings.seed}"
+    run = Path(settings.run.dir) if settings.run.dir else Path("runs") / name
+    if (run / "config.json").exists() and settings.resume is None:
+        raise ConfigError(
+            f"run.dir is {run}, which holds a run already: give another directory, or "
+            f"resume={run} to go on with it."
+        )
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+        stored = config.to_dict(replace(settings, resume=None))
+        (run / "config.json").write_text(json.dumps(stored, indent=2) + "\n")
+    except OSError as error:
+        raise ConfigError(f"run.dir is {run}, which cannot be written: {error.strerror}.") from None
+    return run
+
+
+def _dry_run(program: Program, schedule: Schedule, template: TrainState) -> int:
+    """Compiles, says what it took and what a run needs, and stops."""
+    compiled = compile_chunk(program, schedule, template)
+    state, work = compiled.state_bytes / 2**20, compiled.work_bytes / 2**20
+    sys.stdout.write(
+        f"{_opening(program.config)}\n"
+        f"compiled in {compiled.seconds:.1f} s; memory: {state:.1f} MiB of state, "
+        f"{work:.1f} MiB to work with; nothing was trained (run.dry).\n"
+    )
+    return 0
+
+
+def _opening(settings: TrainConfig) -> str:
+    """Says what is about to be trained."""
+    names = ", ".join(stage.name for stage in settings.stage)
+    steps = settings.arenas * settings.algo.rollout
+    return (
+        f"swarmjax: {settings.stage_name} ({names}), {settings.updates:,} updates of {steps:,} "
+        f"arena control steps ({settings.arenas:,} arenas) on {provenance.device()}"
+    )
+
+
+def _write_results(run: Path, program: Program, state: TrainState, tally: Tally) -> None:
+    """Writes `policy.npz` and `summary.json`."""
+    settings = program.config
+    leaves = checkpoint.to_leaves(state)
+    export.write_policy(run / "policy.npz", leaves, settings, tally.update)
+    steps = tally.update * settings.arenas * settings.algo.rollout
+    trained = (tally.update - tally.first) * settings.arenas * settings.algo.rollout
+    summary = {
+        "stage": settings.stage_name,
+        "stages": [stage.name for stage in settings.stage],
+        "updates": tally.update,
+        "budget_spent": tally.update >= settings.updates,
+        "arena_steps": steps,
+        "transitions": tally.transitions,
+        "train_s": tally.seconds,
+        "compile_s": tally.compile_s,
+        "arena_steps_per_s": trained / tally.seconds if tally.seconds else None,
+        "transitions_per_s": tally.transitions / tally.seconds if tally.seconds else None,
+        "targets_reached": tally.success,
+        "promotions": tally.decisions,
+        "device": provenance.device(),
+        "versions": provenance.versions(),
+        "commit": provenance.commit(),
+    }
+    (run / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+
+
+def _closing(run: Path, settings: TrainConfig, tally: Tally) -> str:
+    """Says what to do next."""
+    if tally.update < settings.updates:
+        return (
+            f"stopped after update {tally.update:,} of {settings.updates:,}, saved; go on with: "
+            f"python -m swarmjax.train resume={run}"
+        )
+    policy = run / "policy.npz"
+    stage = settings.stage[-1].name
+    return f"done; judge the policy with: python -m swarmjax.evaluate policy={policy} stage={stage}"
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("train", main, TrainConfig, (CheckpointError,)))

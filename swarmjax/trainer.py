@@ -1,0 +1,237 @@
+"""The host side of a run: calls the compiled chunk, records, shows, saves, and stops when asked."""
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from swarmjax import curriculum, loop, recorder
+from swarmjax.checkpoint import Checkpoints
+from swarmjax.curriculum import Schedule
+from swarmjax.display import Display, summarize
+from swarmjax.loop import Program, TrainState
+from swarmjax.recorder import Recorder
+
+CALL_SECONDS = 1.0  # what a call should take when run.chunk is auto: the display's pace
+GROWTH = 4  # a call is at most this many times as long as the one before
+
+
+class TrainingError(RuntimeError):
+    """A run that cannot go on, in one sentence."""
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """The compiled chunk and what compiling it took.
+
+    Attributes:
+      call: (schedule, state, n) -> (state, metrics); the state is donated.
+      seconds: that tracing and compiling took.
+      state_bytes: of device memory for what changes in the run.
+      work_bytes: that the program needs besides.
+    """
+
+    call: Callable[[Schedule, TrainState, np.int32], tuple[TrainState, dict]]
+    seconds: float
+    state_bytes: int
+    work_bytes: int
+
+
+@dataclass
+class Tally:
+    """What the host adds up over the calls of this process, in integers that do not wrap.
+
+    Attributes:
+      update: updates of the run that are done.
+      first: updates that were done when this process began.
+      transitions: robot steps that were trained on.
+      seconds: spent training, compilation apart.
+      compile_s: spent compiling.
+      decisions: promotions.
+      success: newest measured share of targets of each stage.
+    """
+
+    update: int
+    first: int
+    compile_s: float
+    transitions: int = 0
+    seconds: float = 0.0
+    decisions: list[dict] = field(default_factory=list)
+    success: dict[str, float] = field(default_factory=dict)
+
+
+class Stop:
+    """Notices SIGINT and SIGTERM while in a `with`, so that the run can save before it stops."""
+
+    def __init__(self) -> None:
+        """Nobody has asked yet."""
+        self.asked = False
+
+    def __enter__(self) -> "Stop":
+        """Begins to listen."""
+        signals = (signal.SIGINT, signal.SIGTERM)
+        self._before = {number: signal.signal(number, self._ask) for number in signals}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Gives the signals back."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _ask(self, *_: object) -> None:
+        if self.asked:  # asked twice: not even to wait for the end of the call
+            raise KeyboardInterrupt
+        self.asked = True
+
+
+def compile_chunk(program: Program, schedule: Schedule, state: Any) -> Compiled:
+    """Compiles `loop.train_chunk` ahead of time.
+
+    Args:
+      program: the compiled side.
+      schedule: the curriculum's numbers.
+      state: a state, or what `jax.eval_shape` gives of one.
+
+    Returns:
+      The program to call.
+    """
+    began = time.perf_counter()
+    chunk = jax.jit(partial(loop.train_chunk, program), donate_argnums=1)
+    call = chunk.lower(schedule, state, np.int32(1)).compile()
+    memory = call.memory_analysis()
+    work = memory.temp_size_in_bytes + memory.output_size_in_bytes
+    seconds = time.perf_counter() - began
+    return Compiled(call, seconds, memory.argument_size_in_bytes, work)
+
+
+def train(
+    run: Path,
+    program: Program,
+    schedule: Schedule,
+    state: TrainState,
+    display: Display,
+    stop: Stop,
+) -> tuple[TrainState, Tally]:
+    """Trains until the budget is spent, `run.stop_after` is reached or somebody asks to stop.
+
+    Args:
+      run: the run directory.
+      program: the compiled side.
+      schedule: the curriculum's numbers.
+      state: where to start; donated.
+      display: shows the run.
+      stop: notices signals.
+
+    Returns:
+      The last state, which is saved, and what came of the run.
+
+    Raises:
+      TrainingError: if a loss is no longer finite; the checkpoint before that is kept.
+    """
+    settings = program.config.run
+    compiled = compile_chunk(program, schedule, state)
+    done = int(state.update)
+    tally = Tally(update=done, first=done, compile_s=compiled.seconds)
+    saved_at = time.monotonic()
+    with (
+        Recorder(run, tensorboard=settings.tensorboard, update=done) as record,
+        Checkpoints(run, settings.keep_checkpoints) as checkpoints,
+    ):
+        for n in _calls(program, tally, stop):
+            began = time.perf_counter()
+            state, metrics = compiled.call(schedule, state, np.int32(n))
+            metrics = jax.device_get(metrics)
+            _report(program, tally, metrics, n, time.perf_counter() - began, record, display)
+            if time.monotonic() - saved_at >= 60.0 * settings.checkpoint_minutes:
+                checkpoints.save(state, tally.update)
+                saved_at = time.monotonic()
+        checkpoints.save(state, tally.update)
+    return state, tally
+
+
+def _calls(program: Program, tally: Tally, stop: Stop) -> Iterator[int]:
+    """Yields how many updates the next call does, until there is nothing left to do."""
+    settings = program.config
+    goal = settings.updates
+    if settings.run.stop_after is not None:
+        goal = min(goal, settings.run.stop_after)
+    n = 1
+    while tally.update < goal and not stop.asked:
+        left = min(goal - tally.update, program.rows)
+        if settings.run.chunk == "all":
+            n = left
+        elif settings.run.chunk != "auto":
+            n = settings.run.chunk
+        elif tally.seconds:
+            pace = tally.seconds / (tally.update - tally.first)
+            n = int(np.clip(CALL_SECONDS / pace, 1, GROWTH * n))
+        yield min(n, left)
+
+
+def _report(
+    program: Program,
+    tally: Tally,
+    metrics: dict[str, np.ndarray],
+    n: int,
+    seconds: float,
+    record: Recorder,
+    display: Display,
+) -> None:
+    """Adds a call to the tally, writes it down and shows it."""
+    settings = program.config
+    names = [stage.name for stage in settings.stage]
+    control_steps = settings.arenas * settings.algo.rollout
+    rows = recorder.rows(metrics, n, names, control_steps)
+    _check_finite(rows)
+    decisions = curriculum.log(rows, names)
+    speeds = _speeds(program, rows, seconds) | {"compile_s": tally.compile_s}
+    tally.update += n
+    tally.seconds += seconds
+    tally.transitions += sum(row["transitions"] for row in rows)
+    tally.decisions += decisions
+    measured = {row["stage"]: row["stage_success"] for row in rows if row["stage_success"]}
+    tally.success |= measured
+    record.write(rows, decisions, speeds)
+    for entry in decisions:
+        display.say(_promotion(entry))
+    pace = tally.seconds / (tally.update - tally.first)
+    display.show(summarize(rows), speeds, pace * (settings.updates - tally.update))
+
+
+def _check_finite(rows: list[dict]) -> None:
+    """Stops a run whose networks have broken, before it is saved."""
+    for row in rows:
+        for name in ("policy_loss", "value_loss", "grad_norm"):
+            if row[name] is None:
+                raise TrainingError(
+                    f"{name} is no longer finite at update {row['update']}: try lower "
+                    "algo.actor_learning_rate and algo.critic_learning_rate."
+                )
+
+
+def _speeds(program: Program, rows: list[dict], seconds: float) -> dict[str, float]:
+    """Speeds of a call: arena control steps, robot steps, physics steps and transitions a second."""
+    settings = program.config
+    arena_steps = len(rows) * settings.arenas * settings.algo.rollout
+    return {
+        "arena_steps_per_s": arena_steps / seconds,
+        "robot_steps_per_s": settings.algo.rollout * sum(row["robots"] for row in rows) / seconds,
+        "physics_steps_per_s": arena_steps * settings.sim.substeps / seconds,
+        "transitions_per_s": sum(row["transitions"] for row in rows) / seconds,
+    }
+
+
+def _promotion(entry: dict) -> str:
+    """Says in one line what the curriculum decided."""
+    share = entry["targets_reached"]
+    success = "not measured yet" if share is None else f"{100 * share:.1f} % of targets reached"
+    return (
+        f"update {entry['update'] + 1}: {entry['from']} -> {entry['to']} by {entry['why']} "
+        f"({success})"
+    )

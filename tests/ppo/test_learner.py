@@ -1,0 +1,338 @@
+"""What one update must and must not do."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from swarmjax.config import AlgoConfig
+from swarmjax.ppo import learner, losses, networks
+from swarmjax.ppo.learner import Batch, LearnerState
+
+G, N, OBSERVATION, U, UPDATES = 8, 6, 3, 2, 5
+CONFIG = AlgoConfig(hidden=(8,), epochs=3, minibatches=4, entropy_cost=0.01)
+ONE_STEP = AlgoConfig(hidden=(8,), epochs=1, minibatches=1)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _update(
+    state: LearnerState, batch: Batch, key: jax.Array, config: AlgoConfig = CONFIG
+) -> tuple[LearnerState, losses.Metrics]:
+    return learner.update(state, config, batch, key, UPDATES)
+
+
+def _batch(state: LearnerState, seed: int = 0, config: AlgoConfig = CONFIG) -> Batch:
+    observation_key, noise_key, target_key, valid_key = jax.random.split(jax.random.key(seed), 4)
+    observation = 3.0 + 2.0 * jax.random.normal(observation_key, (G, N, OBSERVATION))
+    noise = jax.random.normal(noise_key, (G, N, U))
+    action, log_prob = learner.act(state, config, observation, noise)
+    advantage, return_ = 5.0 + 2.0 * jax.random.normal(target_key, (2, G, N))
+    return Batch(
+        observation=observation,
+        action=action,
+        log_prob=log_prob,
+        advantage=advantage,
+        return_=return_,
+        valid=jax.random.bernoulli(valid_key, 0.7, (G, N)),
+    )
+
+
+def _fresh(seed: int = 0, config: AlgoConfig = CONFIG) -> LearnerState:
+    return learner.init(jax.random.key(seed), config, OBSERVATION, U, UPDATES)
+
+
+def _experienced(seed: int = 0, config: AlgoConfig = CONFIG) -> LearnerState:
+    """A learner with momentum, moments, and means that depend strongly on the observation."""
+    state = _fresh(seed, config)
+    state, _ = _update(state, _batch(state, 10, config), jax.random.key(20), config=config)
+    params = jax.tree.map(jnp.copy, state.params)
+    params["actor"]["mean"]["kernel"] *= 100.0
+    return state.replace(params=params)
+
+
+def _spoilt(batch: Batch, valid: jax.Array) -> Batch:
+    """The batch with NaN wherever it is not valid."""
+
+    def spoil(x: jax.Array) -> jax.Array:
+        return jnp.where(valid.reshape(valid.shape + (1,) * (x.ndim - 2)), x, jnp.nan)
+
+    samples = {name: spoil(x) for name, x in vars(batch).items() if name != "valid"}
+    return Batch(**samples, valid=valid)
+
+
+def _assert_equal(got: object, expected: object) -> None:
+    jax.tree.map(np.testing.assert_array_equal, got, expected)
+
+
+def _step_sizes(before: networks.Params, after: networks.Params) -> dict[str, float]:
+    """The largest move of any parameter, by network."""
+    return {
+        name: max(
+            float(jnp.abs(a - b).max())
+            for a, b in zip(
+                jax.tree.leaves(after[name]), jax.tree.leaves(before[name]), strict=True
+            )
+        )
+        for name in before
+    }
+
+
+def test_act_mode_and_values_normalise_raw_observations() -> None:
+    state = _experienced()
+    observation = 3.0 + jax.random.normal(jax.random.key(1), (4, 2, OBSERVATION))
+    noise = jax.random.normal(jax.random.key(2), (4, 2, U))
+    moments = state.normalizer
+    normal = np.clip((observation - moments.mean) / np.sqrt(moments.variance), -10.0, 10.0)
+    mean, std = networks.action_distribution(state.params, CONFIG, normal)
+    action, log_prob = learner.act(state, CONFIG, observation, noise)
+    # Float32 rounding of the normalisation, through weights of order 1.
+    np.testing.assert_allclose(learner.mode(state, CONFIG, observation), mean, atol=1e-5)
+    np.testing.assert_allclose(action, mean + std * noise, atol=1e-5)
+    np.testing.assert_allclose(
+        learner.values(state, CONFIG, observation),
+        networks.value(state.params, CONFIG, normal),
+        atol=1e-5,
+    )
+    # The standardised action is the noise: -0.5 z**2 - log(std) - 0.5 log(2 pi), summed over U.
+    expected = np.sum(-0.5 * noise**2 - np.log(std) - 0.5 * np.log(2.0 * np.pi), axis=-1)
+    np.testing.assert_allclose(log_prob, expected, atol=1e-5)
+
+
+def test_observations_are_cut_at_ten_deviations() -> None:
+    far = jnp.array([1e4, -1e4, 10.5])
+    np.testing.assert_array_equal(learner.normalize(_fresh(), far), [10.0, -10.0, 10.0])
+
+
+def test_the_first_minibatch_starts_at_ratio_one_with_the_old_normalizer() -> None:
+    state = _experienced(config=ONE_STEP)
+    batch = _batch(state, 1, ONE_STEP)
+    shifted = batch.replace(observation=batch.observation + 4.0)
+    action, log_prob = learner.act(
+        state, ONE_STEP, shifted.observation, jax.random.normal(jax.random.key(3), (G, N, U))
+    )
+    shifted = shifted.replace(action=action, log_prob=log_prob)
+    updated, metrics = _update(state, shifted, jax.random.key(2), config=ONE_STEP)
+    # exp and log densities round at about 1e-6; with the updated normalizer it is of order 0.1.
+    np.testing.assert_allclose(metrics["approx_kl"], 0.0, atol=1e-5)
+    assert metrics["clip_fraction"] == 0.0
+    # At ratio 1 the surrogate is the mean of advantages that have mean 0, to rounding.
+    np.testing.assert_allclose(metrics["policy_loss"], 0.0, atol=1e-5)
+    stale = learner.act(updated, ONE_STEP, shifted.observation, jnp.zeros((G, N, U)))[0]
+    fresh = learner.act(
+        updated.replace(normalizer=state.normalizer),
+        ONE_STEP,
+        shifted.observation,
+        jnp.zeros((G, N, U)),
+    )[0]
+    assert jnp.abs(stale - fresh).max() > 0.1
+
+
+def test_the_normalizer_takes_in_the_valid_observations_after_the_update() -> None:
+    state = _fresh()
+    batch = _batch(state)
+    updated, _ = _update(state, batch, jax.random.key(1))
+    seen = np.asarray(batch.observation, np.float64)[np.asarray(batch.valid)]
+    assert updated.normalizer.count == len(seen)
+    # Float32 sums of about 35 values of order 3.
+    np.testing.assert_allclose(updated.normalizer.mean, seen.mean(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(updated.normalizer.variance, seen.var(axis=0), rtol=1e-5)
+
+
+def test_advantages_are_normalised_over_the_valid_samples_of_the_batch() -> None:
+    state = _experienced()
+    batch = _batch(state, 1)
+    key = jax.random.key(2)
+    _, expected = _update(state, batch, key)
+    _, scaled = _update(state, batch.replace(advantage=7.0 * batch.advantage - 30.0), key)
+    # Rounding of 7 a - 30 with values around 5: 1e-6 of the advantages' spread.
+    np.testing.assert_allclose(scaled["policy_loss"], expected["policy_loss"], atol=1e-5)
+    np.testing.assert_allclose(scaled["grad_norm"], expected["grad_norm"], rtol=1e-4)
+
+
+def test_metrics_of_a_single_step_equal_the_loss_over_the_whole_batch() -> None:
+    state = _experienced(config=ONE_STEP)
+    batch = _batch(state, 1, ONE_STEP)
+    _, metrics = _update(state, batch, jax.random.key(2), config=ONE_STEP)
+    valid = np.asarray(batch.valid)
+    advantage = np.asarray(batch.advantage)
+    inside = advantage[valid]
+    minibatch = losses.Minibatch(
+        observation=learner.normalize(state, batch.observation)[valid],
+        action=batch.action[valid],
+        log_prob=batch.log_prob[valid],
+        advantage=jnp.asarray((inside - inside.mean()) / inside.std()),
+        return_=batch.return_[valid],
+        valid=jnp.ones(valid.sum(), bool),
+    )
+    (_, expected), gradient = jax.value_and_grad(losses.ppo_loss, has_aux=True)(
+        state.params, minibatch, ONE_STEP, jnp.float32(valid.sum())
+    )
+    for name, metric in expected.items():
+        # The same terms, of order 1 to 10, added in another order.
+        np.testing.assert_allclose(metrics[name], metric, rtol=1e-5, atol=1e-5, err_msg=name)
+    np.testing.assert_allclose(metrics["grad_norm"], optax.tree.norm(gradient), rtol=1e-4)
+
+
+def test_invalid_samples_may_hold_nan_and_change_nothing() -> None:
+    state = _experienced()
+    batch = _batch(state, 1)
+    key = jax.random.key(2)
+    _assert_equal(_update(state, _spoilt(batch, batch.valid), key), _update(state, batch, key))
+
+
+def test_a_batch_without_a_valid_sample_changes_nothing_at_all() -> None:
+    state = _experienced()
+    batch = _spoilt(_batch(state, 1), jnp.zeros((G, N), bool))
+    updated, metrics = _update(state, batch, jax.random.key(2))
+    _assert_equal(updated, state)
+    std = metrics.pop("std")
+    np.testing.assert_allclose(std, jnp.exp(state.params["actor"]["log_std"]).mean(), rtol=1e-6)
+    assert metrics and all(metric == 0.0 for metric in metrics.values())
+
+
+def test_minibatches_without_a_valid_sample_are_no_steps() -> None:
+    state = _fresh()
+    batch = _batch(state)
+    # All valid samples are in two of eight groups: of four minibatches an epoch, at most two step.
+    valid = jnp.zeros((G, N), bool).at[0].set(True).at[5].set(True)
+    updated, _ = _update(state, _spoilt(batch, valid), jax.random.key(1))
+    steps = optax.tree.get_all_with_path(updated.optimizer_state, "count")
+    orders = [
+        jax.random.permutation(key, G).reshape(CONFIG.minibatches, -1)
+        for key in jax.random.split(jax.random.key(1), CONFIG.epochs)
+    ]
+    expected = sum(int(np.isin(order, [0, 5]).any(axis=1).sum()) for order in orders)
+    assert expected < CONFIG.epochs * CONFIG.minibatches
+    assert [int(count) for _, count in steps] == [expected] * 4
+
+
+def test_each_epoch_learns_from_every_group_once() -> None:
+    state = _fresh()
+    batch = _batch(state)
+    config = AlgoConfig(hidden=(8,), epochs=2, minibatches=4, critic_learning_rate=1e-12)
+    # With a critic that stands still, the value loss averages over every sample exactly when each
+    # epoch visits each group once. Returns 2**g tell every choice of groups apart.
+    returns = jnp.broadcast_to(2.0 ** jnp.arange(G)[:, None], (G, N))
+    batch = batch.replace(return_=returns, valid=jnp.ones((G, N), bool))
+    _, metrics = _update(state, batch, jax.random.key(1), config=config)
+    value = learner.values(state, config, batch.observation)
+    # Float32 means of squares up to 128**2.
+    np.testing.assert_allclose(
+        metrics["value_loss"], 0.5 * np.mean((value - returns) ** 2), rtol=1e-5
+    )
+
+
+def test_actor_and_critic_move_at_their_own_learning_rates() -> None:
+    state = _fresh(config=ONE_STEP)
+    updated, _ = _update(state, _batch(state, 0, ONE_STEP), jax.random.key(1), config=ONE_STEP)
+    moves = _step_sizes(state.params, updated.params)
+    # Adam's first step is rate * g / (|g| + 1e-5): the rate, less 1e-5 / |g| of it, where the
+    # largest |g| of each network is at least 1e-3 here.
+    np.testing.assert_allclose(moves["actor"], ONE_STEP.actor_learning_rate, rtol=1e-2)
+    np.testing.assert_allclose(moves["critic"], ONE_STEP.critic_learning_rate, rtol=1e-2)
+
+
+def test_one_norm_clips_the_gradient_of_both_networks() -> None:
+    state = _fresh(config=ONE_STEP)
+    updated, metrics = _update(
+        state, _batch(state, 0, ONE_STEP), jax.random.key(1), config=ONE_STEP
+    )
+    assert metrics["grad_norm"] > ONE_STEP.max_grad_norm
+    # After its first step Adam's mean is 0.1 times the gradient that it was given.
+    momentum = [mu for _, mu in optax.tree.get_all_with_path(updated.optimizer_state, "mu")]
+    # Float32 rounding of a sum of squares.
+    np.testing.assert_allclose(optax.tree.norm(momentum), 0.1 * ONE_STEP.max_grad_norm, rtol=1e-5)
+
+
+def test_linear_schedule_falls_to_zero_over_the_run_and_constant_does_not() -> None:
+    constant = AlgoConfig(hidden=(8,), epochs=1, minibatches=1, learning_rate_schedule="constant")
+    state = _fresh(config=ONE_STEP)
+    for done in range(UPDATES + 1):
+        batch = _batch(state, done, ONE_STEP)
+        key = jax.random.key(done)
+        linear_state, _ = _update(state, batch, key, config=ONE_STEP)
+        constant_state, _ = _update(state, batch, key, config=constant)
+        linear = _step_sizes(state.params, linear_state.params)
+        full = _step_sizes(state.params, constant_state.params)
+        for network in ("actor", "critic"):
+            # Moves of 1e-4 on parameters of order 1 are known to 2**-24 / 1e-4 = 6e-4.
+            np.testing.assert_allclose(
+                linear[network], (1.0 - done / UPDATES) * full[network], rtol=3e-3, atol=1e-9
+            )
+        state = linear_state
+
+
+def test_same_inputs_give_the_same_bits_and_another_key_does_not() -> None:
+    state = _experienced()
+    batch = _batch(state, 1)
+    first = _update(state, batch, jax.random.key(2))
+    _assert_equal(_update(state, batch, jax.random.key(2)), first)
+    other, _ = _update(state, batch, jax.random.key(3))
+    assert np.any(other.params["actor"]["log_std"] != first[0].params["actor"]["log_std"])
+
+
+def test_any_split_of_a_compiled_loop_gives_the_same_bits() -> None:
+    traces = []
+
+    @jax.jit
+    def chunk(state: LearnerState, start: int, stop: int) -> LearnerState:
+        traces.append(None)
+
+        def body(index: jax.Array, state: LearnerState) -> LearnerState:
+            key = jax.random.fold_in(jax.random.key(1), index)
+            return learner.update(state, CONFIG, _batch(_fresh(), 1), key, UPDATES)[0]
+
+        return jax.lax.fori_loop(start, stop, body, state)
+
+    state = _fresh()
+    for start in range(4):
+        state = chunk(state, start, start + 1)
+    _assert_equal(chunk(_fresh(), 0, 4), state)
+    assert len(traces) == 1
+
+
+def test_learners_under_vmap_equal_single_ones() -> None:
+    states = [_experienced(seed) for seed in range(3)]
+    batches = [_batch(state, seed) for seed, state in enumerate(states)]
+    # One learner whose robot is absent, as in the first stage of a curriculum.
+    batches[1] = _spoilt(batches[1], jnp.zeros((G, N), bool))
+    keys = jax.random.split(jax.random.key(5), 3)
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    stacked_batch = jax.tree.map(lambda *x: jnp.stack(x), *batches)
+    together, metrics = jax.vmap(_update)(stacked, stacked_batch, keys)
+    for i in range(3):
+        alone, alone_metrics = _update(states[i], batches[i], keys[i])
+        # A batched matrix product adds in another order; twelve Adam steps of at most 1e-3 turn
+        # its relative error of 1e-6 into 1e-5 of a step, and parameters are of order 1.
+        jax.tree.map(
+            lambda a, b, i=i: np.testing.assert_allclose(a[i], b, rtol=1e-4, atol=2e-5),
+            (together, metrics),
+            (alone, alone_metrics),
+        )
+    _assert_equal(jax.tree.map(lambda x: x[1], together), states[1])
+
+
+def test_initialised_under_vmap_each_learner_is_its_own() -> None:
+    keys = jax.random.split(jax.random.key(0), 2)
+    states = jax.vmap(lambda key: learner.init(key, CONFIG, OBSERVATION, U, UPDATES))(keys)
+    kernel = states.params["actor"]["mean"]["kernel"]
+    assert kernel.shape == (2, 8, U)
+    assert np.all(kernel[0] != kernel[1])
+
+
+@pytest.mark.parametrize("field", ["return_", "log_prob", "action", "observation"])
+def test_shapes_that_would_broadcast_are_refused(field: str) -> None:
+    state = _fresh()
+    batch = _batch(state)
+    with pytest.raises(AssertionError):
+        _update(state, batch.replace(**{field: getattr(batch, field)[:, :1]}), jax.random.key(0))
+
+
+def test_minibatches_that_do_not_divide_the_groups_are_refused() -> None:
+    state = _fresh()
+    config = AlgoConfig(hidden=(8,), minibatches=3)
+    with pytest.raises(AssertionError):
+        _update(state, _batch(state), jax.random.key(0), config=config)

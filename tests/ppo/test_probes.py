@@ -1,0 +1,167 @@
+"""Six worlds so small that value and best action are known: which part of PPO is broken?
+
+In the manner of Andy Jones, "Debugging Reinforcement Learning Systems" (2021), probe environments.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from swarmjax.config import AlgoConfig
+from swarmjax.ppo import learner
+from swarmjax.ppo.gae import generalized_advantages
+from swarmjax.ppo.learner import Batch, LearnerState
+
+WORLDS, UPDATES = 32, 60
+CONFIG = AlgoConfig(
+    hidden=(16, 16),
+    rollout=8,
+    epochs=4,
+    minibatches=4,
+    discount=0.5,
+    actor_learning_rate=1e-2,
+    critic_learning_rate=1e-2,
+)
+
+
+class Probe(NamedTuple):
+    """A world of one number: `draw` (-1 or 1) fixed for an episode, and a clock."""
+
+    length: int
+    observe: Callable[[jax.Array, jax.Array], jax.Array]
+    reward: Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
+    ends_by_truncation: bool = False
+
+
+class World(NamedTuple):
+    draw: jax.Array
+    clock: jax.Array
+
+
+def _start(key: jax.Array) -> World:
+    draw = jax.random.rademacher(key, (WORLDS,), jnp.float32)
+    return World(draw, jnp.zeros(WORLDS, jnp.int32))
+
+
+def _observe(probe: Probe, world: World) -> jax.Array:
+    return probe.observe(world.draw, world.clock.astype(jnp.float32))[:, None]
+
+
+def _act(
+    probe: Probe, state: LearnerState, world: World, key: jax.Array
+) -> tuple[World, dict[str, jax.Array]]:
+    """One step of all worlds, and what there is to learn from it."""
+    noise_key, reset_key = jax.random.split(key)
+    observation = _observe(probe, world)
+    noise = jax.random.normal(noise_key, (WORLDS, 1))
+    action, log_prob = learner.act(state, CONFIG, observation, noise)
+    reached = world._replace(clock=world.clock + 1)
+    ended = reached.clock == probe.length
+    step = {
+        "observation": observation,
+        "action": action,
+        "log_prob": log_prob,
+        "reward": probe.reward(world.draw, action[:, 0], world.clock.astype(jnp.float32)),
+        "value": learner.values(state, CONFIG, observation),
+        "next_value": learner.values(state, CONFIG, _observe(probe, reached)),
+        "terminated": ended & (not probe.ends_by_truncation),
+        "truncated": ended & probe.ends_by_truncation,
+    }
+    fresh = _start(reset_key)
+    return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, reached), step
+
+
+def _iterate(
+    probe: Probe, carry: tuple[LearnerState, World], key: jax.Array
+) -> tuple[tuple[LearnerState, World], None]:
+    state, world = carry
+    rollout_key, update_key = jax.random.split(key)
+    keys = jax.random.split(rollout_key, CONFIG.rollout)
+    world, steps = jax.lax.scan(functools.partial(_act, probe, state), world, keys)
+    advantage, return_ = generalized_advantages(
+        steps["reward"],
+        steps["value"],
+        steps["next_value"],
+        steps["terminated"],
+        steps["truncated"],
+        discount=CONFIG.discount,
+        gae_lambda=CONFIG.gae_lambda,
+    )
+    samples = {name: steps[name] for name in ("observation", "action", "log_prob")}
+    samples |= {"advantage": advantage, "return_": return_, "valid": jnp.ones_like(advantage)}
+    batch = Batch(**jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), samples))
+    state, _ = learner.update(state, CONFIG, batch, update_key, UPDATES)
+    return (state, world), None
+
+
+def _solve(probe: Probe) -> LearnerState:
+    init_key, world_key, loop_key = jax.random.split(jax.random.key(0), 3)
+
+    @jax.jit
+    def run(state: LearnerState, world: World, keys: jax.Array) -> LearnerState:
+        return jax.lax.scan(functools.partial(_iterate, probe), (state, world), keys)[0][0]
+
+    state = learner.init(init_key, CONFIG, 1, 1, UPDATES)
+    return run(state, _start(world_key), jax.random.split(loop_key, UPDATES))
+
+
+def _values(state: LearnerState, *observations: float) -> jax.Array:
+    return learner.values(state, CONFIG, jnp.array(observations)[:, None])
+
+
+def _modes(state: LearnerState, *observations: float) -> jax.Array:
+    return learner.mode(state, CONFIG, jnp.array(observations)[:, None])[:, 0]
+
+
+def test_critic_learns_a_constant() -> None:
+    state = _solve(
+        Probe(1, lambda draw, clock: 0.0 * draw, lambda draw, action, clock: 1.0 + 0.0 * draw)
+    )
+    # The target is exactly 1, so only Adam's last, shrinking steps remain.
+    np.testing.assert_allclose(_values(state, 0.0), [1.0], atol=0.01)
+
+
+def test_critic_learns_from_the_observation() -> None:
+    state = _solve(Probe(1, lambda draw, clock: draw, lambda draw, action, clock: draw))
+    # Exact targets, as above.
+    np.testing.assert_allclose(_values(state, -1.0, 1.0), [-1.0, 1.0], atol=0.01)
+
+
+def test_a_later_reward_is_discounted() -> None:
+    state = _solve(Probe(2, lambda draw, clock: clock, lambda draw, action, clock: clock))
+    # V(clock 1) = 1, V(clock 0) = 0.5 * V(clock 1). Exact targets once the later one is learnt.
+    np.testing.assert_allclose(_values(state, 0.0, 1.0), [0.5, 1.0], atol=0.01)
+
+
+def test_a_truncated_episode_is_valued_as_if_it_went_on() -> None:
+    probe = Probe(
+        3,
+        lambda draw, clock: 0.0 * draw,
+        lambda draw, action, clock: 1.0 + 0.0 * draw,
+        ends_by_truncation=True,
+    )
+    # 1 + 0.5 + 0.25 + ... = 2; were the cut an end, it would be 1.42 on average. The target moves
+    # with the critic, so it converges more slowly than above.
+    np.testing.assert_allclose(_values(_solve(probe), 0.0), [2.0], atol=0.01)
+
+
+def test_actor_learns_the_best_action() -> None:
+    state = _solve(
+        Probe(1, lambda draw, clock: 0.0 * draw, lambda draw, action, clock: -((action - 0.5) ** 2))
+    )
+    # The noise of gradients that 256 samples make, damped by the falling learning rate.
+    np.testing.assert_allclose(_modes(state, 0.0), [0.5], atol=0.02)
+
+
+def test_actor_learns_the_best_action_of_each_observation() -> None:
+    state = _solve(
+        Probe(
+            1, lambda draw, clock: draw, lambda draw, action, clock: -((action - 0.5 * draw) ** 2)
+        )
+    )
+    # As above, with half the samples for each observation.
+    np.testing.assert_allclose(_modes(state, -1.0, 1.0), [-0.5, 0.5], atol=0.02)
