@@ -36,16 +36,14 @@ def summarize(rows: Sequence[Row]) -> dict[str, Any]:
         total = sum(row[whole] for row in mine)
         return sum(row[part] for row in mine) / total if total else None
 
-    kinds = [name for name in rows[-1] if name.startswith("contacts_") and name[9:] != "per_robot"]
-    contacts = [share(name, "targets") for name in kinds]
     return {
         "stage": newest,
         "update": rows[-1]["update"] + 1,
         "episodes": sum(row["episodes"] for row in mine),
         "targets_reached": share("reached", "targets"),
-        "all_reached": share("all_reached", "episodes"),
+        "all_reached": share("complete", "episodes"),
         "return": share("reward", "targets"),
-        "contacts_per_robot": None if None in contacts else sum(filter(None, contacts)),
+        "contacts_per_robot": share("contacts", "targets"),
         "stage_success": rows[-1]["stage_success"],
         "value_loss": rows[-1]["value_loss"],
         "policy_loss": rows[-1]["policy_loss"],

@@ -39,14 +39,15 @@ def _row(raw: Row, stages: Sequence[str], control_steps: int) -> Row:
     episodes, targets = raw["episodes"], raw["targets"]
     contacts = sum(raw[f"contacts_{kind}"] for kind in gaps.KINDS)
     named = {
+        "contacts": contacts,
         "stage": stages[raw["stage"]],
         "arena_steps": (raw["update"] + 1) * control_steps,
         "targets_reached": _share(raw["reached"], targets),
-        "all_reached": _share(raw["all_reached"], episodes),
+        "all_reached": _share(raw["complete"], episodes),
         "return": _share(raw["reward"], targets),
-        "episode_steps": _share(raw["episode_steps"], episodes),
+        "episode_steps": _share(raw["steps"], episodes),
         "contacts_per_robot": _share(contacts, targets),
-        "ir_steps_share": _share(raw["sensed"], raw["episode_robot_steps"]),
+        "ir_steps_share": _share(raw["sensed"], raw["robot_steps"]),
     }
     finite = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in raw.items()}
     return finite | named

@@ -147,15 +147,15 @@ def collect(
     Returns:
       The arenas, packed; the trajectory; the episodes that ended.
     """
-    axes = env.axes(world)
+    start_value = _values(world, learners, starts.observation)
+    step = functools.partial(_step, world, learners, starts, start_value)
     unpack = functools.partial(physics.unpack, world.physics)
-    step = functools.partial(_step, world, learners, axes, starts, _values(world, learners, starts.observation))
-    arenas = arenas.replace(sim=jax.vmap(unpack, out_axes=axes.sim)(arenas.sim))
-    seen = jax.vmap(functools.partial(env.observe, world), in_axes=(axes,))(arenas)
+    arenas = arenas.replace(sim=jax.vmap(unpack)(arenas.sim))
+    seen = jax.vmap(functools.partial(env.observe, world))(arenas)
     carry = (arenas, seen, _values(world, learners, seen))
     keys = jax.random.split(key, world.config.algo.rollout)
     (arenas, _, _), (trajectory, ended) = jax.lax.scan(step, carry, keys)
-    packed = jax.vmap(physics.pack, in_axes=(axes.sim,))(arenas.sim)
+    packed = jax.vmap(physics.pack)(arenas.sim)
     return arenas.replace(sim=packed), trajectory, ended
 
 
@@ -200,7 +200,6 @@ _Carry = tuple[EnvState, Array, Array]
 def _step(
     world: World,
     learners: LearnerState,
-    axes: EnvState,
     starts: Starts,
     start_value: Array,
     carry: _Carry,
@@ -211,14 +210,11 @@ def _step(
     count = value.shape[0]
     mine = to_learners(seen, count)
     noise = jax.random.normal(key, (*mine.shape[:-1], ACTION_SIZE))
-    act = functools.partial(ppo.act, config=world.config.algo)
-    action, log_prob = jax.vmap(lambda l, o, n: act(l, observation=o, noise=n))(
+    config = world.config.algo
+    action, log_prob = jax.vmap(lambda learner, o, n: ppo.act(learner, config, o, n))(
         learners, mine, noise
     )
-    drive_on = functools.partial(env.step, world)
-    arenas, came = jax.vmap(drive_on, in_axes=(axes, 0), out_axes=(axes, 0))(
-        arenas, to_arenas(action)
-    )
+    arenas, came = jax.vmap(functools.partial(env.step, world))(arenas, to_arenas(action))
     next_value = _values(world, learners, came.observation)
     ended = _ended(arenas, came)
     arenas = restart(arenas, starts.state, came.done)
@@ -241,8 +237,10 @@ def _step(
 def _values(world: World, learners: LearnerState, seen: Array) -> Array:
     """Values [L, A, N] of observations [A, R, O]."""
     count = jax.tree.leaves(learners)[0].shape[0]
-    value = functools.partial(ppo.values, config=world.config.algo)
-    return jax.vmap(lambda l, o: value(l, observation=o))(learners, to_learners(seen, count))
+    config = world.config.algo
+    return jax.vmap(lambda learner, o: ppo.values(learner, config, o))(
+        learners, to_learners(seen, count)
+    )
 
 
 def restart(arenas: EnvState, starts: EnvState, done: Array) -> EnvState:

@@ -9,7 +9,7 @@ import contextlib
 import importlib.util
 import io
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,15 +51,12 @@ class Physics:
     Attributes:
       model: the MJX model.
       template: an `mjx.Data` to fill in.
-      axes: `mjx.Data` of 0 or None: which of its leaves have an arena axis (Warp keeps the
-        contacts of all arenas in one array).
       ids: rows of the moving bodies.
       substeps: physics steps per control step.
     """
 
     model: mjx.Model
     template: mjx.Data
-    axes: Any
     ids: sim_model.Ids
     substeps: int
 
@@ -111,28 +108,14 @@ def load(
         }
     template = mjx.make_data(model, impl=impl, **limits)
     device_model = mjx.put_model(model, impl=impl)
-    return Physics(device_model, template, _batch_axes(template, impl), ids, substeps)
+    return Physics(device_model, template, ids, substeps)
 
 
 def _quiet_warp() -> None:
     """Stops Warp from printing its banner and the name of every kernel it loads."""
     import warp
 
-    warp.config.quiet = True
-
-
-def _batch_axes(template: mjx.Data, impl: str) -> Any:
-    """Marks the leaves of `mjx.Data` that have one entry per arena with 0, the others None."""
-    if impl == "jax":
-        return jax.tree.map(lambda _: 0, template)
-    # MJX has no public word for it; `mjx.Data.where` reads the same table.
-    from mujoco.mjx._src.types import tree_path_to_attr_str
-    from mujoco.mjx.warp.types import _BATCH_DIM
-
-    table = _BATCH_DIM["Data"]
-    return jax.tree_util.tree_map_with_path(
-        lambda path, _: 0 if table.get(tree_path_to_attr_str(path), True) else None, template
-    )
+    warp.config.log_level = warp.LOG_ERROR
 
 
 def rest(qpos: Array) -> PhysicsState:

@@ -1,6 +1,6 @@
 """One arena: reset and step, pure functions that join the files beside this one.
 
-`vmap` them over arenas with `axes`. Nothing here resets by itself: a step reports what it came
+`vmap` them over arenas. Nothing here resets by itself: a step reports what it came
 to, and the rollout decides what comes next.
 """
 
@@ -132,12 +132,6 @@ def load(config: TrainConfig) -> World:
         sim.max_robots, sim.max_obstacles, config.robot.hull_radius, config.task.target_radius
     )
     return World(config, engine, spacing, sim_drive.from_config(config.robot))
-
-
-def axes(world: World) -> EnvState:
-    """Tells `vmap` where the arenas lie in an `EnvState` that holds `mjx.Data`."""
-    rest = dict.fromkeys(EnvState.__dataclass_fields__, 0)
-    return EnvState(**{**rest, "sim": world.physics.axes})
 
 
 def reset(world: World, level: Level, stage: Array, cohort: Array) -> tuple[EnvState, Array]:

@@ -1,0 +1,629 @@
+"""`python -m swarmjax.evaluate policy=FILE stage=s6`: judges a policy in MuJoCo's C engine.
+
+An independent judge: the policy is NumPy, the engine is not the one that trained, its solver
+converges, and the infrared sensors are MuJoCo's rays on the real shapes. Only the rules of the
+task are shared with training; `task/env.py` is what a step here mirrors. No JAX.
+
+Episode n of a seed starts from the same level whatever else is asked for, and every arena is
+computed on its own, so that a result does not depend on how the work is split up.
+"""
+
+import json
+import math
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from swarmjax import command, config, epuck, policy, provenance
+from swarmjax.config import ConfigError, EvaluateConfig
+from swarmjax.policy import Policy, PolicyError
+from swarmjax.sim import drive as sim_drive
+from swarmjax.sim import gaps, infrared
+from swarmjax.sim import model as sim_model
+from swarmjax.task import level, observation
+from swarmjax.task import stage as task_stage
+
+INTERRUPTED = 130  # exit code: 128 + SIGINT, as a shell gives it
+BATCH = 64  # arenas that share NumPy's cost per call; more gain little
+SOLVER_ITERATIONS = 100  # MuJoCo's own default: until its tolerance of 1e-8 is met
+_RAY_GROUPS = np.array([1, 1, 1, 0, 1, 1], np.uint8)  # rays pass through the contact spheres
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Judge:
+    """What all arenas of an evaluation share.
+
+    Attributes:
+        config: Of the evaluation.
+        policy: Who drives.
+        stage: Of the levels, fields [].
+        spacing: Sizes that levels are drawn with.
+        drive: The robot's drive, with the range of commands that the policy was trained for.
+        model: One arena, compiled.
+        ids: Rows of its moving bodies.
+        geom_robot: Of each of its geoms the robot whose contact geom it is, else -1.
+        geom_kind: Of each of its geoms the index in `gaps.KINDS` of what it belongs to.
+    """
+
+    config: EvaluateConfig
+    policy: Policy
+    stage: task_stage.Stage
+    spacing: level.Spacing
+    drive: sim_drive.Drive
+    model: mujoco.MjModel
+    ids: sim_model.Ids
+    geom_robot: np.ndarray
+    geom_kind: np.ndarray
+
+
+class Outcome(NamedTuple):
+    """What episodes came to, or have come to so far.
+
+    Attributes:
+        clock: [A] control steps since the start.
+        arrived: [A, R] whether the robot has arrived.
+        arrival: [A, R] control steps until it arrived, 0 if it has not.
+        contacts: [A, R, 3] contacts of each kind of `gaps.KINDS`.
+        sensed: [A, R] control steps before arrival with an infrared ray shorter than its range.
+        moving: [A, R] control steps before arrival.
+    """
+
+    clock: np.ndarray
+    arrived: np.ndarray
+    arrival: np.ndarray
+    contacts: np.ndarray
+    sensed: np.ndarray
+    moving: np.ndarray
+
+
+class Arenas(NamedTuple):
+    """Arenas between two control steps. Of these, MuJoCo edits `data` in place.
+
+    Attributes:
+        data: [A] of `MjData`, positions up to date.
+        target: [A, R, 2] x (m), y (m).
+        obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+        observation: [A, R, O].
+        apart: [A, R, 3] for how long there was no contact of each kind, s.
+        outcome: Since the start.
+    """
+
+    data: np.ndarray
+    target: np.ndarray
+    obstacle: np.ndarray
+    observation: np.ndarray
+    apart: np.ndarray
+    outcome: Outcome
+
+
+def load(config: EvaluateConfig, trained: Policy) -> Judge:
+    """Compiles the arena of a stage, with no more robots and obstacles than it has.
+
+    Args:
+        config: Of the evaluation.
+        trained: The policy to judge.
+
+    Returns:
+        The judge.
+
+    Raises:
+        PolicyError: If the policy observes something else, or has too few learners.
+    """
+    _check_policy(config, trained)
+    stage = task_stage.select(task_stage.stack([config.stage]), np.intp(0))
+    robots, obstacles = config.stage.robots, config.stage.obstacles
+    size = sim_model.ArenaSize(robots, obstacles, task_stage.largest_half([config.stage]))
+    spacing = level.Spacing(robots, obstacles, config.robot.hull_radius, config.task.target_radius)
+    spec = sim_model.build(
+        config.robot, size, config.task.control_step / config.substeps, ray_geoms=True
+    )
+    spec.option.iterations = SOLVER_ITERATIONS
+    # Rather numbers that are not finite than a robot put back to where its world began.
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    # All levels of a stage have obstacles of the same sizes, so these can be compiled in, and
+    # with them the bounds that MuJoCo derives from sizes.
+    example = draw_level(stage, spacing, config.seed, 0)
+    for i, half in enumerate(example.obstacle[:, 3:]):
+        spec.geom(f"obstacle{i}_box").size[:2] = half
+    compiled = spec.compile()
+    ids = sim_model.ids(compiled, size)
+    geom_robot, geom_kind = _geoms(compiled, ids)
+    return Judge(
+        config=config,
+        policy=trained,
+        stage=stage,
+        spacing=spacing,
+        drive=sim_drive.from_config(config.robot)._replace(
+            max_speed=trained.max_speed, max_turn_rate=trained.max_turn_rate
+        ),
+        model=compiled,
+        ids=ids,
+        geom_robot=geom_robot,
+        geom_kind=geom_kind,
+    )
+
+
+def _geoms(compiled: mujoco.MjModel, ids: sim_model.Ids) -> tuple[np.ndarray, np.ndarray]:
+    """Tells of each geom whose contact geom it is, and of what kind."""
+    robot = np.full(compiled.ngeom, -1)
+    kind = np.full(compiled.ngeom, gaps.KINDS.index("wall"))
+    kind[ids.obstacle_geom] = gaps.KINDS.index("obstacle")
+    for i in range(len(ids.hull_body)):
+        hull = compiled.geom(f"robot{i}_hull").id
+        robot[hull], kind[hull] = i, gaps.KINDS.index("robot")
+    return robot, kind
+
+
+def _check_policy(config: EvaluateConfig, trained: Policy) -> None:
+    found = tuple(trained.meta["observation"]["names"])
+    if found != observation.NAMES:
+        raise PolicyError(
+            f"{config.policy} observes {', '.join(found)}: expected {', '.join(observation.NAMES)}."
+        )
+    learners = len(trained.log_std)
+    if not trained.is_shared and config.stage.robots > learners:
+        raise PolicyError(
+            f"{config.policy} holds a network for each of {learners} robots, but stage.robots is "
+            f"{config.stage.robots}: give 1 to {learners}."
+        )
+
+
+def draw_level(
+    stage: task_stage.Stage, spacing: level.Spacing, seed: int, episode: int
+) -> level.Level:
+    """Draws the level that an episode starts from.
+
+    Args:
+        stage: Fields [].
+        spacing: Sizes.
+        seed: Of the evaluation.
+        episode: Its number.
+
+    Returns:
+        The level, as NumPy arrays.
+    """
+    count = level.uniform_count(spacing)
+    uniforms = np.random.default_rng([seed, episode]).random(count, dtype=np.float32)
+    return level.sample(uniforms, stage, spacing, np)
+
+
+def simulate(judge: Judge, episodes: Sequence[int]) -> Outcome:
+    """Runs episodes side by side, each until all its robots have arrived or the time is out.
+
+    Args:
+        judge: What the arenas share.
+        episodes: Their numbers.
+
+    Returns:
+        What they came to, in their order.
+
+    Raises:
+        ConfigError: If the physics of an episode breaks down.
+    """
+    rows = np.arange(len(episodes))
+    arenas = _start(judge, [_draw(judge, episode) for episode in episodes])
+    total = Outcome(*(np.zeros_like(field) for field in arenas.outcome))
+    for _ in range(judge.config.steps):
+        arenas = step(judge, arenas)
+        for whole, part in zip(total, arenas.outcome, strict=True):
+            whole[rows] = part
+        running = ~arenas.outcome.arrived.all(axis=-1)
+        if not running.all():
+            rows, arenas = rows[running], _select(arenas, running)
+        if not len(rows):
+            break
+    return total
+
+
+def _draw(judge: Judge, episode: int) -> level.Level:
+    return draw_level(judge.stage, judge.spacing, judge.config.seed, episode)
+
+
+def _select(arenas: Arenas, rows: np.ndarray) -> Arenas:
+    """Keeps some of the arenas."""
+    outcome = Outcome(*(field[rows] for field in arenas.outcome))
+    fields = arenas._asdict().items()
+    kept = {name: field[rows] for name, field in fields if name != "outcome"}
+    return Arenas(**kept, outcome=outcome)
+
+
+def _start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
+    """Puts everything in its place and observes it."""
+    count, robots = len(levels), judge.spacing.robots
+    start, target, obstacle = (
+        np.stack([getattr(each, name) for each in levels]).astype(np.float64)
+        for name in ("start", "target", "obstacle")
+    )
+    data = np.empty(count, object)
+    data[:] = [place(judge, *each) for each in zip(start, obstacle, strict=True)]
+    none = np.zeros((count, robots), np.int64)
+    outcome = Outcome(
+        clock=none[:, 0],
+        arrived=none.astype(bool),
+        arrival=none,
+        contacts=np.zeros((count, robots, len(gaps.KINDS)), np.int64),
+        sensed=none,
+        moving=none,
+    )
+    seen = read_infrared(judge, data, start, obstacle)
+    distance, bearing = observation.to_target(start, target, np)
+    return Arenas(
+        data=data,
+        target=target,
+        obstacle=obstacle,
+        observation=observation.observe(seen, distance, bearing, np),
+        apart=np.full(outcome.contacts.shape, gaps.CONTACT_PAUSE),
+        outcome=outcome,
+    )
+
+
+def place(judge: Judge, pose: np.ndarray, obstacle: np.ndarray) -> mujoco.MjData:
+    """Sets an arena up, at rest.
+
+    Args:
+        judge: What the arenas share.
+        pose: [R, 3] x (m), y (m), yaw (rad).
+        obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m; those the model was compiled for).
+
+    Returns:
+        The arena, its positions up to date.
+    """
+    data = mujoco.MjData(judge.model)
+    side = np.float64(judge.stage.side)
+    where, turn = sim_model.fixture_poses(side, obstacle, np)
+    data.mocap_pos[judge.ids.fixture_mocap] = where
+    data.mocap_quat[judge.ids.fixture_mocap] = turn
+    data.qpos = pose.reshape(-1)
+    mujoco.mj_step1(judge.model, data)
+    return data
+
+
+def step(judge: Judge, arenas: Arenas) -> Arenas:
+    """Moves arenas on by one control step; what happens in it is what `task.env.step` says.
+
+    Args:
+        judge: What the arenas share.
+        arenas: Their state before.
+
+    Returns:
+        Their state after.
+
+    Raises:
+        ConfigError: If a position is not finite.
+    """
+    task, before = judge.config.task, arenas.outcome
+    active = ~before.arrived
+    pose = _drive(judge, arenas, active)
+    seen = read_infrared(judge, arenas.data, pose, arenas.obstacle)
+    distance, bearing = observation.to_target(pose, arenas.target, np)
+    arrives = active & (distance <= task.target_radius)
+    gap = np.where(touching(judge, arenas.data), 0.0, np.inf)
+    begins, apart = gaps.count_contacts(gap, arenas.apart, task.control_step, np)
+    clock = before.clock + 1
+    outcome = Outcome(
+        clock=clock,
+        arrived=before.arrived | arrives,
+        arrival=np.where(arrives, clock[:, None], before.arrival),
+        contacts=before.contacts + begins,
+        sensed=before.sensed + (active & (seen < task.sensor_range).any(axis=-1)),
+        moving=before.moving + active,
+    )
+    seen = observation.observe(seen, distance, bearing, np)
+    return arenas._replace(observation=seen, apart=apart, outcome=outcome)
+
+
+def _drive(judge: Judge, arenas: Arenas, active: np.ndarray) -> np.ndarray:
+    """Lets the robots that are on their way drive; returns the new poses [A, R, 3]."""
+    action = policy.mean_action(judge.policy, arenas.observation)
+    wanted = sim_drive.command(action, judge.drive, np)
+    wanted = np.where(active[..., None], wanted, 0.0)
+    wheels = sim_drive.wheel_speeds(wanted, judge.drive, np)
+    velocity = sim_drive.body_velocity(wheels, judge.drive, np)
+    forward, turn_rate = velocity[..., 0], velocity[..., 1]
+    servos = np.stack([forward, np.zeros_like(forward), turn_rate], axis=-1)
+    pose = np.empty((*servos.shape[:-2], judge.model.nq))
+    for i, (data, ctrl) in enumerate(zip(arenas.data, servos.reshape(len(pose), -1), strict=True)):
+        data.ctrl = ctrl
+        # The halves of mj_step, the other way round: the positions that the rays of this control
+        # step need are those that the next one starts from.
+        for _ in range(judge.config.substeps):
+            mujoco.mj_step2(judge.model, data)
+            mujoco.mj_step1(judge.model, data)
+        pose[i] = data.qpos
+    if not np.isfinite(pose).all():
+        raise ConfigError(
+            "the physics broke down, with positions that are not finite: give substeps of more "
+            f"than {judge.config.substeps}, or a robot nearer to the real one."
+        )
+    return pose.reshape(*servos.shape[:-1], 3)
+
+
+def touching(judge: Judge, data: np.ndarray) -> np.ndarray:
+    """Tells which robots touch anything, by the contacts that MuJoCo found.
+
+    Args:
+        judge: What the arenas share.
+        data: [A] of `MjData`, positions up to date.
+
+    Returns:
+        [A, R, 3] bool, in the order of `gaps.KINDS`.
+    """
+    pairs = [each.contact.geom for each in data]
+    arena = np.repeat(np.arange(len(data)), [len(pair) for pair in pairs])
+    first, second = np.concatenate(pairs).T
+    found = np.zeros((len(data), judge.spacing.robots, len(gaps.KINDS)), bool)
+    for mine, other in ((first, second), (second, first)):
+        hull = judge.geom_robot[mine] >= 0
+        found[arena[hull], judge.geom_robot[mine[hull]], judge.geom_kind[other[hull]]] = True
+    return found
+
+
+def read_infrared(
+    judge: Judge, data: np.ndarray, pose: np.ndarray, obstacle: np.ndarray
+) -> np.ndarray:
+    """Reads the infrared sensors by MuJoCo's rays.
+
+    A ray that starts inside something reads 0. MuJoCo reports where such a ray leaves, on a face
+    whose normal points along it; so of each sensor two rays are cast, ahead and back, and the
+    sensor is inside something if either of them leaves. Things overlap a little where robots
+    push, so that a single ray may enter a second thing before it leaves the first.
+
+    Args:
+        judge: What the arenas share.
+        data: [A] of `MjData`, positions up to date.
+        pose: [A, R, 3] x (m), y (m), yaw (rad).
+        obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+
+    Returns:
+        [A, R, K] distance from the sensor's origin to the nearest surface, m, 0..sensor_range.
+    """
+    limit = judge.config.task.sensor_range
+    origin, direction = infrared.rays(pose, np)
+    near = _near(judge, origin + 0.5 * limit * direction, pose[..., :2], obstacle)
+    origin, direction = origin[near], direction[near]
+    flat = np.zeros((len(origin), 1))
+    origin = np.concatenate([origin, flat + epuck.SENSOR_HEIGHT], axis=-1)
+    toward = np.concatenate([direction, flat, -direction, flat], axis=-1)
+    distance, normal = np.zeros((len(origin), 2)), np.zeros_like(toward)
+    geom = np.empty(2, np.int32)
+    cast, far = partial(mujoco.mj_multiRay, judge.model), mujoco.mjMAXVAL
+    arena, robot, _ = np.nonzero(near)
+    body = judge.ids.hull_body[robot].tolist()
+    rays = zip(data[arena], body, origin, toward, distance, normal, strict=True)
+    for where, me, start, ways, reach, face in rays:
+        cast(where, start, ways, _RAY_GROUPS, True, me, geom, reach, face, 2, far)
+    leaves = (normal * toward).reshape(-1, 2, 3).sum(axis=-1) > 0.0
+    ahead = np.where(distance[:, 0] < 0.0, limit, distance[:, 0])  # -1: nothing there
+    seen = np.full(near.shape, limit)
+    seen[near] = np.where(leaves.any(axis=-1), 0.0, np.minimum(ahead, limit))
+    return seen
+
+
+def _near(judge: Judge, middle: np.ndarray, place: np.ndarray, obstacle: np.ndarray) -> np.ndarray:
+    """Tells [A, R, K] whether a ray may meet anything, by circles about it and all things.
+
+    Casting a ray costs more than all else, and most have nothing to meet.
+
+    Args:
+        judge: What the arenas share.
+        middle: [A, R, K, 2] of the rays, m.
+        place: [A, R, 2] of the robots, m.
+        obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+
+    Returns:
+        [A, R, K].
+    """
+    myself = np.eye(place.shape[-2], dtype=bool)[:, None]
+    robots = _apart(middle, place) - judge.spacing.hull_radius
+    boxes = _apart(middle, obstacle[..., :2])
+    boxes -= np.linalg.norm(obstacle[:, None, None, :, 3:], axis=-1)
+    wall = 0.5 * judge.stage.side - np.abs(middle).max(axis=-1)
+    things = [np.where(myself, np.inf, robots), boxes, wall[..., None]]
+    radius = 0.5 * judge.config.task.sensor_range
+    return np.concatenate(things, axis=-1).min(axis=-1) <= radius
+
+
+def _apart(ray: np.ndarray, thing: np.ndarray) -> np.ndarray:
+    """Distances [A, R, K, N] from points [A, R, K, 2] to points [A, N, 2], m."""
+    offset = ray[..., None, :] - thing[:, None, None]
+    return np.sqrt(np.einsum("...i,...i", offset, offset))
+
+
+def evaluate(
+    config: EvaluateConfig, trained: Policy, report: Callable[[int], None] = lambda _: None
+) -> dict[str, Any]:
+    """Judges a policy.
+
+    Args:
+        config: Of the evaluation.
+        trained: The policy.
+        report: Told how many more episodes are over, now and then.
+
+    Returns:
+        The result, plain data for JSON; `docs/interface.md` lists it.
+
+    Raises:
+        PolicyError: If the policy does not fit the stage.
+        ConfigError: If the physics breaks down.
+    """
+    parts = []
+    for part in _simulate_all(config, trained):
+        parts.append(part)
+        report(len(part.clock))
+    outcome = Outcome(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+    return summarize(outcome, config.task.control_step) | {
+        "episodes": config.episodes,
+        "engine": config.engine,
+        "robot": config.robot.body,
+        "stage": config.stage.name,
+        "steps": config.steps,
+        "seed": config.seed,
+        "policy": config.policy,
+        "policy_digest": trained.digest,
+        "versions": provenance.versions(),
+    }
+
+
+def _simulate_all(config: EvaluateConfig, trained: Policy) -> Iterator[Outcome]:
+    """Runs all episodes in batches, by as many processes as are useful."""
+    workers = config.workers or _cores()
+    size = min(BATCH, math.ceil(config.episodes / workers))
+    batches = [
+        range(first, min(first + size, config.episodes))
+        for first in range(0, config.episodes, size)
+    ]
+    workers = min(workers, len(batches))
+    work = partial(_simulate_batch, config, trained)
+    if workers == 1:
+        yield from map(work, batches)
+        return
+    # Ctrl-C is for the process that asked; the others end when it leaves.
+    ignore = (signal.SIGINT, signal.SIG_IGN)
+    with ProcessPoolExecutor(workers, get_context("spawn"), signal.signal, ignore) as pool:
+        yield from pool.map(work, batches)
+
+
+def _simulate_batch(config: EvaluateConfig, trained: Policy, episodes: range) -> Outcome:
+    return simulate(load(config, trained), episodes)
+
+
+def _cores() -> int:
+    """Counts the cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def summarize(outcome: Outcome, control_step: float) -> dict[str, Any]:
+    """Sums episodes up.
+
+    Args:
+        outcome: Of all episodes.
+        control_step: s.
+
+    Returns:
+        Shares (0..1) of targets reached and of episodes in which all were, with the standard
+        errors of these means over episodes (null for a single one); contacts a robot and episode;
+        share of robot steps before arrival with anything in infrared range; mean times of an
+        episode and of an arrival (s, null where none arrived).
+    """
+    reached = outcome.arrived.mean(axis=-1)
+    complete = outcome.arrived.all(axis=-1)
+    contacts = outcome.contacts.mean(axis=(0, 1))
+    arrivals = outcome.arrival[outcome.arrived]
+    return {
+        "targets_reached": float(reached.mean()),
+        "targets_reached_se": _standard_error(reached),
+        "all_reached": float(complete.mean()),
+        "all_reached_se": _standard_error(complete),
+        "contacts_per_robot": float(contacts.sum()),
+        "contacts_per_robot_by_kind": dict(zip(gaps.KINDS, contacts.tolist(), strict=True)),
+        "ir_steps_share": float(outcome.sensed.sum() / outcome.moving.sum()),
+        "episode_time_s": float(outcome.clock.mean() * control_step),
+        "arrival_time_s": float(arrivals.mean() * control_step) if len(arrivals) else None,
+    }
+
+
+def _standard_error(values: np.ndarray) -> float | None:
+    """Estimates the standard error of the mean of independent values; none for one alone."""
+    if len(values) < 2:
+        return None
+    return float(np.std(values, ddof=1) / math.sqrt(len(values)))
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    settings = config.load_evaluate(arguments)
+    trained = policy.load(settings.policy)
+    if settings.out is not None:
+        _check_out(Path(settings.out))
+    progress = Progress(console=Console(stderr=True), transient=True)
+    progress.disable = not progress.console.is_terminal
+    try:
+        with progress:
+            bar = progress.add_task("episodes", total=settings.episodes)
+            result = evaluate(settings, trained, partial(progress.advance, bar))
+    except KeyboardInterrupt:
+        sys.stderr.write("swarmjax.evaluate: interrupted, nothing was written.\n")
+        return INTERRUPTED
+    if settings.out is not None:
+        _write(Path(settings.out), result)
+    _print(Console(), result)
+    return 0
+
+
+def _check_out(path: Path) -> None:
+    """Makes the folder of the result, before there is one to lose."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(path, error.strerror) from None
+    if path.is_dir():
+        raise _unwritable(path, "it is a folder")
+    if not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise _unwritable(path, "permission denied")
+
+
+def _write(path: Path, result: dict[str, Any]) -> None:
+    try:
+        path.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n")
+    except OSError as error:
+        raise _unwritable(path, error.strerror) from None
+
+
+def _unwritable(path: Path, reason: str | None) -> ConfigError:
+    return ConfigError(f"out is {path}, which cannot be written: {reason}.")
+
+
+def _print(console: Console, result: dict[str, Any]) -> None:
+    """Prints a table, plain where it is not for a terminal."""
+    table = Table(
+        title=f"{result['policy']} on {result['stage']}, {result['episodes']:,} episodes",
+        title_justify="left",
+        box=box.SIMPLE if console.is_terminal else None,
+        show_header=False,
+    )
+    table.add_column()
+    table.add_column(justify="right")
+    for row in _rows(result):
+        table.add_row(*row)
+    console.print(table)
+
+
+def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
+    """Words of the table; shares with the 95 % interval of a normal mean, 1.96 standard errors."""
+    kinds = result["contacts_per_robot_by_kind"]
+    arrival = result["arrival_time_s"]
+    return [
+        ("targets reached", _share(result, "targets_reached")),
+        ("all robots reached", _share(result, "all_reached")),
+        ("contacts per robot", f"{result['contacts_per_robot']:.2f}"),
+        *((f"  with {kind}", f"{contacts:.2f}") for kind, contacts in kinds.items()),
+        ("steps with infrared", f"{100 * result['ir_steps_share']:.1f} %"),
+        ("episode time", f"{result['episode_time_s']:.1f} s"),
+        ("arrival time", "-" if arrival is None else f"{arrival:.1f} s"),
+    ]
+
+
+def _share(result: dict[str, Any], key: str) -> str:
+    error = result[f"{key}_se"]
+    interval = "" if error is None else f" ± {196 * error:.1f}"
+    return f"{100 * result[key]:.1f}{interval} %"
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("evaluate", main, EvaluateConfig))
