@@ -214,8 +214,9 @@ def simulate(judge: Judge, episodes: Sequence[int]) -> Outcome:
     Raises:
         ConfigError: If the physics of an episode breaks down.
     """
-    rows = np.arange(len(episodes))
-    arenas = _start(judge, [_draw(judge, episode) for episode in episodes])
+    rows, seed = np.arange(len(episodes)), judge.config.seed
+    levels = [draw_level(judge.stage, judge.spacing, seed, episode) for episode in episodes]
+    arenas = start(judge, levels)
     total = Outcome(*(np.zeros_like(field) for field in arenas.outcome))
     for _ in range(judge.config.steps):
         arenas = step(judge, arenas)
@@ -229,10 +230,6 @@ def simulate(judge: Judge, episodes: Sequence[int]) -> Outcome:
     return total
 
 
-def _draw(judge: Judge, episode: int) -> level.Level:
-    return draw_level(judge.stage, judge.spacing, judge.config.seed, episode)
-
-
 def _select(arenas: Arenas, rows: np.ndarray) -> Arenas:
     """Keeps some of the arenas."""
     outcome = Outcome(*(field[rows] for field in arenas.outcome))
@@ -241,15 +238,23 @@ def _select(arenas: Arenas, rows: np.ndarray) -> Arenas:
     return Arenas(**kept, outcome=outcome)
 
 
-def _start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
-    """Puts everything in its place and observes it."""
+def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
+    """Starts episodes.
+
+    Args:
+        judge: What the arenas share.
+        levels: [A], with no more robots and obstacles than the judge's stage has.
+
+    Returns:
+        The arenas at rest, observed.
+    """
     count, robots = len(levels), judge.spacing.robots
-    start, target, obstacle = (
+    pose, target, obstacle = (
         np.stack([getattr(each, name) for each in levels]).astype(np.float64)
         for name in ("start", "target", "obstacle")
     )
     data = np.empty(count, object)
-    data[:] = [place(judge, *each) for each in zip(start, obstacle, strict=True)]
+    data[:] = [place(judge, *each) for each in zip(pose, obstacle, strict=True)]
     none = np.zeros((count, robots), np.int64)
     outcome = Outcome(
         clock=none[:, 0],
@@ -259,8 +264,8 @@ def _start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
         sensed=none,
         moving=none,
     )
-    seen = read_infrared(judge, data, start, obstacle)
-    distance, bearing = observation.to_target(start, target, np)
+    seen = read_infrared(judge, data, pose, obstacle)
+    distance, bearing = observation.to_target(pose, target, np)
     return Arenas(
         data=data,
         target=target,
@@ -591,12 +596,9 @@ def _unwritable(path: Path, reason: str | None) -> ConfigError:
 
 def _print(console: Console, result: dict[str, Any]) -> None:
     """Prints a table, plain where it is not for a terminal."""
-    table = Table(
-        title=f"{result['policy']} on {result['stage']}, {result['episodes']:,} episodes",
-        title_justify="left",
-        box=box.SIMPLE if console.is_terminal else None,
-        show_header=False,
-    )
+    title = f"{result['policy']} on {result['stage']}, {result['episodes']:,} episodes"
+    console.print(title, highlight=False, markup=False, soft_wrap=True)
+    table = Table(box=box.SIMPLE if console.is_terminal else None, show_header=False)
     table.add_column()
     table.add_column(justify="right")
     for row in _rows(result):

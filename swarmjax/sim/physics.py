@@ -23,7 +23,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # it prints twice where Warp is
     from mujoco import mjx
 
 # Newton iterations and line-search steps; see docs/design.md for what was measured.
-SOLVER_STEPS = {"jax": (3, 5), "warp": (20, 10)}
+SOLVER_STEPS = {"jax": (3, 5), "warp": (100, 50)}
 # Contacts are stored for all arenas together by Warp: an average of this many a robot is far more
 # than a swarm makes; each arena alone may have SOLVER_ROWS_PER_ROBOT.
 CONTACTS_PER_ROBOT = 3

@@ -1,5 +1,7 @@
 """Networks against a forward pass in NumPy, the Gaussian against SciPy."""
 
+from collections.abc import Callable
+
 import hypothesis
 import hypothesis.extra.numpy as hypothesis_numpy
 import hypothesis.strategies as st
@@ -109,6 +111,6 @@ def test_actor_and_critic_share_nothing() -> None:
 
 
 @pytest.mark.parametrize("network", [networks.action_distribution, networks.value])
-def test_wrong_observation_size_is_refused(network) -> None:  # noqa: ANN001 (either function)
+def test_wrong_observation_size_is_refused(network: Callable[..., object]) -> None:
     with pytest.raises(AssertionError):
         network(_params(), CONFIG, np.zeros((2, OBSERVATION + 1), np.float32))

@@ -1,0 +1,62 @@
+"""One tiny configuration, compiled once and kept between runs, for every test that simulates."""
+
+import os
+
+os.environ["JAX_PLATFORMS"] = "cpu"  # before anything imports JAX
+
+from collections.abc import Callable
+
+import hypothesis
+import jax
+import pytest
+
+from swarmjax.config import AlgoConfig, SimConfig, StageConfig, TaskConfig, TrainConfig
+from swarmjax.task import env
+from swarmjax.task.env import EnvState, TimeStep, World
+from swarmjax.task.level import Level
+
+ArenaStep = Callable[[EnvState, jax.Array], tuple[EnvState, TimeStep]]
+
+hypothesis.settings.register_profile("swarmjax", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("swarmjax")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keeps compiled programs in `.pytest_cache`, so that a second run compiles nothing."""
+    if config.cache is not None:
+        jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("jax")))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+@pytest.fixture(scope="session")
+def tiny_config() -> TrainConfig:
+    """The smallest run that has everything: two stages, absent robots, obstacles, minibatches."""
+    return TrainConfig(
+        stage=(
+            StageConfig(name="pair", robots=2, side=0.5),
+            StageConfig(name="trio", robots=3, side=0.8, obstacles=2),
+        ),
+        task=TaskConfig(step_limit=16),
+        algo=AlgoConfig(hidden=(8,), rollout=8, minibatches=2, epochs=2),
+        sim=SimConfig(impl="jax", max_robots=3, max_obstacles=2),
+        arenas=8,
+        budget=8 * 8 * 20,
+    )
+
+
+@pytest.fixture(scope="session")
+def tiny_world(tiny_config: TrainConfig) -> World:
+    return env.load(tiny_config)
+
+
+@pytest.fixture(scope="session")
+def tiny_step(tiny_world: World) -> ArenaStep:
+    """One control step of 8 arenas: state with `mjx.Data`, action [8, 3, 2]."""
+    axes = env.axes(tiny_world)
+    return jax.jit(
+        jax.vmap(
+            lambda state, action: env.step(tiny_world, state, action),
+            in_axes=(axes, 0),
+            out_axes=(axes, 0),
+        )
+    )

@@ -1,0 +1,112 @@
+"""The compiled model: what the ids point at, what may touch what, where things are put."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from swarmjax import epuck
+from swarmjax.config import RobotConfig
+from swarmjax.sim import model
+from swarmjax.sim.model import ArenaSize
+
+SIZE = ArenaSize(robots=3, obstacles=2, largest_half=0.15)
+STEP = 0.032  # s
+
+
+@pytest.fixture(scope="module")
+def compiled() -> mujoco.MjModel:
+    return model.build(RobotConfig(), SIZE, STEP).compile()
+
+
+def test_ids_point_at_the_named_bodies(compiled: mujoco.MjModel) -> None:
+    ids = model.ids(compiled, SIZE)
+    fixtures = [
+        next(b for b in range(compiled.nbody) if compiled.body_mocapid[b] == row)
+        for row in ids.fixture_mocap
+    ]
+    names = [compiled.body(b).name for b in fixtures]
+    assert names == ["obstacle0", "obstacle1", "wall0", "wall1", "wall2", "wall3"]
+    assert [compiled.geom(g).name for g in ids.obstacle_geom] == ["obstacle0_box", "obstacle1_box"]
+    assert [compiled.body(b).name for b in ids.hull_body] == ["robot0", "robot1", "robot2"]
+
+
+@pytest.mark.parametrize("size", [ArenaSize(1, 0, 0.05), ArenaSize(5, 4, 0.05)])
+def test_sizes(size: ArenaSize) -> None:
+    built = model.build(RobotConfig(), size, STEP).compile()
+    ids = model.ids(built, size)
+    assert (built.nq, built.nv, built.nu) == (3 * size.robots,) * 3
+    assert len(ids.obstacle_geom) == size.obstacles
+    assert len(ids.fixture_mocap) == size.obstacles + 4
+    assert built.opt.timestep == STEP
+
+
+def test_only_hulls_touch(compiled: mujoco.MjModel) -> None:
+    # Nothing collides by type; the pairs are all of hull-hull (3), hull-obstacle and hull-wall.
+    assert not compiled.geom_contype.any()
+    assert not compiled.geom_conaffinity.any()
+    pairs = {
+        frozenset(compiled.geom(int(g)).name for g in pair)
+        for pair in zip(compiled.pair_geom1, compiled.pair_geom2, strict=True)
+    }
+    hulls = [f"robot{i}_hull" for i in range(3)]
+    fixed = ["obstacle0_box", "obstacle1_box", "wall0_box", "wall1_box", "wall2_box", "wall3_box"]
+    expected = {frozenset((a, b)) for a in hulls for b in fixed}
+    expected |= {frozenset((a, b)) for a in hulls for b in hulls if a != b}
+    assert pairs == expected
+    assert compiled.npair == 3 + 3 * 6
+    assert (compiled.pair_dim == 1).all()
+
+
+def test_robot_has_the_numbers_of_the_config() -> None:
+    robot = RobotConfig(mass=0.2, yaw_inertia=3e-4, hull_radius=0.04, track=0.06, friction=0.5)
+    built = model.build(robot, SIZE, STEP).compile()
+    body = built.body("robot1")
+    assert body.mass[0] == 0.2
+    assert body.inertia[2] == 3e-4
+    assert built.geom("robot1_hull").size[0] == 0.04
+    # Coulomb: 0.5 * 0.2 kg * 9.81 = 0.981 N along either axis, times 0.03 m as a torque.
+    limits = built.actuator_forcerange[3:6, 1]
+    np.testing.assert_allclose(limits, [0.981, 0.981, 0.981 * 0.03], rtol=1e-12)
+    np.testing.assert_array_equal(built.actuator_forcerange[:, 0], -built.actuator_forcerange[:, 1])
+    # Deadbeat: inertia / step.
+    gains = built.actuator_gainprm[3:6, 0]
+    np.testing.assert_allclose(gains, [0.2 / STEP, 0.2 / STEP, 3e-4 / STEP], rtol=1e-12)
+
+
+def test_a_ray_sees_the_hull_as_the_webots_cylinder() -> None:
+    assert "robot0_body" not in _geom_names(ray_geoms=False)
+    built = model.build(RobotConfig(), SIZE, STEP, ray_geoms=True).compile()
+    geom = built.geom("robot0_body")
+    assert geom.type[0] == mujoco.mjtGeom.mjGEOM_CYLINDER
+    radius, half = geom.size[0], geom.size[1]
+    assert radius == 0.037
+    # 1e-12 m: rounding of float64; z from 0.0025 to 0.0475 m.
+    assert geom.pos[2] - half == pytest.approx(0.0025, abs=1e-12)
+    assert geom.pos[2] + half == pytest.approx(0.0475, abs=1e-12)
+    assert geom.pos[2] - half < epuck.SENSOR_HEIGHT < geom.pos[2] + half
+
+
+def _geom_names(*, ray_geoms: bool) -> list[str]:
+    built = model.build(RobotConfig(), SIZE, STEP, ray_geoms=ray_geoms).compile()
+    return [built.geom(i).name for i in range(built.ngeom)]
+
+
+def test_fixtures_stand_where_the_level_says(compiled: mujoco.MjModel) -> None:
+    side = 0.9
+    obstacle = np.array([[0.1, -0.2, 0.4, 0.05, 0.02], [-0.3, 0.1, 2.0, 0.15, 0.05]])
+    ids, data = model.ids(compiled, SIZE), mujoco.MjData(compiled)
+    place, turn = model.fixture_poses(side, obstacle, np)
+    data.mocap_pos[ids.fixture_mocap], data.mocap_quat[ids.fixture_mocap] = place, turn
+    mujoco.mj_forward(compiled, data)
+    for i, (x, y, yaw) in enumerate(obstacle[:, :3]):
+        box = data.geom(f"obstacle{i}_box")
+        np.testing.assert_allclose(box.xpos[:2], [x, y], atol=1e-12)  # rounding of float64
+        expected = [np.cos(yaw), np.sin(yaw)]
+        np.testing.assert_allclose(box.xmat.reshape(3, 3)[:2, 0], expected, atol=1e-12)  # likewise
+    for i, outward in enumerate([(1, 0), (0, 1), (-1, 0), (0, -1)]):
+        box, half = data.geom(f"wall{i}_box"), compiled.geom(f"wall{i}_box").size
+        extent = np.abs(box.xmat.reshape(3, 3)[:2]) @ half
+        # The inner face is half a side away; 1e-7 m: bearings are kept in float32.
+        assert np.dot(box.xpos[:2] - extent * outward, outward) == pytest.approx(0.45, abs=1e-7)
+        # Along the wall it is longer than the largest arena, 4 m.
+        assert (extent * (1 - np.abs(outward))).sum() >= 2.0
