@@ -105,7 +105,7 @@ def init() -> Curriculum:
         age=jnp.zeros((), jnp.int32),
         current=_empty(),
         previous=_empty(),
-        success=jnp.full((), jnp.nan),
+        success=jnp.full((), jnp.nan, jnp.float32),
     )
 
 

@@ -4,6 +4,7 @@ import os
 
 os.environ["JAX_PLATFORMS"] = "cpu"  # before anything imports JAX
 
+import functools
 from collections.abc import Callable
 
 import hypothesis
@@ -13,7 +14,6 @@ import pytest
 from swarmjax.config import AlgoConfig, SimConfig, StageConfig, TaskConfig, TrainConfig
 from swarmjax.task import env
 from swarmjax.task.env import EnvState, TimeStep, World
-from swarmjax.task.level import Level
 
 ArenaStep = Callable[[EnvState, jax.Array], tuple[EnvState, TimeStep]]
 
@@ -52,11 +52,4 @@ def tiny_world(tiny_config: TrainConfig) -> World:
 @pytest.fixture(scope="session")
 def tiny_step(tiny_world: World) -> ArenaStep:
     """One control step of 8 arenas: state with `mjx.Data`, action [8, 3, 2]."""
-    axes = env.axes(tiny_world)
-    return jax.jit(
-        jax.vmap(
-            lambda state, action: env.step(tiny_world, state, action),
-            in_axes=(axes, 0),
-            out_axes=(axes, 0),
-        )
-    )
+    return jax.jit(jax.vmap(functools.partial(env.step, tiny_world)))

@@ -1,7 +1,8 @@
 """The judge against hand-worked numbers, against the training environment, and as a command."""
 
+import dataclasses
 import json
-import re
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,52 +17,467 @@ from swarmjax import command, evaluate, policy
 from swarmjax.config import (
     ConfigError,
     EvaluateConfig,
-    RobotConfig,
     SimConfig,
     StageConfig,
     TaskConfig,
     TrainConfig,
-    load_evaluate,
 )
 from swarmjax.evaluate import Arenas, Judge, Outcome
-from swarmjax.policy import Policy, PolicyError
-from swarmjax.sim import gaps
+from swarmjax.policy import PolicyError
+from swarmjax.sim import gaps, physics
 from swarmjax.task import env, level, observation
 
-SPEED = 0.1256  # m/s; largest command
-STEP = 0.032  # s; control step
-RADIUS = 0.037  # m; of the hull
-# relu(bearing) and relu(-bearing) become the turn 2 * bearing and the speed 1 - 2 * |bearing|.
-STEER = ([[0.0, 1.0], [-2.0, -2.0], [2.0, -2.0]], "relu")
+SPEED = 0.1256  # m/s, the largest command
+STEP = 0.032  # s, a control step
+STRIDE = SPEED * STEP  # m; the servo has the speed within one control step
+# Action of a policy by hand: at bearing 0, and what each radian to the left and right adds.
+STEER = ((1.0, 0.0), (-2.0, 2.0), (-2.0, -2.0))
+AHEAD = ((1.0, 0.0), (0.0, 0.0), (0.0, 0.0))
+STAY = ((-1.0, 0.0), (0.0, 0.0), (0.0, 0.0))
+SPIN = ((-1.0, 1.0), (0.0, 0.0), (0.0, 0.0))
 
 
-def _write(path: Path, mean: list[list[float]], activation: str = "relu", **meta: Any) -> Path:
-    """Writes a policy by hand: `mean` is [bias, weight of bearing > 0, of bearing < 0][speed, turn]."""
-    kernel = np.zeros((1, observation.SIZE, 2), np.float32)
-    kernel[0, observation.NAMES.index("target_bearing")] = [1.0, -1.0]
-    zero, one = np.zeros((1, observation.SIZE), np.float32), np.ones((1, observation.SIZE), np.float32)
-    weights = np.array([mean], np.float32)
+def _policy(path: Path, drive: tuple = STEER, learners: int = 1, **meta: Any) -> Path:
+    """Writes a policy of one hidden layer, relu(bearing) and relu(-bearing)."""
+    bearing = np.zeros((1, observation.SIZE, 2))
+    bearing[0, observation.NAMES.index("target_bearing")] = [1.0, -1.0]
+    zero = np.zeros((1, observation.SIZE))
     arrays = {
-        "actor/hidden_0/kernel": kernel,
-        "actor/hidden_0/bias": np.zeros((1, 2), np.float32),
-        "actor/mean/kernel": weights[:, 1:],
-        "actor/mean/bias": weights[:, 0],
-        "actor/log_std": np.zeros((1, 2), np.float32),
+        "actor/hidden_0/kernel": bearing,
+        "actor/hidden_0/bias": zero[:, :2],
+        "actor/mean/kernel": np.array([drive[1:]]),
+        "actor/mean/bias": np.array([drive[0]]),
+        "actor/log_std": zero[:, :2],
         "normalizer/mean": zero,
-        "normalizer/std": one,
+        "normalizer/std": zero + 1.0,
     }
-    layout = {"names": list(observation.NAMES), "units": list(observation.UNITS), "limit": 10.0}
-    limits = {"low": [0.0, -3.14], "high": [SPEED, 3.14]}
-    action = {"names": ["speed", "turn_rate"], "units": ["m/s", "rad/s"]} | limits
+    arrays = {n: np.repeat(a, learners, 0).astype(np.float32) for n, a in arrays.items()}
     full = {
         "policy": "shared",
-        "learners": 1,
-        "activation": activation,
-        "observation": layout,
-        "action": action,
+        "learners": learners,
+        "activation": "relu",
+        "observation": {
+            "names": list(observation.NAMES),
+            "units": list(observation.UNITS),
+            "limit": 10.0,
+        },
+        "action": {
+            "names": ["speed", "turn_rate"],
+            "units": ["m/s", "rad/s"],
+            "low": [0.0, -3.14],
+            "high": [SPEED, 3.14],
+        },
         "config": {},
         "versions": {},
         "update": 0,
     }
     policy.save(path, arrays, full | meta)
     return path
+
+
+def _stage(robots: int = 1, side: float = 1.0, obstacles: int = 0, **rest: Any) -> StageConfig:
+    return StageConfig(name="test", robots=robots, side=side, obstacles=obstacles, **rest)
+
+
+def _judge(tmp_path: Path, stage: StageConfig, drive: tuple = STEER, **rest: Any) -> Judge:
+    path = _policy(tmp_path / "policy.npz", drive)
+    config = EvaluateConfig(policy=str(path), stage=stage, **rest)
+    return evaluate.load(config, policy.load(path))
+
+
+def _start(
+    judge: Judge, pose: list, target: list | None = None, obstacle: list | None = None
+) -> Arenas:
+    """Starts one arena by hand; without a target it lies far ahead, out of reach."""
+    start = np.array(pose, np.float32)
+    ahead = np.stack([np.cos(start[:, 2]), np.sin(start[:, 2])], axis=-1)
+    robots, obstacles = len(start), len(obstacle or [])
+    return evaluate.start(
+        judge,
+        [
+            level.Level(
+                side=judge.stage.side,
+                present=np.ones(robots, bool),
+                start=start,
+                target=start[:, :2] + 100 * ahead if target is None else np.array(target),
+                obstacle_present=np.ones(obstacles, bool),
+                obstacle=np.array(obstacle or np.zeros((0, 5)), np.float32),
+            )
+        ],
+    )
+
+
+def _run(judge: Judge, arenas: Arenas, steps: int) -> Arenas:
+    for _ in range(steps):
+        arenas = evaluate.step(judge, arenas)
+    return arenas
+
+
+def _pose(arenas: Arenas) -> np.ndarray:
+    return np.stack([data.qpos.reshape(-1, 3) for data in arenas.data])
+
+
+def test_a_robot_drives_straight_to_its_target_and_stays(tmp_path: Path) -> None:
+    judge = _judge(tmp_path, _stage())
+    arenas = _start(judge, [[-0.1, 0.2, 0.0]], [[0.2, 0.2]])
+    # (0.3 - 0.05) / 0.0040192 = 62.2: it is within 0.05 m after 63 control steps.
+    steps = math.ceil((0.3 - 0.05) / STRIDE)
+    assert steps == 63
+    arenas = _run(judge, arenas, steps - 1)
+    assert not arenas.outcome.arrived.any()
+    # Float32 rounds the action and the start: some 1e-7 of 0.25 m.
+    np.testing.assert_allclose(_pose(arenas)[0, 0], [-0.1 + 62 * STRIDE, 0.2, 0.0], atol=1e-6)
+    arenas = _run(judge, arenas, 20)
+    assert arenas.outcome.arrival.tolist() == [[63]]
+    assert arenas.outcome.moving.tolist() == [[63]]
+    # The command is zero from the step after the arrival on, and the servo stops within it.
+    np.testing.assert_allclose(_pose(arenas)[0, 0], [-0.1 + 63 * STRIDE, 0.2, 0.0], atol=1e-6)
+
+
+def test_a_robot_turns_by_its_turn_rate(tmp_path: Path) -> None:
+    judge = _judge(tmp_path, _stage(), SPIN)
+    arenas = _start(judge, [[0.1, 0.2, 0.5]], [[0.1, 0.4]])
+    # The first step takes 1.06e-4 * 3.14 / 0.032 = 0.0104 N m, less than the limit of 0.0408.
+    turned = 10 * 3.14 * STEP
+    arenas = _run(judge, arenas, 10)
+    np.testing.assert_allclose(_pose(arenas)[0, 0], [0.1, 0.2, 0.5 + turned], atol=1e-6)
+    seen = dict(zip(observation.NAMES, arenas.observation[0, 0], strict=True))
+    assert seen["target_distance"] == pytest.approx(0.2, abs=1e-6)
+    assert seen["target_bearing"] == pytest.approx(math.pi / 2 - 0.5 - turned, abs=1e-6)
+
+
+def test_a_robot_that_starts_at_its_target_arrives_with_the_first_step(tmp_path: Path) -> None:
+    judge = _judge(tmp_path, _stage(), STAY)
+    arenas = _start(judge, [[0.0, 0.0, 0.0]], [[0.05, 0.0]])
+    assert not arenas.outcome.arrived.any()
+    assert _run(judge, arenas, 1).outcome.arrival.tolist() == [[1]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "pose", "obstacle", "gap", "pace"),
+    [
+        # Centres 0.2 m apart, head on; both drive.
+        ("robot", [[-0.1, 0.0, 0.0], [0.1, 0.0, math.pi]], [], 0.2 - 2 * 0.037, 2 * STRIDE),
+        # The wall is at x = 0.5; robot 1 drives along the middle, meeting nothing.
+        ("wall", [[0.35, 0.3, 0.0], [-0.4, -0.3, 0.0]], [], 0.5 - 0.35 - 0.037, STRIDE),
+        # A box of edge 0.1 at (0.2, 0), straight.
+        (
+            "obstacle",
+            [[0.0, 0.0, 0.0], [-0.4, -0.3, 0.0]],
+            [[0.2, 0.0, 0.0, 0.05, 0.05]],
+            0.2 - 0.05 - 0.037,
+            STRIDE,
+        ),
+    ],
+)
+def test_a_push_is_one_contact_of_its_kind(
+    tmp_path: Path, kind: str, pose: list, obstacle: list, gap: float, pace: float
+) -> None:
+    judge = _judge(tmp_path, _stage(robots=2, obstacles=len(obstacle)), AHEAD)
+    arenas = _start(judge, pose, obstacle=obstacle)
+    first = math.ceil(gap / pace)  # the control step in which the gap closes
+    arenas = _run(judge, arenas, first - 1)
+    assert not arenas.outcome.contacts.any()
+    arenas = _run(judge, arenas, 1)
+    expected = np.zeros((1, 2, 3), int)
+    expected[0, : 2 if kind == "robot" else 1, gaps.KINDS.index(kind)] = 1
+    np.testing.assert_array_equal(arenas.outcome.contacts, expected)
+    # It goes on pushing, which is no further contact.
+    np.testing.assert_array_equal(_run(judge, arenas, 40).outcome.contacts, expected)
+
+
+def test_an_arrived_robot_is_pushed_and_its_arrival_stands(tmp_path: Path) -> None:
+    judge = _judge(tmp_path, _stage(robots=2), AHEAD)
+    arenas = _start(judge, [[-0.1, 0.0, 0.0], [-0.3, 0.0, 0.0]], [[-0.1, 0.0], [9.0, 0.0]])
+    arenas = _run(judge, arenas, 60)
+    before = _pose(arenas)[0, 0, 0]
+    arenas = _run(judge, arenas, 50)
+    # One servo holds SPEED and the other 0, both with gain m / dt: together SPEED / 2. Contact is
+    # soft, so the speed is still settling, and a tenth covers it.
+    assert _pose(arenas)[0, 0, 0] - before == pytest.approx(50 * STRIDE / 2, rel=0.1)
+    assert arenas.outcome.arrival.tolist() == [[1, 0]]
+    assert arenas.outcome.moving.tolist() == [[1, 110]]
+    assert arenas.observation[0, 0, observation.NAMES.index("target_distance")] > 0.05
+    assert arenas.outcome.contacts[0, :, 0].tolist() == [1, 1]
+
+
+def test_steps_with_infrared_are_those_of_robots_on_their_way(tmp_path: Path) -> None:
+    judge = _judge(tmp_path, _stage(robots=3), STAY)
+    pose = [[0.45, 0.0, 0.0], [0.45, 0.3, 0.0], [0.0, 0.0, 0.0]]
+    # Sensors at x = 0.48 look at the wall from 0.02 / cos(17 degrees) m. Robot 1 has arrived.
+    arenas = _run(judge, _start(judge, pose, [[-0.4, 0.0], [0.45, 0.3], [-0.4, 0.0]]), 7)
+    assert arenas.outcome.sensed.tolist() == [[7, 1, 0]]
+    assert arenas.outcome.moving.tolist() == [[7, 1, 7]]
+
+
+def test_a_control_step_is_that_many_steps_of_mujoco(tmp_path: Path) -> None:
+    stage = _stage(robots=2, side=0.6, obstacles=1)
+    judge = _judge(tmp_path, stage, AHEAD, substeps=3)
+    pose = [[-0.1, 0.02, 0.1], [0.1, 0.0, 2.5]]
+    box = [[0.0, 0.15, 0.3, 0.05, 0.05]]
+    arenas = _run(judge, _start(judge, pose, obstacle=box), 50)
+    data = evaluate.place(judge, np.array(pose, np.float32), np.array(box, np.float32))
+    data.ctrl = [SPEED, 0.0, 0.0] * 2
+    # Float32 rounds the policy's action, which contacts do not magnify here.
+    mujoco.mj_step(judge.model, data, 150)
+    np.testing.assert_allclose(_pose(arenas)[0], data.qpos.reshape(-1, 3), atol=1e-6)
+    assert judge.model.opt.timestep == STEP / 3
+
+
+def test_touching_is_a_gap_below_zero(tmp_path: Path) -> None:
+    judge = _judge(tmp_path, _stage(robots=4, side=0.7, obstacles=2))
+    draw = np.random.default_rng(0)
+    count = 250
+    pose = draw.uniform(-0.34, 0.34, (count, 4, 3)).astype(np.float32)
+    box = draw.uniform(-0.25, 0.25, (count, 2, 5)).astype(np.float32)
+    box[..., 2] *= 8.0
+    box[..., 3:] = 0.05
+    data = np.empty(count, object)
+    data[:] = [evaluate.place(judge, *each) for each in zip(pose, box, strict=True)]
+    gap = np.stack(
+        [
+            gaps.gaps(p.astype(float), judge.stage.side, b.astype(float), 0.037, np)
+            for p, b in zip(pose, box, strict=True)
+        ]
+    )
+    assert np.abs(gap).min() > 1e-7  # float32 in the walls' quaternions moves them by 1e-8 m
+    touching = evaluate.touching(judge, data)
+    assert touching.mean(axis=(0, 1)).min() > 0.1  # every kind occurs
+    np.testing.assert_array_equal(touching, gap <= 0.0)
+
+
+def test_the_judge_counts_what_the_training_environment_counts(tmp_path: Path) -> None:
+    stage = _stage(robots=3, side=0.7, obstacles=1)
+    judge = _judge(tmp_path, stage)
+    # An episode in which robots meet one another and the obstacle, and all arrive.
+    drawn = evaluate.draw_level(judge.stage, judge.spacing, 1, 58)
+    arenas = evaluate.start(judge, [drawn])
+    sim = SimConfig(impl="jax", max_robots=3, max_obstacles=1)
+    world = env.load(TrainConfig(stage=(stage,), sim=sim))
+    zero = jnp.zeros((), jnp.int32)
+    state, seen = env.reset(world, jax.tree.map(jnp.asarray, drawn), zero, zero)
+    state = dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
+    step = jax.jit(lambda state, action: env.step(world, state, action))
+    # Float32 against double along the way; the paths hardly magnify it, contacts included.
+    np.testing.assert_allclose(seen, arenas.observation[0], atol=1e-5)
+    for _ in range(153):
+        state, came = step(state, policy.mean_action(judge.policy, np.asarray(seen)))
+        seen = np.asarray(came.observation)
+        arenas = evaluate.step(judge, arenas)
+        np.testing.assert_allclose(seen, arenas.observation[0], atol=1e-3)
+        np.testing.assert_array_equal(state.arrived, arenas.outcome.arrived[0])
+    assert arenas.outcome.arrived.all()
+    np.testing.assert_array_equal(state.episode.contacts, arenas.outcome.contacts[0])
+    np.testing.assert_array_equal(state.episode.sensed, arenas.outcome.sensed[0])
+    np.testing.assert_array_equal(state.episode.moving, arenas.outcome.moving[0])
+    assert arenas.outcome.contacts.sum(axis=(0, 1))[:2].min() >= 2  # both kinds did occur
+
+
+def test_an_episode_does_not_depend_on_those_beside_it(tmp_path: Path) -> None:
+    judge = _judge(tmp_path, _stage(robots=3, side=0.7, obstacles=1), steps=150)
+    together = evaluate.simulate(judge, range(8))
+    assert len(set(together.clock.tolist())) > 2  # arenas leave at different times
+    for episode in (0, 5, 7):
+        alone = evaluate.simulate(judge, [episode])
+        for one, all_ in zip(alone, together, strict=True):
+            np.testing.assert_array_equal(one[0], all_[episode])
+
+
+def test_a_result_does_not_depend_on_batches_and_workers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = _policy(tmp_path / "policy.npz")
+    results = []
+    for workers, batch in ((1, 64), (1, 2), (2, 3)):
+        monkeypatch.setattr(evaluate, "BATCH", batch)
+        config = EvaluateConfig(
+            policy=str(path), stage=_stage(robots=2), steps=120, episodes=7, workers=workers
+        )
+        told: list[int] = []
+        results.append(evaluate.evaluate(config, policy.load(path), told.append))
+        assert sum(told) == 7
+    assert results[0] == results[1] == results[2]
+    assert results[0]["targets_reached"] > 0.0
+
+
+def test_seed_and_number_alone_decide_the_level(tmp_path: Path) -> None:
+    judge = _judge(tmp_path, _stage(robots=2, obstacles=2))
+    again, other, next_ = (
+        evaluate.draw_level(judge.stage, judge.spacing, seed, episode)
+        for seed, episode in ((1, 4), (2, 4), (1, 5))
+    )
+    first = evaluate.draw_level(judge.stage, judge.spacing, 1, 4)
+    np.testing.assert_array_equal(first.start, again.start)
+    assert (first.start != other.start).any()
+    assert (first.start != next_.start).any()
+    assert first.start.dtype == np.float32  # as training draws it
+
+
+@pytest.mark.parametrize("stage", [_stage(robots=2, side=0.5), _stage(robots=2, side=0.7)])
+def test_steering_to_the_target_reaches_it_in_empty_arenas(
+    tmp_path: Path, stage: StageConfig
+) -> None:
+    path = _policy(tmp_path / "policy.npz")
+    config = EvaluateConfig(policy=str(path), stage=stage, episodes=40, steps=400, workers=1)
+    result = evaluate.evaluate(config, policy.load(path))
+    assert result["targets_reached"] >= 0.95  # only another robot can be in the way
+    # The arena's diagonal at full speed, and a turn by half a circle at 3.14 rad/s.
+    assert 0.0 < result["arrival_time_s"] < stage.side * math.sqrt(2) / SPEED + 1.0 + 2.0
+
+
+def test_standing_still_reaches_nothing(tmp_path: Path) -> None:
+    path = _policy(tmp_path / "policy.npz", STAY)
+    config = EvaluateConfig(
+        policy=str(path), stage=_stage(robots=2), episodes=10, steps=9, workers=1
+    )
+    result = evaluate.evaluate(config, policy.load(path))
+    assert result["targets_reached"] == result["all_reached"] == 0.0
+    assert result["contacts_per_robot"] == 0.0
+    assert result["arrival_time_s"] is None
+    assert result["episode_time_s"] == pytest.approx(9 * STEP)
+
+
+@pytest.mark.parametrize("layout", ["boxes", "fence"])
+def test_obstacles_of_a_fixed_level_have_their_own_sizes(tmp_path: Path, layout: Any) -> None:
+    stage = _stage(robots=1, side=1.4, obstacles=1, level="fixed", layout=layout)
+    judge = _judge(tmp_path, stage)
+    # Boxes of 0.10 m; a fence of 0.50 by 0.06 m in a 0.7 m arena, its length scaled with the side.
+    half = [0.05, 0.05] if layout == "boxes" else [0.50, 0.03]
+    found = judge.model.geom("obstacle0_box")
+    np.testing.assert_allclose(found.size[:2], half, rtol=1e-6)  # float32
+    # A bound that is left too small hides contacts at the ends from MuJoCo.
+    assert found.rbound[0] == pytest.approx(math.hypot(*half, 0.05), rel=1e-6)
+
+
+def test_the_policy_says_how_fast_it_may_ask_for(tmp_path: Path) -> None:
+    limits = {"low": [0.0, -1.0], "high": [0.05, 1.0]}
+    names = {"names": ["speed", "turn_rate"], "units": ["m/s", "rad/s"]}
+    path = _policy(tmp_path / "policy.npz", AHEAD, action=names | limits)
+    judge = evaluate.load(EvaluateConfig(policy=str(path), stage=_stage()), policy.load(path))
+    arenas = _run(judge, _start(judge, [[0.0, 0.0, 0.0]]), 10)
+    assert _pose(arenas)[0, 0, 0] == pytest.approx(10 * 0.05 * STEP, abs=1e-7)  # float32 action
+
+
+def test_physics_that_breaks_down_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # where MuJoCo writes its log
+    judge = _judge(tmp_path, _stage(robots=2))
+    arenas = _start(judge, [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    arenas.data[0].qvel[3] = np.nan
+    with pytest.raises(ConfigError, match=r"^the physics broke down.*substeps of more than 1.*\.$"):
+        evaluate.step(judge, arenas)
+
+
+def test_summarize_by_hand() -> None:
+    contacts = np.zeros((3, 2, 3), int)
+    contacts[0, 0] = [1, 0, 2]
+    contacts[2, 1] = [1, 2, 0]
+    outcome = Outcome(
+        clock=np.array([10, 20, 30]),
+        arrived=np.array([[True, True], [True, False], [False, False]]),
+        arrival=np.array([[4, 10], [6, 0], [0, 0]]),
+        contacts=contacts,
+        sensed=np.array([[1, 2], [3, 4], [0, 5]]),
+        moving=np.array([[4, 10], [6, 20], [30, 30]]),
+    )
+    result = evaluate.summarize(outcome, 0.1)
+    assert result == {
+        "targets_reached": pytest.approx((1 + 0.5 + 0) / 3),
+        "targets_reached_se": pytest.approx(0.5 / math.sqrt(3)),  # of 1, 0.5, 0: deviation 0.5
+        "all_reached": pytest.approx(1 / 3),
+        # Of 1, 0, 0: variance (4/9 + 1/9 + 1/9) / 2 = 1/3.
+        "all_reached_se": pytest.approx(math.sqrt(1 / 3) / math.sqrt(3)),
+        "contacts_per_robot": pytest.approx(6 / 6),
+        "contacts_per_robot_by_kind": {
+            "robot": pytest.approx(2 / 6),
+            "obstacle": pytest.approx(2 / 6),
+            "wall": pytest.approx(2 / 6),
+        },
+        "ir_steps_share": pytest.approx(15 / 100),
+        "episode_time_s": pytest.approx(2.0),
+        "arrival_time_s": pytest.approx((4 + 10 + 6) / 3 * 0.1),
+    }
+    single = Outcome(*(field[:1] for field in outcome))
+    assert evaluate.summarize(single, 0.1)["targets_reached_se"] is None
+
+
+def _command(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["evaluate", *words])
+    return command.run("evaluate", evaluate.main, EvaluateConfig)
+
+
+def test_the_command_writes_the_result_and_prints_a_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, out = _policy(tmp_path / "policy.npz"), tmp_path / "new" / "result.json"
+    words = (f"policy={path}", "stage=s1", "episodes=3", "steps=20", "seed=5", "workers=1")
+    assert _command(monkeypatch, *words, f"out={out}") == 0
+    result = json.loads(out.read_text())
+    assert {key: result[key] for key in ("episodes", "engine", "robot", "stage", "steps")} == {
+        "episodes": 3,
+        "engine": "c",
+        "robot": "planar",
+        "stage": "s1",
+        "steps": 20,
+    }
+    assert (result["seed"], result["policy"]) == (5, str(path))
+    assert result["policy_digest"] == policy.load(path).digest
+    assert result["versions"]["mujoco"] == mujoco.__version__
+    printed = capsys.readouterr()
+    share = f"{100 * result['targets_reached']:.1f} ± "
+    row = next(line for line in printed.out.splitlines() if "targets reached" in line)
+    assert share in row
+    assert f"{path} on s1, 3 episodes" in printed.out
+    assert "\x1b" not in printed.out  # plain where it is no terminal
+    assert printed.err == ""
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["policy={tmp}/none.npz"], "{tmp}/none.npz is no file: give the path of a policy.npz."),
+        (["policy={tmp}/policy.npz", "stage=s7"], "stage is 's7': give one of "),
+        ([], "policy is missing"),
+        (
+            ["policy={tmp}/policy.npz", "out={tmp}"],
+            "out is {tmp}, which cannot be written: it is a folder.",
+        ),
+        (
+            ["policy={tmp}/policy.npz", "out={tmp}/policy.npz/result.json"],
+            "out is {tmp}/policy.npz/result.json, which cannot be written: ",
+        ),
+        (
+            ["policy={tmp}/three.npz", "stage=s6"],
+            "{tmp}/three.npz holds a network for each of 3 robots, but stage.robots is 5: "
+            "give 1 to 3.",
+        ),
+        (["policy={tmp}/other.npz", "stage=s1"], "{tmp}/other.npz observes a, a, "),
+    ],
+)
+def test_the_command_refuses_in_one_sentence(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    sentence: str,
+) -> None:
+    _policy(tmp_path / "policy.npz")
+    _policy(tmp_path / "three.npz", learners=3, policy="independent")
+    layout = {"names": ["a"] * observation.SIZE, "units": ["m"] * observation.SIZE, "limit": 10.0}
+    _policy(tmp_path / "other.npz", observation=layout)
+    words = [word.format(tmp=tmp_path) for word in words]
+    assert _command(monkeypatch, *words, "workers=1", "episodes=1") == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith(f"swarmjax.evaluate: error: {sentence.format(tmp=tmp_path)}")
+    assert printed.err.count("\n") == 1
+
+
+def test_a_policy_of_three_judges_three(tmp_path: Path) -> None:
+    path = _policy(tmp_path / "policy.npz", learners=3, policy="independent")
+    config = EvaluateConfig(policy=str(path), stage=_stage(robots=4))
+    with pytest.raises(PolicyError, match=r"each of 3 robots, but stage\.robots is 4"):
+        evaluate.load(config, policy.load(path))
+    config = EvaluateConfig(policy=str(path), stage=_stage(robots=3), task=TaskConfig(), steps=2)
+    assert evaluate.simulate(evaluate.load(config, policy.load(path)), [0]).clock.tolist() == [2]

@@ -106,7 +106,7 @@ def test_fixtures_stand_where_the_level_says(compiled: mujoco.MjModel) -> None:
     for i, outward in enumerate([(1, 0), (0, 1), (-1, 0), (0, -1)]):
         box, half = data.geom(f"wall{i}_box"), compiled.geom(f"wall{i}_box").size
         extent = np.abs(box.xmat.reshape(3, 3)[:2]) @ half
-        # The inner face is half a side away; 1e-7 m: bearings are kept in float32.
-        assert np.dot(box.xpos[:2] - extent * outward, outward) == pytest.approx(0.45, abs=1e-7)
+        # The inner face is half a side away; 1e-6 m: bearings of float32, at 2.5 m.
+        assert np.dot(box.xpos[:2] - extent * outward, outward) == pytest.approx(0.45, abs=1e-6)
         # Along the wall it is longer than the largest arena, 4 m.
         assert (extent * (1 - np.abs(outward))).sum() >= 2.0

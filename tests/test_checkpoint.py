@@ -1,0 +1,96 @@
+"""Checkpoints: exact, checked, and forgiving of the newest one being damaged."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmjax import checkpoint
+from swarmjax.checkpoint import CheckpointError, Checkpoints
+
+
+def _state(value: float) -> dict:
+    return {
+        "weights": jnp.full((2, 3), value),
+        "nested": {"count": jnp.int32(7), "none": jnp.zeros((4, 0)), "flag": jnp.array([True])},
+        "key": jax.random.key(5),
+    }
+
+
+def _save(run: Path, *updates: int) -> None:
+    with Checkpoints(run, keep=2) as checkpoints:
+        for update in updates:
+            checkpoints.save(_state(float(update)), update)
+
+
+def test_a_state_comes_back_bit_for_bit(tmp_path: Path) -> None:
+    _save(tmp_path, 3)
+    leaves, update, skipped = checkpoint.restore(tmp_path)
+    state = checkpoint.from_leaves(leaves, jax.eval_shape(lambda: _state(0.0)))
+    assert (update, skipped) == (3, [])
+    np.testing.assert_array_equal(state["weights"], np.full((2, 3), 3.0))
+    assert state["nested"]["none"].shape == (4, 0)
+    assert int(state["nested"]["count"]) == 7
+    assert jax.random.key_data(state["key"]).tolist() == [0, 5]
+
+
+def test_the_newest_are_kept_and_any_of_them_can_be_asked_for(tmp_path: Path) -> None:
+    _save(tmp_path, 1, 2, 3)
+    assert checkpoint.restore(tmp_path)[1] == 3
+    assert checkpoint.restore(tmp_path, 2)[0]["weights"][0, 0] == 2.0
+    with pytest.raises(CheckpointError, match=r"no checkpoint of update 1: it has \[3, 2\]"):
+        checkpoint.restore(tmp_path, 1)
+
+
+def _flip_one_bit(step: Path) -> None:
+    """Damages the largest file of a step, in the middle."""
+    largest = max((p for p in step.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
+    content = bytearray(largest.read_bytes())
+    content[len(content) // 2] ^= 1
+    largest.write_bytes(content)
+
+
+def test_a_damaged_checkpoint_is_passed_over_and_named(tmp_path: Path) -> None:
+    _save(tmp_path, 1, 2)
+    _flip_one_bit(tmp_path / "checkpoints" / "2")
+    leaves, update, skipped = checkpoint.restore(tmp_path)
+    assert update == 1
+    assert leaves["weights"][0, 0] == 1.0
+    assert len(skipped) == 1
+    assert "checkpoint 2" in skipped[0]
+
+
+def test_a_half_copied_step_is_passed_over(tmp_path: Path) -> None:
+    _save(tmp_path, 1)
+    (tmp_path / "checkpoints" / "9").mkdir()
+    assert checkpoint.restore(tmp_path)[1] == 1
+
+
+def test_nothing_sound_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="holds no checkpoints"):
+        checkpoint.restore(tmp_path / "nowhere")
+    _save(tmp_path, 4)
+    _flip_one_bit(tmp_path / "checkpoints" / "4")
+    with pytest.raises(CheckpointError, match="no sound checkpoint") as error:
+        checkpoint.restore(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_digest_notices_one_bit_and_a_name() -> None:
+    leaves = {"a": np.arange(3.0), "b": np.arange(2)}
+    flipped = {"a": np.nextafter(np.arange(3.0), 9.0), "b": np.arange(2)}
+    assert checkpoint.digest(leaves) != checkpoint.digest(flipped)
+    assert checkpoint.digest(leaves) != checkpoint.digest({"a": leaves["b"], "b": leaves["a"]})
+    assert checkpoint.digest(leaves) == checkpoint.digest(dict(reversed(leaves.items())))
+
+
+def test_another_run_is_refused_with_both_shapes() -> None:
+    leaves = checkpoint.to_leaves(_state(1.0))
+    template = jax.eval_shape(lambda: _state(0.0) | {"weights": jnp.zeros((2, 4))})
+    with pytest.raises(CheckpointError, match=r"float32\[2, 3\] for weights.*float32\[2, 4\]"):
+        checkpoint.from_leaves(leaves, template)
+    del leaves["nested/count"]
+    with pytest.raises(CheckpointError, match="nothing for nested/count"):
+        checkpoint.from_leaves(leaves, jax.eval_shape(lambda: _state(0.0)))

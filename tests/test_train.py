@@ -1,0 +1,193 @@
+"""The command line from end to end: train, stop, resume, export, and every way to be refused."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from swarmjax import checkpoint, command, config, export, train
+from swarmjax.checkpoint import CheckpointError, digest
+from swarmjax.config import ExportConfig, TrainConfig
+
+TINY = [
+    "stage=s1",
+    "sim.impl=jax",
+    "sim.max_robots=2",
+    "sim.max_obstacles=0",
+    "arenas=4",
+    "algo.rollout=4",
+    "algo.minibatches=2",
+    "algo.epochs=1",
+    "algo.hidden=[8]",
+    "task.step_limit=8",
+    f"budget={4 * 4 * 9}",
+    "run.tensorboard=false",
+]
+
+
+def _train(*words: str) -> int:
+    return train.main([*TINY, *words])
+
+
+def _digest(run: Path) -> str:
+    return digest(checkpoint.restore(run)[0])
+
+
+def _refusal(capsys: pytest.CaptureFixture[str], main: str, *words: str) -> str:
+    """Runs a command that must be refused and returns its one sentence."""
+    commands = {"train": (train.main, TrainConfig), "export": (export.main, ExportConfig)}
+    run, settings = commands[main]
+    before = sys.argv
+    sys.argv = [main, *words]
+    try:
+        assert command.run(main, run, settings, (CheckpointError,)) == 2
+    finally:
+        sys.argv = before
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith(f"swarmjax.{main}: error: ")
+    assert captured.err.count("\n") == 1
+    return captured.err
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("whole") / "run"
+    assert _train(f"run.dir={run}", "run.chunk=1") == 0
+    return run
+
+
+def test_a_run_directory_holds_what_it_promises(whole: Path) -> None:
+    names = {path.name for path in whole.iterdir()}
+    promised = {"config.json", "metrics.jsonl", "summary.json", "policy.npz", "checkpoints"}
+    assert promised <= names
+    rows = [json.loads(line) for line in (whole / "metrics.jsonl").read_text().splitlines()]
+    assert [row["update"] for row in rows] == list(range(9))
+    assert rows[-1]["arena_steps"] == 4 * 4 * 9
+    summary = json.loads((whole / "summary.json").read_text())
+    assert summary["updates"] == 9
+    assert summary["budget_spent"] is True
+    assert summary["transitions"] == sum(row["transitions"] for row in rows)
+    stored = json.loads((whole / "config.json").read_text())
+    assert config.build(TrainConfig, stored).algo.hidden == (8,)
+
+
+@pytest.mark.parametrize("chunk", ["7", "all", "auto"])
+def test_chunks_of_any_size_train_the_same_parameters(
+    chunk: str, whole: Path, tmp_path: Path
+) -> None:
+    assert _train(f"run.dir={tmp_path}", f"run.chunk={chunk}") == 0
+    assert _digest(tmp_path) == _digest(whole)
+
+
+def test_a_resumed_run_ends_where_an_uninterrupted_one_does(whole: Path, tmp_path: Path) -> None:
+    assert _train(f"run.dir={tmp_path}", "run.stop_after=4") == 0
+    assert checkpoint.restore(tmp_path)[1] == 4
+    assert train.main([f"resume={tmp_path}"]) == 0
+    assert _digest(tmp_path) == _digest(whole)
+    rows = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    kept = (whole / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(a) for a in rows] == [json.loads(b) for b in kept]
+
+
+def test_another_seed_is_another_run(whole: Path, tmp_path: Path) -> None:
+    assert _train(f"run.dir={tmp_path}", "seed=1") == 0
+    assert _digest(tmp_path) != _digest(whole)
+
+
+def test_export_gives_the_policy_that_training_left(whole: Path, tmp_path: Path) -> None:
+    out = tmp_path / "again.npz"
+    assert export.main([f"run={whole}", f"out={out}"]) == 0
+    with np.load(out) as again, np.load(whole / "policy.npz") as first:
+        assert set(again.files) == set(first.files)
+        for name in set(first.files) - {"meta"}:
+            np.testing.assert_array_equal(again[name], first[name])
+        assert json.loads(str(again["meta"]))["update"] == 9
+
+
+def test_a_run_directory_is_never_written_over(
+    whole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (whole / "metrics.jsonl").read_bytes()
+    sentence = _refusal(capsys, "train", *TINY, f"run.dir={whole}")
+    assert "holds a run already" in sentence
+    assert (whole / "metrics.jsonl").read_bytes() == before
+
+
+def test_foreign_and_missing_runs_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "no config.json" in _refusal(capsys, "train", f"resume={tmp_path}")
+    assert "no config.json" in _refusal(capsys, "export", f"run={tmp_path / 'nowhere'}")
+    (tmp_path / "config.json").write_text("{")
+    assert "cannot be read" in _refusal(capsys, "export", f"run={tmp_path}")
+    stored = config.to_dict(config.load_train(TINY))
+    (tmp_path / "config.json").write_text(json.dumps(stored))
+    assert "no checkpoints" in _refusal(capsys, "train", f"resume={tmp_path}")
+
+
+def test_a_checkpoint_of_another_shape_is_refused(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stored = json.loads((whole / "config.json").read_text())
+    stored["algo"]["hidden"] = [16]
+    (tmp_path / "config.json").write_text(json.dumps(stored))
+    (tmp_path / "checkpoints").symlink_to(whole / "checkpoints")
+    sentence = _refusal(capsys, "train", f"resume={tmp_path}")
+    assert "this run's config needs" in sentence
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["stage=s9"], ["s9", "s1"]),
+        (["arena=4"], ["arena", "arenas"]),
+        (["budget=ten"], ["budget", "ten", "whole number"]),
+        (["stage=s6", "stage.robots=6"], ["stage.robots", "6", "sim.max_robots", "5"]),
+        (["stage=s6", "stage.side=0.5"], ["stage.side", "0.5", "at least"]),
+        (["arenas=6", "algo.minibatches=4"], ["arenas", "6", "multiple of 4"]),
+        (["seeds=2"], ["seeds", "2", "not built"]),
+        (["run.dir=/proc/none"], ["run.dir", "/proc/none", "cannot be written"]),
+    ],
+)
+def test_bad_input_is_one_sentence(
+    words: list[str], parts: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = TINY if words[0].startswith("run") else []
+    sentence = _refusal(capsys, "train", *small, *words)
+    for part in parts:
+        assert part in sentence
+
+
+def test_a_dry_run_compiles_and_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    assert _train(f"run.dir={run}", "run.dry=true") == 0
+    assert "MiB of state" in capsys.readouterr().out
+    assert not run.exists()
+
+
+def test_an_interrupt_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
+    """Ctrl-C in a process of its own, well before the budget of many thousand updates is spent."""
+    words = [*TINY, f"budget={4 * 4 * 10**6}", f"run.dir={tmp_path}", "run.chunk=1"]
+    code = "import sys; from swarmjax import train; sys.exit(train.main(sys.argv[1:]))"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *words], stdout=subprocess.PIPE, text=True, env=os.environ
+    )
+    rows = tmp_path / "metrics.jsonl"
+    deadline = time.monotonic() + 240.0
+    while not (rows.exists() and rows.stat().st_size) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == train.INTERRUPTED
+    assert f"resume={tmp_path}" in output
+    assert checkpoint.restore(tmp_path)[1] > 0
+    assert (tmp_path / "policy.npz").exists()
