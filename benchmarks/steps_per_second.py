@@ -11,6 +11,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -62,7 +63,7 @@ def physics_alone(program: Program, arenas: EnvState, key: Array) -> tuple[EnvSt
 
     data, _ = jax.lax.scan(body, data, jax.random.split(key, CONTROL_STEPS))
     packed = jax.vmap(physics.pack)(data)
-    return arenas.replace(sim=packed), jnp.sum(packed.qpos)
+    return replace(arenas, sim=packed), jnp.sum(packed.qpos)
 
 
 def environment(
@@ -87,10 +88,10 @@ def environment(
         arenas, reward = jax.lax.scan(partial(body, starts=starts), arenas, keys)
         return arenas, jnp.sum(reward)
 
-    arenas = arenas.replace(sim=unpack(arenas.sim))
+    arenas = replace(arenas, sim=unpack(arenas.sim))
     keys = jax.random.split(key, CONTROL_STEPS // program.config.algo.rollout)
     arenas, reward = jax.lax.scan(rolled, arenas, keys)
-    return arenas.replace(sim=jax.vmap(physics.pack)(arenas.sim)), jnp.sum(reward)
+    return replace(arenas, sim=jax.vmap(physics.pack)(arenas.sim)), jnp.sum(reward)
 
 
 def _actions(program: Program, key: Array) -> Array:
@@ -99,7 +100,13 @@ def _actions(program: Program, key: Array) -> Array:
     return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
 
 
-def _line(program: Program, name: str, control_steps: int, timing: tuple[float, float], transitions: float | None) -> dict:
+def _line(
+    program: Program,
+    name: str,
+    control_steps: int,
+    timing: Sequence[float],
+    transitions: float | None,
+) -> dict:
     """Puts a result together under the names of docs/interface.md."""
     settings = program.config
     compile_s, seconds = timing
@@ -130,19 +137,17 @@ def results(settings: TrainConfig) -> list[dict]:
     key = jax.random.key(settings.seed)
     lines = []
     *timing, _ = measure(partial(physics_alone, program), start(schedule).arenas, key)
-    lines.append(_line(program, "physics", CONTROL_STEPS, tuple(timing), None))
+    lines.append(_line(program, "physics", CONTROL_STEPS, timing, None))
     arenas = start(schedule).arenas
     *timing, _ = measure(partial(environment, program), arenas, (schedule, key))
     steps = CONTROL_STEPS // settings.algo.rollout * settings.algo.rollout
-    lines.append(_line(program, "environment", steps, tuple(timing), None))
+    lines.append(_line(program, "environment", steps, timing, None))
     rate = lines[-1]["arena_steps_per_s"] / (settings.arenas * settings.algo.rollout)
     n = int(np.clip(TRAIN_SECONDS * rate / 2, 1, settings.updates))
     train = partial(_trained, program, schedule)
     *timing, metrics = measure(train, start(schedule), np.int32(n))
     transitions = float(np.sum(np.asarray(metrics["transitions"], np.float64)[:n]))
-    lines.append(
-        _line(program, "training", n * settings.algo.rollout, tuple(timing), transitions)
-    )
+    lines.append(_line(program, "training", n * settings.algo.rollout, timing, transitions))
     return lines
 
 

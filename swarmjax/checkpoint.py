@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 from absl import logging as absl_logging
@@ -59,7 +60,7 @@ def to_leaves(state: Any) -> Leaves:
     """Flattens a state to names and arrays; keys become their data, empty arrays are left out."""
     leaves = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(state):
-        if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             leaf = jax.random.key_data(leaf)
         if leaf.size:
             leaves[_name(path)] = np.asarray(leaf)
@@ -81,10 +82,10 @@ def from_leaves(leaves: Leaves, template: Any) -> Any:
     """
 
     def fill(path: tuple, leaf: Any) -> jax.Array:
-        name, is_key = _name(path), jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        name, is_key = _name(path), jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         expected = jax.eval_shape(jax.random.key_data, leaf) if is_key else leaf
         if not expected.size:
-            return jax.numpy.zeros(expected.shape, expected.dtype)
+            return jnp.zeros(expected.shape, expected.dtype)
         found = leaves.get(name)
         if found is None or (found.shape, found.dtype) != (expected.shape, expected.dtype):
             has = "nothing" if found is None else f"{found.dtype}{list(found.shape)}"
@@ -92,7 +93,7 @@ def from_leaves(leaves: Leaves, template: Any) -> Any:
                 f"the checkpoint holds {has} for {name}, but this run's config needs "
                 f"{expected.dtype}{list(expected.shape)}."
             )
-        array = jax.numpy.asarray(found)
+        array = jnp.asarray(found)
         return jax.random.wrap_key_data(array) if is_key else array
 
     return jax.tree_util.tree_map_with_path(fill, template)
@@ -132,7 +133,7 @@ def restore(run: Path, update: int | None = None) -> tuple[Leaves, int, list[str
         for step in [update] if update is not None else steps:
             try:
                 return _read(manager, step), step, skipped
-            except Exception as error:  # noqa: BLE001 - Orbax raises whatever its parts raise
+            except Exception as error:
                 reason = str(error).splitlines()[0][:120]
                 skipped.append(f"checkpoint {step} of {run} is damaged ({reason})")
     found = "; ".join(skipped) or "there is none"

@@ -346,7 +346,7 @@ class TrainConfig(_Section):
     seeds: int = field(default=1, metadata=_about("runs trained at once", 1, MAX_COUNT))
     arenas: int = field(default=128, metadata=_about("arenas simulated at once", 1, 2**20))
     budget: int = field(
-        default=4_000_000, metadata=_about("control steps of all arenas together", 1, 10**15)
+        default=3_000_000, metadata=_about("control steps of all arenas together", 1, 10**15)
     )
     realism: Literal["ideal"] = field(default="ideal", metadata=_about("sensor and motor model"))
     resume: str | None = field(default=None, metadata=_about("run directory to go on with"))
@@ -414,7 +414,7 @@ class TrainConfig(_Section):
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig(_Section):
-    """Everything that fixes an evaluation of a policy on the wheeled robot."""
+    """Everything that fixes an evaluation of a policy."""
 
     policy: str = field(metadata=_about("path of a policy.npz"))
     stage: StageConfig

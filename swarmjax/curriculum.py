@@ -7,6 +7,7 @@ episodes that end first are the lucky ones, and would promote too early.
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -34,9 +35,9 @@ class Schedule(NamedTuple):
     """
 
     stages: Stage
-    deadline: Array
-    threshold: Array
-    cohort_updates: Array
+    deadline: Array | np.ndarray
+    threshold: Array | np.float32
+    cohort_updates: Array | np.int32
 
 
 class Tally(NamedTuple):
@@ -134,7 +135,8 @@ def count(curriculum: Curriculum, cohort: Array, targets: Array, reached: Array)
             tally.reached + jnp.sum(jnp.where(mine, reached, 0)),
         )
 
-    return curriculum.replace(
+    return replace(
+        curriculum,
         current=add(curriculum.current, curriculum.cohort),
         previous=add(curriculum.previous, curriculum.cohort - 1),
     )
@@ -164,7 +166,7 @@ def advance(
     passed = whole & (share >= schedule.threshold) & ~last
     late = (update + 1 >= jnp.asarray(schedule.deadline)[curriculum.stage]) & ~last
     reason = jnp.where(passed, BY_THRESHOLD, jnp.where(late, BY_BUDGET, STAYED))
-    stayed = curriculum.replace(age=age, success=success)
+    stayed = replace(curriculum, age=age, success=success)
     moved = _promote(curriculum)
     next_ = _select(reason != STAYED, moved, _select(over, _next_cohort(stayed), stayed))
     return next_, Decision(reason.astype(jnp.int32), curriculum.stage, success)
@@ -176,7 +178,8 @@ def _empty() -> Tally:
 
 def _next_cohort(curriculum: Curriculum) -> Curriculum:
     """Begins a cohort on the same stage."""
-    return curriculum.replace(
+    return replace(
+        curriculum,
         cohort=curriculum.cohort + 1,
         age=jnp.zeros_like(curriculum.age),
         previous=curriculum.current,
@@ -186,7 +189,8 @@ def _next_cohort(curriculum: Curriculum) -> Curriculum:
 
 def _promote(curriculum: Curriculum) -> Curriculum:
     """Begins the next stage; episodes of the old one, still running, count for no cohort of it."""
-    return curriculum.replace(
+    return replace(
+        curriculum,
         stage=curriculum.stage + 1,
         cohort=curriculum.cohort + 2,
         age=jnp.zeros_like(curriculum.age),

@@ -90,8 +90,9 @@ class Display:
 def _table(summary: Row, speeds: Row, updates: int, seconds_left: float) -> Table:
     """Lays the live table out: how the swarm does beside how fast the run goes."""
     table = Table(title=f"swarmjax: stage {summary['stage']}", title_justify="left")
-    for heading, justify in (("swarm", "left"), ("", "right"), ("run", "left"), ("", "right")):
-        table.add_column(heading, justify=justify)
+    for heading in ("swarm", "run"):
+        table.add_column(heading)
+        table.add_column(justify="right")
     left = [
         ("targets reached", _percent(summary["targets_reached"])),
         ("all robots reached", _percent(summary["all_reached"])),

@@ -13,8 +13,8 @@ import numpy as np
 from swarmjax import checkpoint, command, config, policy, provenance
 from swarmjax.checkpoint import Leaves
 from swarmjax.config import ConfigError, ExportConfig, TrainConfig
-from swarmjax.ppo import normalizer
 from swarmjax.ppo import learner as ppo
+from swarmjax.ppo import normalizer
 from swarmjax.task import observation
 
 
@@ -33,12 +33,9 @@ def policy_arrays(leaves: Leaves) -> dict[str, np.ndarray]:
         for name, leaf in leaves.items()
         if name.startswith(prefix)
     }
-    moments = {
-        name: leaves[f"learners/normalizer/{name}"] for name in ("count", "mean", "variance")
-    }
-    std = normalizer.Normalizer(**moments).std
-    scaling = {"normalizer/mean": moments["mean"], "normalizer/std": np.asarray(std)}
-    return actor | scaling
+    mean, variance = (leaves[f"learners/normalizer/{name}"] for name in ("mean", "variance"))
+    std = np.maximum(np.sqrt(variance), normalizer.MIN_STD)
+    return actor | {"normalizer/mean": mean, "normalizer/std": std}
 
 
 def policy_meta(trained: TrainConfig, update: int) -> dict:

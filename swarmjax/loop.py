@@ -121,9 +121,7 @@ def train_chunk(
     return jax.lax.fori_loop(0, n, body, (state, blank))
 
 
-def update(
-    program: Program, schedule: Schedule, state: TrainState
-) -> tuple[TrainState, Metrics]:
+def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[TrainState, Metrics]:
     """One update: every arena drives for one rollout, the learners learn, the curriculum decides.
 
     Args:
@@ -137,9 +135,7 @@ def update(
     config, world = program.config, program.world
     key, level_key, rollout_key, learn_key = jax.random.split(state.key, 4)
     index = curricula.assign(state.curriculum, config.arenas)
-    starts = rollout.draw_starts(
-        world, schedule.stages, index, state.curriculum.cohort, level_key
-    )
+    starts = rollout.draw_starts(world, schedule.stages, index, state.curriculum.cohort, level_key)
     arenas, trajectory, ended = rollout.collect(
         world, state.learners, state.arenas, starts, rollout_key
     )

@@ -6,7 +6,17 @@ import platform
 import subprocess
 from pathlib import Path
 
-_PACKAGES = ("swarmjax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang", "flax", "optax", "numpy")
+_PACKAGES = (
+    "swarmjax",
+    "jax",
+    "jaxlib",
+    "mujoco",
+    "mujoco-mjx",
+    "warp-lang",
+    "flax",
+    "optax",
+    "numpy",
+)
 
 
 def versions() -> dict[str, str]:

@@ -16,7 +16,9 @@ METRICS, DECISIONS = "metrics.jsonl", "curriculum.jsonl"
 Row = dict[str, Any]
 
 
-def rows(metrics: dict[str, np.ndarray], n: int, stages: Sequence[str], control_steps: int) -> list[Row]:
+def rows(
+    metrics: dict[str, np.ndarray], n: int, stages: Sequence[str], control_steps: int
+) -> list[Row]:
     """Turns the metrics of a call into a row an update.
 
     Args:
@@ -30,7 +32,9 @@ def rows(metrics: dict[str, np.ndarray], n: int, stages: Sequence[str], control_
       the update on its stage (None where none did).
     """
     columns = {name: np.asarray(column)[:n].tolist() for name, column in metrics.items()}
-    found = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+    found = [
+        dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)
+    ]
     return [_row(raw, stages, control_steps) for raw in found]
 
 
@@ -49,7 +53,9 @@ def _row(raw: Row, stages: Sequence[str], control_steps: int) -> Row:
         "contacts_per_robot": _share(contacts, targets),
         "ir_steps_share": _share(raw["sensed"], raw["robot_steps"]),
     }
-    finite = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in raw.items()}
+    finite = {
+        k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in raw.items()
+    }
     return finite | named
 
 
@@ -68,7 +74,9 @@ class Recorder:
         self._metrics = (run / METRICS).open("a")
         self._decisions = (run / DECISIONS).open("a")
         purge = update or None  # TensorBoard hides what comes after this step
-        self._board = SummaryWriter(str(run / "tensorboard"), purge_step=purge) if tensorboard else None
+        self._board = (
+            SummaryWriter(str(run / "tensorboard"), purge_step=purge) if tensorboard else None
+        )
 
     def write(self, found: Sequence[Row], decisions: Iterable[Row], speeds: Row) -> None:
         """Writes the rows of a call, and the last of them with the speeds to TensorBoard."""

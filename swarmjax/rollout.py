@@ -5,6 +5,7 @@ Here, and only here, arenas and robots are laid out for the learners: [A, R, ...
 """
 
 import functools
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -15,7 +16,7 @@ from swarmjax.ppo import gae
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.sim import physics
-from swarmjax.task import env, level, observation
+from swarmjax.task import env, level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
 from swarmjax.task.stage import Stage
@@ -150,13 +151,13 @@ def collect(
     start_value = _values(world, learners, starts.observation)
     step = functools.partial(_step, world, learners, starts, start_value)
     unpack = functools.partial(physics.unpack, world.physics)
-    arenas = arenas.replace(sim=jax.vmap(unpack)(arenas.sim))
+    arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
     seen = jax.vmap(functools.partial(env.observe, world))(arenas)
     carry = (arenas, seen, _values(world, learners, seen))
     keys = jax.random.split(key, world.config.algo.rollout)
     (arenas, _, _), (trajectory, ended) = jax.lax.scan(step, carry, keys)
     packed = jax.vmap(physics.pack)(arenas.sim)
-    return arenas.replace(sim=packed), trajectory, ended
+    return replace(arenas, sim=packed), trajectory, ended
 
 
 def batch(trajectory: Trajectory, *, discount: float, gae_lambda: float) -> Batch:
@@ -254,11 +255,9 @@ def restart(arenas: EnvState, starts: EnvState, done: Array) -> EnvState:
     Returns:
       The arenas, `sim` an `mjx.Data`: of that only what is physically the state is replaced.
     """
-    packed = physics.PhysicsState(
-        arenas.sim.qpos, arenas.sim.qvel, arenas.sim.qacc_warmstart
-    )
-    chosen = _pick(done, starts, arenas.replace(sim=packed))
-    return chosen.replace(sim=arenas.sim.replace(**chosen.sim._asdict()))
+    packed = physics.PhysicsState(arenas.sim.qpos, arenas.sim.qvel, arenas.sim.qacc_warmstart)
+    chosen = _pick(done, starts, replace(arenas, sim=packed))
+    return replace(chosen, sim=arenas.sim.replace(**chosen.sim._asdict()))
 
 
 def _pick[Tree](done: Array, yes: Tree, no: Tree) -> Tree:

@@ -19,6 +19,7 @@ from swarmjax.config import ConfigError, TrainConfig
 from swarmjax.curriculum import Schedule
 from swarmjax.display import Display
 from swarmjax.loop import Program, TrainState
+from swarmjax.sim import physics
 from swarmjax.trainer import Stop, Tally, TrainingError, compile_chunk, train
 
 INTERRUPTED = 130  # exit code: 128 + SIGINT, as a shell gives it
@@ -50,7 +51,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _settings(arguments: Sequence[str]) -> TrainConfig:
     """Reads the command line; with `resume=` the stored config and what may be changed of it."""
-    given = dict(word.partition("=")[::2] for word in arguments)
+    given = {key: value for key, _, value in (word.partition("=") for word in arguments)}
     if given.get("resume", "null") in ("", "null"):
         return config.load_train(arguments)
     run = Path(given["resume"])
@@ -129,6 +130,7 @@ def _write_results(run: Path, program: Program, state: TrainState, tally: Tally)
         "transitions_per_s": tally.transitions / tally.seconds if tally.seconds else None,
         "targets_reached": tally.success,
         "promotions": tally.decisions,
+        "impl": physics.resolve_impl(settings.sim.impl),
         "device": provenance.device(),
         "versions": provenance.versions(),
         "commit": provenance.commit(),

@@ -105,6 +105,7 @@ def compile_chunk(program: Program, schedule: Schedule, state: Any) -> Compiled:
     chunk = jax.jit(partial(loop.train_chunk, program), donate_argnums=1)
     call = chunk.lower(schedule, state, np.int32(1)).compile()
     memory = call.memory_analysis()
+    assert memory is not None  # both CPU and GPU tell
     work = memory.temp_size_in_bytes + memory.output_size_in_bytes
     seconds = time.perf_counter() - began
     return Compiled(call, seconds, memory.argument_size_in_bytes, work)
@@ -187,12 +188,13 @@ def _report(
     settings = program.config
     names = [stage.name for stage in settings.stage]
     control_steps = settings.arenas * settings.algo.rollout
+    tally.update += n
+    tally.seconds += seconds
     rows = recorder.rows(metrics, n, names, control_steps)
+    rows: list[recorder.Row] = [row | {"train_s": tally.seconds} for row in rows]
     _check_finite(rows)
     decisions = curriculum.log(rows, names)
     speeds = _speeds(program, rows, seconds) | {"compile_s": tally.compile_s}
-    tally.update += n
-    tally.seconds += seconds
     tally.transitions += sum(row["transitions"] for row in rows)
     tally.decisions += decisions
     measured = {row["stage"]: row["stage_success"] for row in rows if row["stage_success"]}
@@ -216,7 +218,7 @@ def _check_finite(rows: list[dict]) -> None:
 
 
 def _speeds(program: Program, rows: list[dict], seconds: float) -> dict[str, float]:
-    """Speeds of a call: arena control steps, robot steps, physics steps and transitions a second."""
+    """Speeds of a call: arena, robot and physics steps, and transitions, a second."""
     settings = program.config
     arena_steps = len(rows) * settings.arenas * settings.algo.rollout
     return {

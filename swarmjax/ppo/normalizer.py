@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 
 # An observation that has hardly moved so far is magnified by at most 1 / this.
-_MIN_STD = 1e-3
+MIN_STD = 1e-3
 
 
 @struct.dataclass(kw_only=True)
@@ -32,7 +32,7 @@ class Normalizer:
     @property
     def std(self) -> jax.Array:
         """Standard deviation to divide by, [O], at least 1e-3."""
-        return jnp.maximum(jnp.sqrt(self.variance), _MIN_STD)
+        return jnp.maximum(jnp.sqrt(self.variance), MIN_STD)
 
 
 def init(observation_size: int) -> Normalizer:

@@ -76,7 +76,7 @@ def resolve_impl(impl: str) -> str:
     installed = importlib.util.find_spec("warp") is not None
     if impl == "warp" and not installed:
         raise ConfigError(
-            "sim.impl is warp, but Warp is not installed: install swarmjax[gpu], or give jax or auto."
+            "sim.impl is warp, but Warp is not installed: give jax or auto, or install extra gpu."
         )
     if impl != "auto":
         return impl
@@ -168,9 +168,7 @@ def step(
         ctrl=ctrl,
     )
     model = physics.model
-    model = model.replace(
-        geom_size=model.geom_size.at[ids.obstacle_geom, :2].set(obstacle[:, 3:])
-    )
+    model = model.replace(geom_size=model.geom_size.at[ids.obstacle_geom, :2].set(obstacle[:, 3:]))
     if physics.substeps == 1:
         return mjx.step(model, data)
     return jax.lax.fori_loop(0, physics.substeps, lambda _, d: mjx.step(model, d), data)

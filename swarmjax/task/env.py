@@ -4,7 +4,7 @@
 to, and the rollout decides what comes next.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -125,9 +125,7 @@ def load(config: TrainConfig) -> World:
     spec.option.ls_iterations = sim.ls_iterations or ls_iterations
     compiled = spec.compile()
     ids = model.ids(compiled, size)
-    engine = physics.load(
-        compiled, ids, impl=impl, arenas=config.arenas, substeps=sim.substeps
-    )
+    engine = physics.load(compiled, ids, impl=impl, arenas=config.arenas, substeps=sim.substeps)
     spacing = Spacing(
         sim.max_robots, sim.max_obstacles, config.robot.hull_radius, config.task.target_radius
     )
@@ -194,12 +192,15 @@ def step(world: World, state: EnvState, action: Array) -> tuple[EnvState, TimeSt
     gap = sim_gaps.gaps(
         pose, state.level.side, state.level.obstacle, world.config.robot.hull_radius, jnp
     )
-    begins, apart = sim_gaps.count_contacts(
-        gap, state.apart, world.config.task.control_step, jnp
-    )
+    begins, apart = sim_gaps.count_contacts(gap, state.apart, world.config.task.control_step, jnp)
     begins = begins & state.level.present[:, None]
     earned = reward.Step(
-        state.distance, distance, seen, world.config.task.sensor_range, arrives, begins & active[:, None]
+        state.distance,
+        distance,
+        seen,
+        world.config.task.sensor_range,
+        arrives,
+        begins & active[:, None],
     )
     valid = active & sound
     gained = jnp.where(valid, reward.total(earned, world.config.task.reward), 0.0)
@@ -207,8 +208,14 @@ def step(world: World, state: EnvState, action: Array) -> tuple[EnvState, TimeSt
     arrived = state.arrived | arrives
     clock = state.clock + 1
     timeout = clock >= world.config.task.step_limit
-    new = state.replace(
-        sim=data, clock=clock, arrived=arrived, distance=distance, apart=apart, episode=episode
+    new = replace(
+        state,
+        sim=data,
+        clock=clock,
+        arrived=arrived,
+        distance=distance,
+        apart=apart,
+        episode=episode,
     )
     return new, TimeStep(
         observation=observation.observe(seen, distance, bearing, jnp),
@@ -221,17 +228,13 @@ def step(world: World, state: EnvState, action: Array) -> tuple[EnvState, TimeSt
     )
 
 
-def _move(
-    world: World, state: EnvState, action: Array, active: Array
-) -> tuple[Any, Array, Array]:
+def _move(world: World, state: EnvState, action: Array, active: Array) -> tuple[Any, Array, Array]:
     """Lets the robots that are on their way drive; returns data, poses and whether it is sound."""
     command = sim_drive.command(action, world.drive, jnp)
     command = jnp.where(active[:, None], command, 0.0)
     wheels = sim_drive.wheel_speeds(command, world.drive, jnp)
     velocity = sim_drive.body_velocity(wheels, world.drive, jnp)
-    data = physics.step(
-        world.physics, state.sim, state.level.side, state.level.obstacle, velocity
-    )
+    data = physics.step(world.physics, state.sim, state.level.side, state.level.obstacle, velocity)
     sound = physics.is_finite(data)
     # What follows stays finite: an arena that broke is seen where it last was, and reset.
     pose = jnp.where(sound, physics.poses(data), physics.poses(state.sim))

@@ -70,9 +70,7 @@ def score_walls(points: Array, side: Array, gap: Array, xp: Any) -> Array:
     return xp.where(spare >= 0, 0, _FORBIDDEN + spare)
 
 
-def score_things(
-    points: Array, centres: Array, there: Array, gap: Gap, xp: Any
-) -> Array:
+def score_things(points: Array, centres: Array, there: Array, gap: Gap, xp: Any) -> Array:
     """Scores points by their distances to things already placed.
 
     Args:

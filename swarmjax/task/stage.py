@@ -51,6 +51,5 @@ def select(stages: Stage, index: Array) -> Stage:
 def largest_half(stages: Sequence[StageConfig]) -> float:
     """Half the longest edge of any obstacle of these stages, m: what the model is compiled for."""
     return max(
-        FENCE_HALF_LENGTH * s.side if s.layout == "fence" else 0.5 * s.obstacle_size
-        for s in stages
+        FENCE_HALF_LENGTH * s.side if s.layout == "fence" else 0.5 * s.obstacle_size for s in stages
     )

@@ -1,6 +1,7 @@
 """What one update must and must not do."""
 
 import functools
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -50,7 +51,7 @@ def _experienced(seed: int = 0, config: AlgoConfig = CONFIG) -> LearnerState:
     state, _ = _update(state, _batch(state, 10, config), jax.random.key(20), config=config)
     params = jax.tree.map(jnp.copy, state.params)
     params["actor"]["mean"]["kernel"] *= 100.0
-    return state.replace(params=params)
+    return replace(state, params=params)
 
 
 def _spoilt(batch: Batch, valid: jax.Array) -> Batch:
@@ -109,11 +110,11 @@ def test_observations_are_cut_at_ten_deviations() -> None:
 def test_the_first_minibatch_starts_at_ratio_one_with_the_old_normalizer() -> None:
     state = _experienced(config=ONE_STEP)
     batch = _batch(state, 1, ONE_STEP)
-    shifted = batch.replace(observation=batch.observation + 4.0)
+    shifted = replace(batch, observation=batch.observation + 4.0)
     action, log_prob = learner.act(
         state, ONE_STEP, shifted.observation, jax.random.normal(jax.random.key(3), (G, N, U))
     )
-    shifted = shifted.replace(action=action, log_prob=log_prob)
+    shifted = replace(shifted, action=action, log_prob=log_prob)
     updated, metrics = _update(state, shifted, jax.random.key(2), config=ONE_STEP)
     # exp and log densities round at about 1e-6; with the updated normalizer it is of order 0.1.
     np.testing.assert_allclose(metrics["approx_kl"], 0.0, atol=1e-5)
@@ -122,7 +123,7 @@ def test_the_first_minibatch_starts_at_ratio_one_with_the_old_normalizer() -> No
     np.testing.assert_allclose(metrics["policy_loss"], 0.0, atol=1e-5)
     stale = learner.act(updated, ONE_STEP, shifted.observation, jnp.zeros((G, N, U)))[0]
     fresh = learner.act(
-        updated.replace(normalizer=state.normalizer),
+        replace(updated, normalizer=state.normalizer),
         ONE_STEP,
         shifted.observation,
         jnp.zeros((G, N, U)),
@@ -146,7 +147,7 @@ def test_advantages_are_normalised_over_the_valid_samples_of_the_batch() -> None
     batch = _batch(state, 1)
     key = jax.random.key(2)
     _, expected = _update(state, batch, key)
-    _, scaled = _update(state, batch.replace(advantage=7.0 * batch.advantage - 30.0), key)
+    _, scaled = _update(state, replace(batch, advantage=7.0 * batch.advantage - 30.0), key)
     # Rounding of 7 a - 30 with values around 5: 1e-6 of the advantages' spread.
     np.testing.assert_allclose(scaled["policy_loss"], expected["policy_loss"], atol=1e-5)
     np.testing.assert_allclose(scaled["grad_norm"], expected["grad_norm"], rtol=1e-4)
@@ -190,7 +191,8 @@ def test_a_batch_without_a_valid_sample_changes_nothing_at_all() -> None:
     _assert_equal(updated, state)
     std = metrics.pop("std")
     np.testing.assert_allclose(std, jnp.exp(state.params["actor"]["log_std"]).mean(), rtol=1e-6)
-    assert metrics and all(metric == 0.0 for metric in metrics.values())
+    assert metrics
+    assert all(metric == 0.0 for metric in metrics.values())
 
 
 def test_minibatches_without_a_valid_sample_are_no_steps() -> None:
@@ -216,7 +218,7 @@ def test_each_epoch_learns_from_every_group_once() -> None:
     # With a critic that stands still, the value loss averages over every sample exactly when each
     # epoch visits each group once. Returns 2**g tell every choice of groups apart.
     returns = jnp.broadcast_to(2.0 ** jnp.arange(G)[:, None], (G, N))
-    batch = batch.replace(return_=returns, valid=jnp.ones((G, N), bool))
+    batch = replace(batch, return_=returns, valid=jnp.ones((G, N), bool))
     _, metrics = _update(state, batch, jax.random.key(1), config=config)
     value = learner.values(state, config, batch.observation)
     # Float32 means of squares up to 128**2.
@@ -328,7 +330,7 @@ def test_shapes_that_would_broadcast_are_refused(field: str) -> None:
     state = _fresh()
     batch = _batch(state)
     with pytest.raises(AssertionError):
-        _update(state, batch.replace(**{field: getattr(batch, field)[:, :1]}), jax.random.key(0))
+        _update(state, replace(batch, **{field: getattr(batch, field)[:, :1]}), jax.random.key(0))
 
 
 def test_minibatches_that_do_not_divide_the_groups_are_refused() -> None:

@@ -1,5 +1,7 @@
 """The loss against NumPy, with masks."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -73,7 +75,8 @@ def test_a_clipped_ratio_has_no_gradient_and_an_unclipped_one_has() -> None:
     config = AlgoConfig(hidden=(8,), clip=0.2, entropy_cost=0.0)
 
     def slope(ratio: float, advantage: float) -> float:
-        samples = minibatch.replace(
+        samples = replace(
+            minibatch,
             log_prob=log_prob - np.log(ratio),
             advantage=np.full(B, advantage, np.float32),
             valid=np.ones(B, bool),
@@ -91,7 +94,7 @@ def test_a_clipped_ratio_has_no_gradient_and_an_unclipped_one_has() -> None:
 def test_without_a_valid_sample_loss_and_gradient_are_zero() -> None:
     minibatch = _minibatch(valid_share=0.0)
     # A log ratio of about 1000: masked only after exp, its gradient would be NaN.
-    minibatch = minibatch.replace(log_prob=minibatch.log_prob - 1000.0)
+    minibatch = replace(minibatch, log_prob=minibatch.log_prob - 1000.0)
     (loss, metrics), gradient = jax.value_and_grad(ppo_loss, has_aux=True)(
         PARAMS, minibatch, CONFIG, jnp.float32(0.0)
     )
@@ -104,7 +107,7 @@ def test_float_masks_count_as_boolean_ones() -> None:
     expected = ppo_loss(PARAMS, minibatch, CONFIG, jnp.float32(14.0))
     got = ppo_loss(
         PARAMS,
-        minibatch.replace(valid=minibatch.valid.astype(np.float32)),
+        replace(minibatch, valid=minibatch.valid.astype(np.float32)),
         CONFIG,
         jnp.float32(14.0),
     )
@@ -115,7 +118,7 @@ def test_mean_over_unevenly_filled_minibatches_is_the_loss_of_the_batch() -> Non
     batch = _minibatch()
     valid = np.zeros(B, bool)
     valid[[0, 1, 2, 3, 4, 5, 6, 7, 9]] = True
-    batch = batch.replace(valid=valid)
+    batch = replace(batch, valid=valid)
     loss = jax.value_and_grad(ppo_loss, has_aux=True)
     whole = loss(PARAMS, batch, CONFIG, jnp.float32(9.0))
     # Three minibatches of eight with 8, 1 and 0 valid samples: each expects 9 / 3 of them.
@@ -138,7 +141,7 @@ def test_shapes_that_would_broadcast_are_refused() -> None:
     with pytest.raises(AssertionError):
         ppo_loss(
             PARAMS,
-            minibatch.replace(return_=minibatch.return_[:, None]),
+            replace(minibatch, return_=minibatch.return_[:, None]),
             CONFIG,
             jnp.float32(1.0),
         )

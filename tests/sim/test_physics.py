@@ -127,7 +127,9 @@ def test_both_implementations_move_as_the_c_engine_does(engine: Engine) -> None:
     np.testing.assert_allclose(found[..., 2], expected[..., 2], atol=2e-5)
 
 
-@pytest.mark.parametrize("command", [(FULL, 0.0), (0.0, 3.14), (0.0, -3.14), (0.05, 1.0), (0.0, 0.0)])
+@pytest.mark.parametrize(
+    "command", [(FULL, 0.0), (0.0, 3.14), (0.0, -3.14), (0.05, 1.0), (0.0, 0.0)]
+)
 def test_one_step_from_rest_reaches_the_command(
     engine: Engine, command: tuple[float, float]
 ) -> None:
@@ -138,7 +140,9 @@ def test_one_step_from_rest_reaches_the_command(
     forward = rate[0] * np.cos(yaw) + rate[1] * np.sin(yaw)
     sideways = rate[1] * np.cos(yaw) - rate[0] * np.sin(yaw)
     # 1e-6: float32 at 3.14.
-    np.testing.assert_allclose([forward, sideways, rate[2]], [command[0], 0.0, command[1]], atol=1e-6)
+    np.testing.assert_allclose(
+        [forward, sideways, rate[2]], [command[0], 0.0, command[1]], atol=1e-6
+    )
 
 
 def test_a_robot_rolls_as_the_unicycle(engine: Engine) -> None:
@@ -181,7 +185,9 @@ def test_parked_robots_stay_where_they_are(engine: Engine) -> None:
     velocity = np.zeros((40, ARENAS, ROBOTS, 2))
     velocity[:, :, 0, 0] = FULL  # into the east wall
     path = _drive(engine, start, velocity)
-    np.testing.assert_array_equal(path.pose[:, :, 1:], np.broadcast_to(start[1:], (40, ARENAS, 2, 3)))
+    np.testing.assert_array_equal(
+        path.pose[:, :, 1:], np.broadcast_to(start[1:], (40, ARENAS, 2, 3))
+    )
     assert not path.rate[:, :, 1:].any()
 
 

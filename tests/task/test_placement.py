@@ -122,9 +122,7 @@ def test_place(
 def test_place_heeds_the_score_it_is_given(xp: ModuleType) -> None:
     score = xp.asarray([0, 0, FORBIDDEN - 5, -7, 0])
     picks = xp.asarray([0.99, 0.99, 0.99, 0.99], dtype=xp.float32)
-    centres, sound = place(
-        xp.asarray(ROW), score, picks, xp.ones(4, dtype=bool), Gap(1, 1), xp
-    )
+    centres, sound = place(xp.asarray(ROW), score, picks, xp.ones(4, dtype=bool), Gap(1, 1), xp)
     # The three free points from the last to the first, then the one that only lacks room.
     assert centres[:, 0].tolist() == [40, 10, 0, 30]
     assert sound.tolist() == [True] * 4

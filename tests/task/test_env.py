@@ -1,0 +1,360 @@
+"""One arena's rules: arrival, the end of an episode, rewards, and what a broken arena does."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmjax.sim import gaps, infrared, physics
+from swarmjax.task import env, observation
+from swarmjax.task.env import EnvState, TimeStep, World
+from swarmjax.task.level import Level
+
+ArenaStep = Callable[[EnvState, jax.Array], tuple[EnvState, TimeStep]]
+
+ARENAS, ROBOTS, OBSTACLES, LIMIT = 8, 3, 2, 16  # of the tiny configuration
+HULL, REACH, RANGE = 0.037, 0.05, 0.04  # m
+PACE = 0.1256 * 0.032  # m a step at full speed: 4.02 mm
+AHEAD, STILL = (1.0, 0.0), (-1.0, 0.0)  # actions
+
+
+class Robot(NamedTuple):
+    x: float
+    y: float
+    yaw: float
+    target: tuple[float, float]
+    action: tuple[float, float]
+
+
+class Episode(NamedTuple):
+    """Arenas driven for one step limit, without any reset: states [T + 1, A], steps [T, A]."""
+
+    state: EnvState
+    came: TimeStep
+    pose: np.ndarray
+    rate: np.ndarray
+
+
+# Arrives after 3 steps: 60, 56, 52, 48 mm. Its neighbour's target is behind a wall.
+ARRIVES = [Robot(0.0, 0.0, 0.0, (0.06, 0.0), AHEAD), Robot(-0.2, 0.2, 1.0, (9.0, 9.0), STILL)]
+# Arrive after 3 and 5 steps: the second by 68, 64, 60, 56, 52, 48 mm less 4.
+ALL_ARRIVE = [Robot(0.0, 0.0, 0.0, (0.06, 0.0), AHEAD), Robot(0.0, 0.2, 0.0, (0.07, 0.2), AHEAD)]
+# The second meets the first, which has arrived, from the front, and pushes it back.
+PUSHED = [Robot(0.0, 0.0, 0.0, (0.06, 0.0), AHEAD), Robot(0.11, 0.0, np.pi, (9.0, 9.0), AHEAD)]
+# The first stands 23 mm from the east wall, the second in the middle of nowhere.
+STANDS = [
+    Robot(0.34, 0.0, 0.0, (0.0, 0.3), STILL),
+    Robot(-0.1, 0.0, 0.0, (-0.3, 0.3), STILL),
+    Robot(0.1, -0.25, 0.0, (-0.3, 0.0), STILL),
+]
+# The first drives into the east wall, the second into an obstacle.
+BUMPS = [
+    Robot(0.34, 0.0, 0.0, (0.0, 0.3), AHEAD),
+    Robot(-0.05, -0.25, np.pi, (0.3, -0.25), AHEAD),
+]
+OBSTACLE = (-0.2, -0.25, 0.0, 0.05, 0.05)
+SCENES = [ARRIVES, ALL_ARRIVE, PUSHED, STANDS, BUMPS]
+ARRIVING, ALL, PUSHING, STANDING, BUMPING, *RANDOM = range(ARENAS)
+
+
+def _level(robots: list[Robot]) -> Level:
+    """An arena of 0.8 m with these robots and one obstacle, the rest parked."""
+    parked = [Robot(5.0 + 0.5 * i, 5.0, 0.0, (5.0 + 0.5 * i, 5.0), AHEAD) for i in range(ROBOTS)]
+    everyone = [*robots, *parked[len(robots) :]]
+    return Level(
+        side=np.float32(0.8),
+        present=np.arange(ROBOTS) < len(robots),
+        start=np.array([robot[:3] for robot in everyone], np.float32),
+        target=np.array([robot.target for robot in everyone], np.float32),
+        obstacle_present=np.array([True, False]),
+        obstacle=np.array([OBSTACLE, (-5.5, -5.0, 0.0, 0.05, 0.05)], np.float32),
+    )
+
+
+def _crowd(random: np.random.Generator) -> list[Robot]:
+    """Three robots close to each other, whose actions are drawn anew at every step."""
+    place = [(-0.05, 0.0), (0.05, 0.0), (0.0, 0.09)]
+    return [Robot(x, y, random.uniform(-3, 3), (0.1, 0.06), AHEAD) for x, y in place]
+
+
+def _start(world: World, levels: list[Level]) -> EnvState:
+    stacked = jax.tree.map(lambda *fields: jnp.asarray(np.stack(fields)), *levels)
+    number = jnp.arange(len(levels))
+    state, _ = jax.vmap(functools.partial(env.reset, world))(stacked, number, number)
+    return state.replace(sim=jax.vmap(functools.partial(physics.unpack, world.physics))(state.sim))
+
+
+def _slim(state: EnvState) -> EnvState:
+    """The state as NumPy, with no more of the physics than a checkpoint holds."""
+    return jax.tree.map(np.asarray, state.replace(sim=physics.pack(state.sim)))
+
+
+def _stack(trees: list[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
+
+
+@pytest.fixture(scope="module")
+def actions() -> np.ndarray:
+    random = np.random.default_rng(5)
+    chosen = random.uniform(-1.5, 1.5, (LIMIT, ARENAS, ROBOTS, 2)).astype(np.float32)
+    chosen[..., 0] += 0.5
+    for arena, robots in enumerate(SCENES):
+        for i in range(ROBOTS):
+            chosen[:, arena, i] = robots[i].action if i < len(robots) else AHEAD
+    return chosen
+
+
+@pytest.fixture(scope="module")
+def start(tiny_world: World) -> EnvState:
+    random = np.random.default_rng(6)
+    return _start(tiny_world, [_level(r) for r in [*SCENES, *(_crowd(random) for _ in RANDOM)]])
+
+
+@pytest.fixture(scope="module")
+def episode(start: EnvState, actions: np.ndarray, tiny_step: ArenaStep) -> Episode:
+    state, states, steps = start, [_slim(start)], []
+    for action in actions:
+        state, came = tiny_step(state, jnp.asarray(action))
+        states.append(_slim(state))
+        steps.append(jax.tree.map(np.asarray, came))
+    stacked = _stack(states)
+    shape = (LIMIT + 1, ARENAS, ROBOTS, 3)
+    return Episode(
+        stacked,
+        _stack(steps),
+        stacked.sim.qpos.reshape(shape).astype(np.float64),
+        stacked.sim.qvel.reshape(shape),
+    )
+
+
+# --- arrival
+
+
+def test_a_robot_arrives_once_and_its_own_episode_ends(episode: Episode) -> None:
+    came = episode.came
+    robot = ARRIVING, 0
+    assert came.terminated[:, *robot].tolist() == [t == 2 for t in range(LIMIT)]
+    assert episode.state.arrived[:, *robot].tolist() == [t >= 3 for t in range(LIMIT + 1)]
+    assert came.valid[:, *robot].tolist() == [t <= 2 for t in range(LIMIT)]
+    assert not came.reward[3:, *robot].any()
+    assert not came.truncated[:, *robot].any()
+    # 60 mm less three steps, 1e-6 m for float32.
+    assert episode.state.distance[3, *robot] == pytest.approx(0.06 - 3 * PACE, abs=1e-6)
+
+
+def test_a_robot_that_has_arrived_stands_whatever_its_action(episode: Episode) -> None:
+    rate = episode.rate[:, ARRIVING, 0]
+    # 1e-6: float32; it drives until it arrives, and its servo is deadbeat.
+    np.testing.assert_allclose(rate[1:4, 0], 0.1256, atol=1e-6)
+    np.testing.assert_allclose(rate[4:], 0.0, atol=1e-6)
+    place = episode.pose[:, ARRIVING, 0]
+    np.testing.assert_allclose(place[4:], np.broadcast_to(place[3], (13, 3)), atol=1e-6)
+
+
+def test_a_robot_that_is_pushed_away_has_still_arrived(episode: Episode) -> None:
+    robot = PUSHING, 0
+    assert episode.came.terminated[:, *robot].tolist() == [t == 2 for t in range(LIMIT)]
+    assert episode.state.distance[-1, *robot] > REACH + 0.01  # it was pushed a centimetre out
+    assert episode.state.arrived[3:, *robot].all()
+    assert not episode.came.valid[3:, *robot].any()
+    assert not episode.came.reward[3:, *robot].any()
+
+
+def test_all_arrived_ends_the_episode(episode: Episode) -> None:
+    assert np.flatnonzero(episode.came.terminated[:, ALL, 0]).tolist() == [2]
+    assert np.flatnonzero(episode.came.terminated[:, ALL, 1]).tolist() == [4]
+    assert np.flatnonzero(episode.came.done[:, ALL])[0] == 4
+    assert not episode.came.truncated[:5, ALL].any()
+
+
+# --- the end of time
+
+
+def test_time_runs_out_for_those_on_their_way(episode: Episode) -> None:
+    came = episode.came
+    assert not came.truncated[:-1].any()
+    on_their_way = episode.state.level.present[0] & ~episode.state.arrived[-1]
+    np.testing.assert_array_equal(came.truncated[-1], on_their_way)
+    assert on_their_way[ARRIVING].tolist() == [False, True, False]
+    assert came.done[-1].all()
+    assert not came.done[:-1, [ARRIVING, PUSHING, STANDING, BUMPING]].any()
+    assert episode.state.clock[:, 0].tolist() == list(range(LIMIT + 1))
+
+
+def test_no_robot_terminates_twice_nor_ends_both_ways(episode: Episode) -> None:
+    assert (episode.came.terminated.sum(axis=0) <= 1).all()
+    assert not (episode.came.terminated & episode.came.truncated).any()
+    assert episode.came.terminated.sum() == episode.state.arrived[-1].sum()
+
+
+def test_absent_robots_take_no_part(episode: Episode) -> None:
+    absent = ~episode.state.level.present[0]
+    assert absent.sum() == 4
+    for name in ("valid", "terminated", "truncated", "reward"):
+        assert not getattr(episode.came, name)[:, absent].any(), name
+    for total in episode.state.episode:
+        assert not total[-1][absent].any()
+    # They stand where they are parked, whatever their action.
+    np.testing.assert_array_equal(
+        episode.pose[:, absent], np.broadcast_to(episode.pose[0][absent], (LIMIT + 1, 4, 3))
+    )
+
+
+# --- observation
+
+
+def test_observation_is_of_the_state_after_the_step_before_any_reset(episode: Episode) -> None:
+    level = episode.state.level
+    for t in range(LIMIT):
+        for a in range(ARENAS):
+            pose = episode.pose[t + 1, a].astype(np.float32)
+            side, box, target = level.side[0, a], level.obstacle[0, a], level.target[0, a]
+            seen = infrared.distances(pose, side, box, HULL, RANGE, np)
+            distance, bearing = observation.to_target(pose, target, np)
+            expected = observation.observe(seen, distance, bearing, np)
+            found = episode.came.observation[t, a]
+            # 1e-5 m: float32, where a glancing ray multiplies its rounding.
+            np.testing.assert_allclose(found[:, :9], expected[:, :9], atol=1e-5)
+            # Where the target is near, so is its rounding in rad; half a turn is either sign.
+            turn = np.abs(np.exp(1j * found[:, 9]) - np.exp(1j * expected[:, 9]))
+            present = level.present[0, a]
+            assert (turn < 1e-5)[present].all()
+
+
+def test_first_observation(tiny_world: World, start: EnvState) -> None:
+    level = jax.tree.map(np.asarray, start.level)
+    state, found = env.reset(tiny_world, jax.tree.map(lambda x: x[STANDING], start.level), 1, 7)
+    expected = infrared.distances(
+        level.start[STANDING], level.side[STANDING], level.obstacle[STANDING], HULL, RANGE, np
+    )
+    np.testing.assert_allclose(found[:, :8], expected, atol=1e-6)  # float32
+    # The first robot looks at the wall, 60 mm ahead of its centre: ps7 sits 30 mm ahead and
+    # looks 0.2992 rad to the left, ps0 0.30081 rad to the right.
+    assert found[0, 7] == pytest.approx(0.03 / np.cos(0.2992), abs=1e-6)
+    assert found[0, 0] == pytest.approx(0.03 / np.cos(0.30081), abs=1e-6)
+    # Its target is 0.34 m back and 0.3 m to the left.
+    assert found[0, 8] == pytest.approx(np.hypot(0.34, 0.3), abs=1e-6)
+    assert found[0, 9] == pytest.approx(np.arctan2(0.3, -0.34), abs=1e-6)
+    assert (int(state.stage), int(state.cohort), int(state.clock)) == (1, 7, 0)
+    np.testing.assert_array_equal(state.distance, found[:, 8])
+    assert not state.arrived.any()
+
+
+# --- reward and counts
+
+
+def test_a_robot_that_stands_in_range_pays_every_step_once(episode: Episode) -> None:
+    # Two rays of the first see the wall; the others see nothing.
+    assert (episode.came.observation[:, STANDING, 0, :8] < RANGE).sum(axis=-1).min() == 2
+    expected = np.broadcast_to(np.float32([-0.001, 0.0, 0.0]), (LIMIT, ROBOTS))
+    # 1e-7 m: its distance to the target is computed anew at every step.
+    np.testing.assert_allclose(episode.came.reward[:, STANDING], expected, atol=1e-7)
+    assert episode.state.episode.sensed[-1, STANDING].tolist() == [LIMIT, 0, 0]
+
+
+def test_rewards_of_an_episode_add_up_to_the_way_made(episode: Episode) -> None:
+    """With progress only, they telescope; each step in range costs 0.001 beside."""
+    present = episode.state.level.present[0]
+    ended = np.where(episode.came.terminated.any(axis=0), episode.came.terminated.argmax(axis=0), 15)
+    last = np.take_along_axis(episode.state.distance[1:], ended[None], axis=0)[0]
+    progress = episode.state.distance[0] - last
+    sensed = episode.came.observation[..., :8].min(axis=-1) < RANGE
+    steps = np.sum(sensed & episode.came.valid, axis=0)
+    expected = np.where(present, progress - 0.001 * steps, 0.0)
+    assert (steps[RANDOM] > 0).any()
+    # 1e-6: float32, sixteen sums.
+    np.testing.assert_allclose(episode.came.reward.sum(axis=0), expected, atol=1e-6)
+    np.testing.assert_allclose(episode.state.episode.reward[-1], expected, atol=1e-6)
+    np.testing.assert_array_equal(episode.state.episode.sensed[-1], np.where(present, steps, 0))
+
+
+def test_steps_before_arrival_are_counted(episode: Episode) -> None:
+    moving = episode.state.episode.moving[-1]
+    np.testing.assert_array_equal(moving, episode.came.valid.sum(axis=0))
+    assert moving[ARRIVING].tolist() == [3, LIMIT, 0]
+    assert moving[ALL].tolist() == [3, 5, 0]
+
+
+def test_contacts_are_counted_by_kind(episode: Episode) -> None:
+    counts = episode.state.episode.contacts[-1]
+    assert gaps.KINDS == ("robot", "obstacle", "wall")
+    # Into a wall 23 mm ahead, and into an obstacle: once each, while they keep pushing.
+    assert counts[BUMPING].tolist() == [[0, 0, 1], [0, 1, 0], [0, 0, 0]]
+    # A contact of two robots is one of each, arrived or not.
+    assert counts[PUSHING].tolist() == [[1, 0, 0], [1, 0, 0], [0, 0, 0]]
+    assert not counts[STANDING].any()
+    # All of them again, from the poses.
+    apart = np.full((ARENAS, ROBOTS, 3), gaps.CONTACT_PAUSE)
+    expected = np.zeros((ARENAS, ROBOTS, 3), int)
+    level = jax.tree.map(lambda field: field[0], episode.state.level)
+    for pose in episode.pose[1:]:
+        gap = [
+            gaps.gaps(pose[a], level.side[a], level.obstacle[a], HULL, np) for a in range(ARENAS)
+        ]
+        begins, apart = gaps.count_contacts(np.stack(gap), apart, 0.032, np)
+        expected += begins & level.present[..., None]
+    np.testing.assert_array_equal(counts, expected)
+    assert expected[RANDOM].sum() >= 3
+
+
+# --- one arena and the others
+
+
+@pytest.mark.parametrize("arena", [PUSHING, RANDOM[0]])
+def test_an_arena_moves_as_it_would_in_any_other_company(
+    start: EnvState, actions: np.ndarray, episode: Episode, tiny_step: ArenaStep, arena: int
+) -> None:
+    # Eight copies of one arena, in the same program: bit for bit what it did among the others.
+    state = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[arena], leaf.shape), start)
+    for t, action in enumerate(actions):
+        mine = np.broadcast_to(action[arena], action.shape)
+        state, came = tiny_step(state, jnp.asarray(mine))
+        expected = jax.tree.map(lambda leaf, t=t: leaf[t, arena], episode.came)
+        for found, one in zip(came, expected, strict=True):
+            np.testing.assert_array_equal(found, np.broadcast_to(one, found.shape))
+        qpos = episode.state.sim.qpos[t + 1, arena]
+        np.testing.assert_array_equal(state.sim.qpos, np.broadcast_to(qpos, state.sim.qpos.shape))
+    assert episode.state.episode.contacts[-1, arena].any(), "it has touched something"
+
+
+@pytest.mark.parametrize("field", ["qpos", "qvel", "qacc_warmstart"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_broken_arena_leaves_its_neighbours_alone(
+    start: EnvState, actions: np.ndarray, tiny_step: ArenaStep, field: str, value: float
+) -> None:
+    broken = start.replace(
+        sim=start.sim.replace(**{field: getattr(start.sim, field).at[BUMPING, 0].set(value)})
+    )
+    sound = start
+    others = np.arange(ARENAS) != BUMPING
+    for action in actions[:3]:
+        sound, expected = tiny_step(sound, jnp.asarray(action))
+        broken, found = tiny_step(broken, jnp.asarray(action))
+        jax.tree.map(
+            lambda theirs, mine: np.testing.assert_array_equal(theirs[others], mine[others]),
+            (_slim(broken), found),
+            (_slim(sound), expected),
+        )
+
+
+def test_a_broken_arena_is_over_and_teaches_nothing(
+    start: EnvState, actions: np.ndarray, tiny_step: ArenaStep
+) -> None:
+    state, _ = tiny_step(start, jnp.asarray(actions[0]))
+    before = state.distance[BUMPING]
+    state = state.replace(sim=state.sim.replace(qvel=state.sim.qvel.at[BUMPING, 4].set(jnp.nan)))
+    state, came = jax.tree.map(np.asarray, tiny_step(state, jnp.asarray(actions[1])))
+    assert came.sound.tolist() == [a != BUMPING for a in range(ARENAS)]
+    assert came.done.tolist() == [a == BUMPING for a in range(ARENAS)]
+    assert not came.valid[BUMPING].any()
+    assert not came.terminated[BUMPING].any()
+    assert came.truncated[BUMPING].tolist() == [True, True, False]
+    assert not came.reward[BUMPING].any()
+    assert np.isfinite(came.observation).all()
+    np.testing.assert_array_equal(state.distance[BUMPING], before)  # seen where it last was
+    for total in state.episode:
+        assert np.isfinite(total).all()

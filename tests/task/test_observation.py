@@ -1,0 +1,73 @@
+"""What a robot observes, by hand."""
+
+from types import ModuleType
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarmjax.task import observation
+
+MODULES = pytest.mark.parametrize("xp", [np, jnp])
+PI = np.pi
+
+
+def test_layout() -> None:
+    assert observation.NAMES == (
+        *(f"infrared_{i}" for i in range(8)),
+        "target_distance",
+        "target_bearing",
+    )
+    assert observation.UNITS == ("m",) * 9 + ("rad",)
+    assert observation.SIZE == 10
+
+
+@MODULES
+@pytest.mark.parametrize(
+    ("pose", "target", "distance", "bearing"),
+    [
+        ((0.0, 0.0, 0.0), (0.3, 0.4), 0.5, np.arctan2(4, 3)),
+        ((0.1, 0.2, 0.0), (0.1, 0.7), 0.5, 0.5 * PI),  # left is positive
+        ((0.1, 0.2, 0.5 * PI), (0.1, 0.7), 0.5, 0.0),  # straight ahead
+        ((0.1, 0.2, PI), (0.1, 0.7), 0.5, -0.5 * PI),
+        ((0.0, 0.0, 0.75 * PI), (0.2, 0.0), 0.2, -0.75 * PI),
+        ((0.0, 0.0, 10 * PI + 0.3), (0.2, 0.0), 0.2, -0.3),  # a yaw is not bounded
+        ((0.3, -0.3, 1.0), (0.3, -0.3), 0.0, 0.0),  # on the target
+    ],
+)
+def test_target(
+    xp: ModuleType,
+    pose: tuple[float, float, float],
+    target: tuple[float, float],
+    distance: float,
+    bearing: float,
+) -> None:
+    place = xp.asarray(pose, dtype=xp.float32)
+    found = observation.to_target(place, xp.asarray(target, dtype=xp.float32), xp)
+    # 1e-6 m; 1e-5 rad: float32, at a yaw of 30 rad.
+    assert float(found[0]) == pytest.approx(distance, abs=1e-6)
+    assert float(found[1]) == pytest.approx(bearing, abs=1e-5)
+
+
+@given(st.floats(-20.0, 20.0), st.floats(-PI, PI), st.floats(0.01, 2.0))
+def test_bearing_lies_within_half_a_turn(yaw: float, angle: float, distance: float) -> None:
+    pose = np.array([0.1, -0.2, yaw])
+    target = pose[:2] + distance * np.array([np.cos(yaw + angle), np.sin(yaw + angle)])
+    found, bearing = observation.to_target(pose, target, np)
+    assert found == pytest.approx(distance, abs=1e-12)  # rounding of float64
+    assert abs(bearing) <= PI
+    # As directions: half a turn to the left is half a turn to the right. Rounding of float64.
+    assert abs(np.exp(1j * bearing) - np.exp(1j * angle)) < 1e-11
+
+
+@MODULES
+def test_order(xp: ModuleType) -> None:
+    rays = 0.001 * np.arange(16).reshape(2, 8)
+    found = observation.observe(
+        xp.asarray(rays), xp.asarray([0.5, 0.6]), xp.asarray([-1.0, 2.0]), xp
+    )
+    expected = np.array([[*rays[0], 0.5, -1.0], [*rays[1], 0.6, 2.0]], np.float32)
+    np.testing.assert_array_equal(found, expected)
+    assert found.dtype == np.float32

@@ -1,0 +1,88 @@
+"""Each term of the reward by hand, and equation 3 of the paper."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmjax.config import RewardConfig
+from swarmjax.task import reward
+
+RANGE = 0.04  # m
+NOTHING = RewardConfig(progress=0.0, proximity=0.0)
+
+
+@pytest.fixture
+def step() -> reward.Step:
+    """Four robots: free; one ray short; three rays short, arriving, in contact; backing off."""
+    infrared = np.full((4, 8), RANGE, np.float32)
+    infrared[1, 2] = 0.039
+    infrared[2, :3] = 0.0, 0.01, 0.02
+    return reward.Step(
+        distance_before=jnp.array([0.5, 0.25, 0.0625, 0.25]),
+        distance=jnp.array([0.375, 0.25, 0.03125, 0.5]),
+        infrared=jnp.asarray(infrared),
+        sensor_range=RANGE,
+        arrives=jnp.array([False, False, True, False]),
+        contact_begins=jnp.array([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 0]], bool),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("progress", [0.125, 0.0, 0.03125, -0.25]),  # before - now, exact in binary
+        ("proximity", [0, 1, 1, 0]),  # once, however many rays; a full ray sees nothing
+        ("arrival", [0, 0, 1, 0]),
+        ("contact", [0, 1, 2, 0]),
+        ("time", [1, 1, 1, 1]),
+    ],
+)
+def test_term_and_its_weight(step: reward.Step, name: str, expected: list[float]) -> None:
+    np.testing.assert_array_equal(reward.TERMS[name](step), expected)
+    weights = dataclasses.replace(NOTHING, **{name: -4.0})
+    np.testing.assert_array_equal(reward.total(step, weights), -4.0 * np.array(expected))
+
+
+def test_every_weight_has_its_term() -> None:
+    assert set(reward.TERMS) == {field.name for field in dataclasses.fields(RewardConfig)}
+
+
+def test_default_is_equation_3(step: reward.Step) -> None:
+    expected = np.float32([0.125, -0.001, 0.03125 - 0.001, -0.25])
+    # 1e-8: one float32 rounding of the sum.
+    np.testing.assert_allclose(reward.total(step, RewardConfig()), expected, atol=1e-8)
+
+
+def test_terms_add_up(step: reward.Step) -> None:
+    weights = RewardConfig(progress=2.0, proximity=-1.0, arrival=8.0, contact=-0.5, time=-0.25)
+    # 2 * progress - proximity + 8 * arrival - contact / 2 - 1/4, exact in binary.
+    expected = [0.25 - 0.25, -1.0 - 0.5 - 0.25, 0.0625 - 1.0 + 8.0 - 1.0 - 0.25, -0.5 - 0.25]
+    np.testing.assert_array_equal(reward.total(step, weights), expected)
+
+
+def test_no_weight_no_reward(step: reward.Step) -> None:
+    np.testing.assert_array_equal(reward.total(step, NOTHING), np.zeros(4))
+
+
+def test_progress_telescopes() -> None:
+    random = np.random.default_rng(0)
+    distance = random.uniform(0.0, 1.0, (21, 3)).astype(np.float32)
+    total = sum(
+        np.asarray(
+            reward.progress(
+                reward.Step(
+                    jnp.asarray(before),
+                    jnp.asarray(now),
+                    jnp.zeros((3, 8)),
+                    RANGE,
+                    jnp.zeros(3, bool),
+                    jnp.zeros((3, 3), bool),
+                )
+            )
+        )
+        for before, now in zip(distance[:-1], distance[1:], strict=True)
+    )
+    # 1e-6 m: float32, twenty sums.
+    np.testing.assert_allclose(total, distance[0] - distance[-1], atol=1e-6)
