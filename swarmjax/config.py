@@ -158,10 +158,10 @@ class RobotConfig(_Section):
         default=epuck.HULL_RADIUS,
         metadata=_about("radius of the hull, m", above=0.0, high=DISC / 2),
     )
-    mass: float = field(default=epuck.MASS, metadata=_about("mass, kg", above=0.0))
+    mass: float = field(default=epuck.MASS, metadata=_about("mass, kg", 0.001, 100.0))
     yaw_inertia: float = field(
         default=epuck.YAW_INERTIA,
-        metadata=_about("moment of inertia about the vertical axis, kg m^2", above=0.0),
+        metadata=_about("moment of inertia about the vertical axis, kg m^2", 1e-8, 10.0),
     )
     wheel_radius: float = field(
         default=epuck.WHEEL_RADIUS, metadata=_about("radius of the wheels, m", above=0.0)

@@ -128,18 +128,7 @@ def load(config: EvaluateConfig, trained: Policy) -> Judge:
     robots, obstacles = config.stage.robots, config.stage.obstacles
     size = sim_model.ArenaSize(robots, obstacles, task_stage.largest_half([config.stage]))
     spacing = level.Spacing(robots, obstacles, config.robot.hull_radius, config.task.target_radius)
-    spec = sim_model.build(
-        config.robot, size, config.task.control_step / config.substeps, ray_geoms=True
-    )
-    spec.option.iterations = SOLVER_ITERATIONS
-    # Rather numbers that are not finite than a robot put back to where its world began.
-    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-    # All levels of a stage have obstacles of the same sizes, so these can be compiled in, and
-    # with them the bounds that MuJoCo derives from sizes.
-    example = draw_level(stage, spacing, config.seed, 0)
-    for i, half in enumerate(example.obstacle[:, 3:]):
-        spec.geom(f"obstacle{i}_box").size[:2] = half
-    compiled = spec.compile()
+    compiled = _compile(config, size, draw_level(stage, spacing, config.seed, 0))
     ids = sim_model.ids(compiled, size)
     geom_robot, geom_kind = _geoms(compiled, ids)
     return Judge(
@@ -155,6 +144,21 @@ def load(config: EvaluateConfig, trained: Policy) -> Judge:
         geom_robot=geom_robot,
         geom_kind=geom_kind,
     )
+
+
+def _compile(
+    config: EvaluateConfig, size: sim_model.ArenaSize, example: level.Level
+) -> mujoco.MjModel:
+    """Compiles the arena for obstacles of the sizes that they have in any level of the stage."""
+    timestep = config.task.control_step / config.substeps
+    spec = sim_model.build(config.robot, size, timestep, ray_geoms=True)
+    spec.option.iterations = SOLVER_ITERATIONS
+    # Rather numbers that are not finite than a robot put back to where its world began.
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    # Compiled in rather than set later, so that MuJoCo derives its bounds from them.
+    for i, half in enumerate(example.obstacle[:, 3:]):
+        spec.geom(f"obstacle{i}_box").size[:2] = half
+    return spec.compile()
 
 
 def _geoms(compiled: mujoco.MjModel, ids: sim_model.Ids) -> tuple[np.ndarray, np.ndarray]:
@@ -496,9 +500,9 @@ def _simulate_all(config: EvaluateConfig, trained: Policy) -> Iterator[Outcome]:
     if workers == 1:
         yield from map(work, batches)
         return
-    # Ctrl-C is for the process that asked; the others end when it leaves.
-    ignore = (signal.SIGINT, signal.SIG_IGN)
-    with ProcessPoolExecutor(workers, get_context("spawn"), signal.signal, ignore) as pool:
+    # Ctrl-C ends the others at once and without a word; this process says what happened.
+    end = (signal.SIGINT, signal.SIG_DFL)
+    with ProcessPoolExecutor(workers, get_context("spawn"), signal.signal, end) as pool:
         yield from pool.map(work, batches)
 
 

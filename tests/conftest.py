@@ -23,8 +23,9 @@ hypothesis.settings.load_profile("swarmjax")
 
 def pytest_configure(config: pytest.Config) -> None:
     """Keeps compiled programs in `.pytest_cache`, so that a second run compiles nothing."""
-    if config.cache is not None:
-        jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("jax")))
+    cache = getattr(config, "cache", None)  # absent with -p no:cacheprovider
+    if cache is not None:
+        jax.config.update("jax_compilation_cache_dir", str(cache.mkdir("jax")))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 

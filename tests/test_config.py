@@ -85,8 +85,8 @@ def test_train_defaults_to_the_whole_curriculum():
     assert train.stage_name == "curriculum"
     # No file of configs/ sets what config.py already says.
     assert train == TrainConfig(stage=train.stage, stage_name="curriculum")
-    # 4e6 // (128 * 32) = 4e6 // 4096 = 976, and 976 * 4096 = 3 997 696 is the last whole update.
-    assert train.updates == 976
+    # 3e6 // (128 * 32) = 3e6 // 4096 = 732, and 732 * 4096 = 2 998 272 is the last whole update.
+    assert train.updates == 732
     assert train.learners == 1
 
 

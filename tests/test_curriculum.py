@@ -103,11 +103,11 @@ def test_start_and_assignment() -> None:
     assert (int(state.stage), int(state.cohort), int(state.age)) == (0, 0, 0)
     assert math.isnan(float(state.success))
     assert curriculum.assign(state, 3).tolist() == [0, 0, 0]
-    assert curriculum.assign(state.replace(stage=jnp.int32(2)), 2).tolist() == [2, 2]
+    assert curriculum.assign(dataclasses.replace(state, stage=jnp.int32(2)), 2).tolist() == [2, 2]
 
 
 def test_episodes_count_for_the_cohort_in_which_they_began() -> None:
-    state = curriculum.init().replace(cohort=jnp.int32(5))
+    state = dataclasses.replace(curriculum.init(), cohort=jnp.int32(5))
     cohort = jnp.array([[5, 4, 3], [5, -1, 6]])
     targets = jnp.array([[2, 3, 5], [2, 0, 7]])
     reached = jnp.array([[1, 3, 5], [2, 0, 7]])

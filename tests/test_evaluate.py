@@ -186,6 +186,12 @@ def test_a_push_is_one_contact_of_its_kind(
     np.testing.assert_array_equal(_run(judge, arenas, 40).outcome.contacts, expected)
 
 
+def test_a_contact_in_the_first_step_counts(tmp_path: Path) -> None:
+    judge = _judge(tmp_path, _stage(), AHEAD)
+    arenas = _start(judge, [[0.5 - 0.037 - 0.001, 0.0, 0.0]])
+    assert _run(judge, arenas, 1).outcome.contacts.tolist() == [[[0, 0, 1]]]
+
+
 def test_an_arrived_robot_is_pushed_and_its_arrival_stands(tmp_path: Path) -> None:
     judge = _judge(tmp_path, _stage(robots=2), AHEAD)
     arenas = _start(judge, [[-0.1, 0.0, 0.0], [-0.3, 0.0, 0.0]], [[-0.1, 0.0], [9.0, 0.0]])

@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax.task.stage import FENCE_HALF_LENGTH, Stage
-
 Array = Any
 
 EXAMPLE_SIDE = 0.7  # m; deepworlds find_and_avoid
 START = (-0.26, 0.27)  # m, in the example's arena
 TARGET = (0.26, -0.23)  # m, likewise
 FENCE = (-0.10, 0.16)  # m, centre, likewise
+FENCE_HALF_LENGTH = 0.25 / EXAMPLE_SIDE  # of the side, likewise
 FENCE_HALF_WIDTH = 0.03  # m; not scaled, as the wall of a real arena would not be
 BOX_HALF = 0.05  # m; the 0.1 m boxes of the stock e-puck world
 SPACING = 0.1  # m; between starts, and between targets: wider than a robot
@@ -49,15 +48,15 @@ def targets(robots: int, side: Array, xp: Any) -> Array:
     return xp.stack([TARGET[0] * scale - back, TARGET[1] * scale + up], axis=-1)
 
 
-def obstacles(count: int, stage: Stage, xp: Any) -> Array:
-    """Returns obstacles [count, 5]: the fence, or boxes, by the stage's layout."""
+def obstacles(count: int, side: Array, fenced: Array, xp: Any) -> Array:
+    """Returns obstacles [count, 5]: the fence where `fenced` [], else boxes."""
     if not count:
         return xp.zeros((0, 5), dtype=xp.float32)
-    scale = stage.side / EXAMPLE_SIDE
+    scale = side / EXAMPLE_SIDE
     centres = np.resize(np.array(BOXES, np.float32), (count, 2))
     one = xp.ones_like(xp.asarray(centres[:, 0]))
     boxes = [centres[:, 0] * scale, centres[:, 1] * scale, 0 * one, BOX_HALF * one, BOX_HALF * one]
-    half_length = FENCE_HALF_LENGTH * stage.side
+    half_length = FENCE_HALF_LENGTH * side
     fence = [FENCE[0] * scale, FENCE[1] * scale, 0.0, half_length, FENCE_HALF_WIDTH]
     fence = xp.stack([xp.asarray(value, dtype=xp.float32) for value in fence])
-    return xp.where(stage.fence, fence * one[:, None], xp.stack(boxes, axis=-1))
+    return xp.where(fenced, fence * one[:, None], xp.stack(boxes, axis=-1))

@@ -205,7 +205,7 @@ def _fixed(stage: Stage, spacing: Spacing, xp: Any) -> Level:
         start=fixed_level.starts(spacing.robots, stage.side, xp),
         target=fixed_level.targets(spacing.robots, stage.side, xp),
         obstacle_present=xp.arange(spacing.obstacles) < count,
-        obstacle=fixed_level.obstacles(spacing.obstacles, stage, xp),
+        obstacle=fixed_level.obstacles(spacing.obstacles, stage.side, stage.fence, xp),
     )
 
 

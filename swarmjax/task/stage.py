@@ -5,10 +5,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from swarmjax.config import StageConfig
+from swarmjax.config import ConfigError, StageConfig
+from swarmjax.task import fixed_level
 
 Array = Any
-FENCE_HALF_LENGTH = 0.25 / 0.7  # of the side; deepworlds find_and_avoid: 0.50 m in a 0.7 m arena
 
 
 class Stage(NamedTuple):
@@ -32,7 +32,13 @@ class Stage(NamedTuple):
 
 
 def stack(stages: Sequence[StageConfig]) -> Stage:
-    """Stacks configured stages into NumPy arrays [S]."""
+    """Stacks configured stages into NumPy arrays [S].
+
+    Raises:
+      ConfigError: if a fixed level has no room for its robots.
+    """
+    for stage in stages:
+        _check_fixed(stage)
     return Stage(
         robots=np.array([s.robots for s in stages], np.int32),
         obstacles=np.array([s.obstacles for s in stages], np.int32),
@@ -50,6 +56,22 @@ def select(stages: Stage, index: Array) -> Stage:
 
 def largest_half(stages: Sequence[StageConfig]) -> float:
     """Half the longest edge of any obstacle of these stages, m: what the model is compiled for."""
-    return max(
-        FENCE_HALF_LENGTH * s.side if s.layout == "fence" else 0.5 * s.obstacle_size for s in stages
-    )
+    return max(_half(stage) for stage in stages)
+
+
+def _check_fixed(stage: StageConfig) -> None:
+    """Refuses a fixed level whose row of starts is too short, or that runs out of boxes."""
+    most = {"robots": fixed_level.most_robots(stage.side), "obstacles": len(fixed_level.BOXES)}
+    for key, limit in most.items():
+        if stage.level == "fixed" and getattr(stage, key) > limit:
+            raise ConfigError(
+                f"stage {stage.name}: {key} is {getattr(stage, key)}, but the fixed level of a "
+                f"{stage.side:g} m arena has room for {limit}: give at most {limit}."
+            )
+
+
+def _half(stage: StageConfig) -> float:
+    """Half the longest edge of the obstacles of a stage, m."""
+    if stage.layout == "fence":
+        return fixed_level.FENCE_HALF_LENGTH * stage.side
+    return fixed_level.BOX_HALF if stage.level == "fixed" else 0.5 * stage.obstacle_size

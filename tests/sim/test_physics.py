@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,11 +34,11 @@ class Path(NamedTuple):
 class Engine(NamedTuple):
     """The physics of one implementation, and its compiled step of all arenas."""
 
-    physics: physics.Physics
-    step: Callable[..., physics.mjx.Data]
+    loaded: physics.Physics
+    step: Callable[..., Any]
 
 
-def _config(impl: config.Literal["jax", "warp"]) -> TrainConfig:
+def _config(impl: Literal["jax", "warp"]) -> TrainConfig:
     stage = StageConfig(
         name="boxes", robots=ROBOTS, side=1.3, obstacles=OBSTACLES, obstacle_size=2 * BIGGEST_HALF
     )
@@ -61,7 +61,7 @@ def engine(request: pytest.FixtureRequest) -> Iterator[Engine]:
 def _start(engine: Engine, pose: np.ndarray) -> physics.mjx.Data:
     """Arenas [A] at rest at poses [A, R, 3]."""
     rest = jax.vmap(physics.rest)(jnp.asarray(pose, jnp.float32).reshape(ARENAS, -1))
-    return jax.vmap(functools.partial(physics.unpack, engine.physics))(rest)
+    return jax.vmap(functools.partial(physics.unpack, engine.loaded))(rest)
 
 
 def _drive(
@@ -211,7 +211,7 @@ def test_a_step_reads_nothing_but_what_is_packed(engine: Engine) -> None:
     start = np.array([[-0.1, 0.0, 0.0], [-0.2, 0.0, 0.0], [0.22, 0.22, 0.8]])
     velocity = jnp.asarray(random.uniform(0.0, FULL, (8, ARENAS, ROBOTS, 2)), jnp.float32)
     carried = again = _start(engine, np.broadcast_to(start, (ARENAS, ROBOTS, 3)))
-    repack = jax.vmap(lambda data: physics.unpack(engine.physics, physics.pack(data)))
+    repack = jax.vmap(lambda data: physics.unpack(engine.loaded, physics.pack(data)))
     for now in velocity:
         carried = engine.step(carried, jnp.float32(SIDE), jnp.asarray(obstacle), now)
         again = engine.step(repack(again), jnp.float32(SIDE), jnp.asarray(obstacle), now)

@@ -1,5 +1,6 @@
 """One arena's rules: arrival, the end of an episode, rewards, and what a broken arena does."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -84,13 +85,14 @@ def _crowd(random: np.random.Generator) -> list[Robot]:
 def _start(world: World, levels: list[Level]) -> EnvState:
     stacked = jax.tree.map(lambda *fields: jnp.asarray(np.stack(fields)), *levels)
     number = jnp.arange(len(levels))
-    state, _ = jax.vmap(functools.partial(env.reset, world))(stacked, number, number)
-    return state.replace(sim=jax.vmap(functools.partial(physics.unpack, world.physics))(state.sim))
+    state, _ = jax.jit(jax.vmap(functools.partial(env.reset, world)))(stacked, number, number)
+    sim = jax.vmap(functools.partial(physics.unpack, world.physics))(state.sim)
+    return dataclasses.replace(state, sim=sim)
 
 
 def _slim(state: EnvState) -> EnvState:
     """The state as NumPy, with no more of the physics than a checkpoint holds."""
-    return jax.tree.map(np.asarray, state.replace(sim=physics.pack(state.sim)))
+    return jax.tree.map(np.asarray, dataclasses.replace(state, sim=physics.pack(state.sim)))
 
 
 def _stack(trees: list[Any]) -> Any:
@@ -259,7 +261,9 @@ def test_a_robot_that_stands_in_range_pays_every_step_once(episode: Episode) -> 
 def test_rewards_of_an_episode_add_up_to_the_way_made(episode: Episode) -> None:
     """With progress only, they telescope; each step in range costs 0.001 beside."""
     present = episode.state.level.present[0]
-    ended = np.where(episode.came.terminated.any(axis=0), episode.came.terminated.argmax(axis=0), 15)
+    ended = np.where(
+        episode.came.terminated.any(axis=0), episode.came.terminated.argmax(axis=0), 15
+    )
     last = np.take_along_axis(episode.state.distance[1:], ended[None], axis=0)[0]
     progress = episode.state.distance[0] - last
     sensed = episode.came.observation[..., :8].min(axis=-1) < RANGE
@@ -326,9 +330,8 @@ def test_an_arena_moves_as_it_would_in_any_other_company(
 def test_a_broken_arena_leaves_its_neighbours_alone(
     start: EnvState, actions: np.ndarray, tiny_step: ArenaStep, field: str, value: float
 ) -> None:
-    broken = start.replace(
-        sim=start.sim.replace(**{field: getattr(start.sim, field).at[BUMPING, 0].set(value)})
-    )
+    spoilt = {field: getattr(start.sim, field).at[BUMPING, 0].set(value)}
+    broken = dataclasses.replace(start, sim=start.sim.replace(**spoilt))
     sound = start
     others = np.arange(ARENAS) != BUMPING
     for action in actions[:3]:
@@ -346,7 +349,8 @@ def test_a_broken_arena_is_over_and_teaches_nothing(
 ) -> None:
     state, _ = tiny_step(start, jnp.asarray(actions[0]))
     before = state.distance[BUMPING]
-    state = state.replace(sim=state.sim.replace(qvel=state.sim.qvel.at[BUMPING, 4].set(jnp.nan)))
+    spoilt = state.sim.replace(qvel=state.sim.qvel.at[BUMPING, 4].set(jnp.nan))
+    state = dataclasses.replace(state, sim=spoilt)
     state, came = jax.tree.map(np.asarray, tiny_step(state, jnp.asarray(actions[1])))
     assert came.sound.tolist() == [a != BUMPING for a in range(ARENAS)]
     assert came.done.tolist() == [a == BUMPING for a in range(ARENAS)]

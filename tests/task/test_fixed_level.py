@@ -137,4 +137,4 @@ def test_nothing_is_drawn_and_numpy_and_jax_agree(layout: Layout) -> None:
 
 def test_no_obstacles_compiled_in() -> None:
     stage = task_stage.select(task_stage.stack([_stage(0.7, 2, 0, "boxes")]), 0)
-    assert fixed_level.obstacles(0, stage, np).shape == (0, 5)
+    assert fixed_level.obstacles(0, stage.side, stage.fence, np).shape == (0, 5)

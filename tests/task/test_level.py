@@ -266,7 +266,8 @@ class _Flood:
         """Whether [N] a way leads from start [N, 2] to a cell of goal [N, X, Y]."""
         plane = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]])
         structure = np.stack([0 * plane, plane, 0 * plane])  # each level by itself
-        label, _ = ndimage.label(self.free & ~blocked, structure=structure)
+        label = np.zeros(self.free.shape, np.int32)
+        ndimage.label(self.free & ~blocked, structure=structure, output=label)
         x, y = np.floor((start + 0.5 * self.side) / self.cell).astype(int).T
         mine = label[np.arange(len(label)), x, y]
         return (mine > 0) & ((label == mine[:, None, None]) & goal).any(axis=(1, 2))

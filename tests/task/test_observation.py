@@ -15,12 +15,9 @@ PI = np.pi
 
 
 def test_layout() -> None:
-    assert observation.NAMES == (
-        *(f"infrared_{i}" for i in range(8)),
-        "target_distance",
-        "target_bearing",
-    )
-    assert observation.UNITS == ("m",) * 9 + ("rad",)
+    infrared = [f"infrared_{i}" for i in range(8)]
+    assert list(observation.NAMES) == [*infrared, "target_distance", "target_bearing"]
+    assert list(observation.UNITS) == ["m"] * 9 + ["rad"]
     assert observation.SIZE == 10
 
 

@@ -42,7 +42,7 @@ def test_lattice_covers_the_square(xp: ModuleType) -> None:
     np.testing.assert_array_equal(points, expected)
     # A shift of a quarter and three quarters of the spacing.
     shifted = np.asarray(lattice(xp.asarray([0.25, 0.75], dtype=xp.float32), side, xp))
-    np.testing.assert_array_equal(shifted, expected + [25, 75])
+    np.testing.assert_array_equal(shifted, expected + np.array([25, 75]))
 
 
 @given(st.floats(0.0, 1.0, exclude_max=True, width=32), st.integers(1600, 16000))

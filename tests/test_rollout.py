@@ -1,0 +1,352 @@
+"""One rollout replayed step by step, and the layouts that the learners see."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmjax import rollout
+from swarmjax.ppo import gae
+from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.learner import LearnerState
+from swarmjax.rollout import Ended, Starts, Trajectory
+from swarmjax.sim import gaps, physics
+from swarmjax.task import env, observation
+from swarmjax.task import stage as task_stage
+from swarmjax.task.env import EnvState, TimeStep, World
+from swarmjax.task.level import Level
+
+ArenaStep = Callable[[EnvState, jax.Array], tuple[EnvState, TimeStep]]
+Draw = Callable[[int, int], Starts]
+
+T, ARENAS, ROBOTS, LIMIT = 8, 8, 3, 16  # of the tiny configuration
+HULL, RANGE = 0.037, 0.04  # m
+ARRIVES, BUMPS, BROKEN = 1, 2, 7  # arenas
+CLOCK = [0, 0, 9, 10, 11, 12, 13, 0]  # at the start; an episode ends at 16
+NOW, NEXT = 4, 5  # cohorts of the episodes that run and of those that wait
+
+
+class Run(NamedTuple):
+    """A rollout: what it began with and what came of it."""
+
+    learners: LearnerState
+    before: EnvState
+    starts: Starts
+    after: EnvState
+    trajectory: Trajectory
+    ended: Ended
+
+
+class Replay(NamedTuple):
+    """The same actions, one compiled step at a time: [T, A, ...]."""
+
+    came: TimeStep
+    seen: np.ndarray  # what was observed before each step
+    pose: np.ndarray  # after each step, before any reset
+    fresh: np.ndarray  # whether the next step is the first of an episode
+    last: EnvState
+
+
+@pytest.fixture(scope="module")
+def learners(tiny_world: World) -> LearnerState:
+    config = tiny_world.config
+
+    def init(key: jax.Array) -> LearnerState:
+        return ppo.init(key, config.algo, observation.SIZE, rollout.ACTION_SIZE, config.updates)
+
+    return jax.vmap(init)(jax.random.split(jax.random.key(1), 1))
+
+
+@pytest.fixture(scope="module")
+def draw(tiny_world: World) -> Draw:
+    """Draws starts of either stage in turn, from a seed, for a cohort."""
+    stages, index = task_stage.stack(tiny_world.config.stage), jnp.arange(ARENAS) % 2
+    draw = jax.jit(functools.partial(rollout.draw_starts, tiny_world, stages, index))
+    return lambda seed, cohort: draw(jnp.int32(cohort), jax.random.key(seed))
+
+
+@pytest.fixture(scope="module")
+def before(tiny_world: World, draw: Draw) -> EnvState:
+    """Arenas in the middle of their episodes; in one all arrive, one drives into a wall."""
+    drawn = draw(0, NOW).state
+    pose, target = drawn.level.start[ARRIVES], drawn.level.target
+    toward = jnp.stack([jnp.cos(pose[:, 2]), jnp.sin(pose[:, 2])], axis=-1)
+    target = target.at[ARRIVES].set(pose[:, :2] + 0.053 * toward)
+    at_wall = jnp.array([0.25 - HULL - 0.001, 0.0, 0.0])
+    start = drawn.level.start.at[BUMPS, 0].set(at_wall)
+    level = drawn.level._replace(start=start, target=target)
+    reset = jax.jit(jax.vmap(functools.partial(env.reset, tiny_world)))
+    state, _ = reset(level, drawn.stage, drawn.cohort)
+    sim = state.sim._replace(qvel=state.sim.qvel.at[BROKEN, 1].set(jnp.inf))
+    return dataclasses.replace(state, sim=sim, clock=jnp.array(CLOCK, jnp.int32))
+
+
+@pytest.fixture(scope="module")
+def run(tiny_world: World, draw: Draw, learners: LearnerState, before: EnvState) -> Run:
+    starts = draw(1, NEXT)
+    collect = jax.jit(functools.partial(rollout.collect, tiny_world))
+    found = collect(learners, before, starts, jax.random.key(2))
+    again = collect(learners, before, starts, jax.random.key(2))
+    other = collect(learners, before, starts, jax.random.key(3))
+    jax.tree.map(np.testing.assert_array_equal, again, found)  # bit for bit
+    assert (np.asarray(other[1].action) != np.asarray(found[1].action)).all()
+    return Run(learners, before, starts, *jax.tree.map(np.asarray, found))
+
+
+def _unpack(world: World, state: EnvState) -> EnvState:
+    sim = jax.vmap(functools.partial(physics.unpack, world.physics))(state.sim)
+    return dataclasses.replace(state, sim=sim)
+
+
+def _where(done: jax.Array, yes: jax.Array, no: jax.Array) -> jax.Array:
+    return jnp.where(done.reshape(-1, *[1] * (no.ndim - 1)), yes, no)
+
+
+@pytest.fixture(scope="module")
+def replay(tiny_world: World, run: Run, tiny_step: ArenaStep) -> Replay:
+    state, waiting = _unpack(tiny_world, run.before), _unpack(tiny_world, run.starts.state)
+    seen = jax.jit(jax.vmap(functools.partial(env.observe, tiny_world)))(state)
+    rows = []
+    for action in run.trajectory.action[:, 0]:  # one learner
+        state, came = tiny_step(state, jnp.asarray(action))
+        rows.append((came, seen, jax.vmap(physics.poses)(state.sim), came.done))
+        # All of the waiting episode, and not only what is packed of it.
+        state = jax.tree.map(functools.partial(_where, came.done), waiting, state)
+        seen = _where(came.done, run.starts.observation, came.observation)
+    came, observed, pose, fresh = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
+    return Replay(came, observed, pose, fresh, state)
+
+
+def _values(world: World, learners: LearnerState, seen: np.ndarray) -> np.ndarray:
+    """Values [..., A, R] by the one learner."""
+    one = jax.tree.map(lambda leaf: leaf[0], learners)
+    return np.asarray(ppo.values(one, world.config.algo, jnp.asarray(seen)))
+
+
+def _at[Tree](tree: Tree, where: Any) -> Tree:
+    """One arena, one step, or a part of them."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[where], tree)
+
+
+# --- layouts
+
+
+def test_one_learner_drives_all_robots() -> None:
+    x = jnp.arange(4 * 3 * 2).reshape(4, 3, 2)
+    mine = rollout.to_learners(x, 1)
+    assert mine.shape == (1, 4, 3, 2)
+    assert mine[0, 2, 1, 0] == x[2, 1, 0]
+    np.testing.assert_array_equal(rollout.to_arenas(mine), x)
+
+
+def test_each_robot_has_its_learner() -> None:
+    x = jnp.arange(4 * 3 * 2).reshape(4, 3, 2)
+    mine = rollout.to_learners(x, 3)
+    assert mine.shape == (3, 4, 1, 2)
+    assert mine[1, 2, 0, 0] == x[2, 1, 0]
+    np.testing.assert_array_equal(rollout.to_arenas(mine), x)
+    flat = rollout.to_learners(x[..., 0], 3)  # without features
+    assert flat.shape == (3, 4, 1)
+    np.testing.assert_array_equal(rollout.to_arenas(flat), x[..., 0])
+
+
+@pytest.mark.parametrize(("count", "robots"), [(1, 3), (3, 1)])
+def test_batch_groups_the_samples_of_an_arena(count: int, robots: int) -> None:
+    random = np.random.default_rng(0)
+    shape = (5, count, 4, robots)  # [T, L, A, N]
+    end = random.random(shape)
+    trajectory = Trajectory(
+        observation=random.random((*shape, 10)),
+        action=random.random((*shape, 2)),
+        log_prob=random.random(shape),
+        value=random.random(shape),
+        next_value=random.random(shape),
+        reward=random.random(shape),
+        terminated=end < 0.2,
+        truncated=end > 0.8,
+        valid=random.random(shape) < 0.7,
+    )
+    trajectory = jax.tree.map(jnp.asarray, trajectory)
+    advantage, return_ = gae.generalized_advantages(
+        *trajectory[5:6],
+        *trajectory[3:5],
+        *trajectory[6:8],
+        discount=0.9,
+        gae_lambda=0.8,
+    )
+    found = rollout.batch(trajectory, discount=0.9, gae_lambda=0.8)
+    for t, learner, arena, robot in np.ndindex(*shape):
+        mine, sample = (learner, arena, t * robots + robot), (t, learner, arena, robot)
+        np.testing.assert_array_equal(found.observation[mine], trajectory.observation[sample])
+        np.testing.assert_array_equal(found.action[mine], trajectory.action[sample])
+        assert found.log_prob[mine] == trajectory.log_prob[sample]
+        assert found.valid[mine] == trajectory.valid[sample]
+        assert found.advantage[mine] == advantage[sample]
+        assert found.return_[mine] == return_[sample]
+    assert found.valid.shape == (count, 4, 5 * robots)
+
+
+# --- episodes that wait
+
+
+def test_starts_are_of_the_stage_they_are_asked_for(draw: Draw) -> None:
+    starts = draw(3, NEXT)
+    state = starts.state
+    assert state.stage.tolist() == [0, 1] * 4
+    assert state.cohort.tolist() == [NEXT] * ARENAS
+    # The first stage has 2 robots in 0.5 m, the second 3 and 2 obstacles in 0.8 m.
+    assert state.level.present.sum(axis=-1).tolist() == [2, 3] * 4
+    assert state.level.obstacle_present.sum(axis=-1).tolist() == [0, 2] * 4
+    np.testing.assert_array_equal(state.level.side, np.float32([0.5, 0.8] * 4))
+    places = np.asarray(state.level.start[:, 0, :2])
+    assert len(np.unique(places, axis=0)) == ARENAS
+    pose = np.asarray(state.sim.qpos).reshape(ARENAS, ROBOTS, 3)
+    np.testing.assert_array_equal(pose, state.level.start)
+    assert not state.sim.qvel.any()
+    jax.tree.map(np.testing.assert_array_equal, draw(3, NEXT), starts)
+
+
+def test_restart_puts_the_waiting_episode_into_arenas_that_are_over(
+    tiny_world: World, run: Run
+) -> None:
+    running = _unpack(tiny_world, run.before)
+    done = jnp.arange(ARENAS) % 3 == 0
+    found = rollout.restart(running, run.starts.state, done)
+    packed = dataclasses.replace(found, sim=physics.pack(found.sim))
+
+    def check(mine: jax.Array, waiting: jax.Array, before: jax.Array) -> None:
+        for arena in range(ARENAS):
+            expected = waiting if arena in (0, 3, 6) else before
+            np.testing.assert_array_equal(mine[arena], expected[arena])
+
+    jax.tree.map(check, packed, run.starts.state, run.before)
+
+
+# --- the rollout against its replay
+
+# The scan is another program than the single step, which XLA fuses differently: float32's
+# rounding, which contacts multiply (6e-6 m in 100 steps at most was seen against the C engine).
+DRIFT = 1e-5
+
+
+def test_the_rollout_is_what_single_steps_make(run: Run, replay: Replay) -> None:
+    trajectory, came = run.trajectory, replay.came
+    for name in ("terminated", "truncated", "valid"):
+        np.testing.assert_array_equal(getattr(trajectory, name)[:, 0], getattr(came, name), name)
+    np.testing.assert_allclose(trajectory.reward[:, 0], came.reward, atol=DRIFT)
+    present = replay.seen[..., 8] > 0.0  # the parked stand on their targets, whose bearing is any
+    np.testing.assert_allclose(
+        trajectory.observation[:, 0][present], replay.seen[present], atol=20 * DRIFT
+    )  # 20: a bearing turns by 1 / 0.05 m as fast as its robot
+    assert came.terminated.any()
+    assert came.truncated.any()
+    np.testing.assert_allclose(run.after.sim.qpos, replay.last.sim.qpos, atol=DRIFT)
+    np.testing.assert_array_equal(run.after.clock, replay.last.clock)
+    np.testing.assert_array_equal(run.after.cohort, replay.last.cohort)
+
+
+def test_some_episodes_end_and_others_go_on(run: Run, replay: Replay) -> None:
+    over = replay.fresh
+    assert over[:, BROKEN].tolist() == [True] + [False] * 7
+    assert [int(over[:, a].argmax()) for a in (2, 3, 4, 5, 6)] == [6, 5, 4, 3, 2]
+    assert over[:, ARRIVES].any(), "all arrive"
+    assert not over[:, 0].any()
+    expected = np.where(over.any(axis=0), NEXT, NOW)
+    np.testing.assert_array_equal(run.after.cohort, expected)
+
+
+def test_value_after_an_episode_is_of_what_it_came_to_not_of_the_next_start(
+    tiny_world: World, run: Run, replay: Replay
+) -> None:
+    found = run.trajectory
+    value = _values(tiny_world, run.learners, replay.seen)
+    next_value = _values(tiny_world, run.learners, replay.came.observation)
+    start = _values(tiny_world, run.learners, np.asarray(run.starts.observation))
+    present = replay.seen[..., 8] > 0.0  # as above
+    # 1e-3: the drift of a bearing (2e-4) through a network whose slope is about 1.
+    np.testing.assert_allclose(found.value[:, 0][present], value[present], atol=1e-3)
+    np.testing.assert_allclose(found.next_value[:, 0][present], next_value[present], atol=1e-3)
+    for t, arena in zip(*np.nonzero(replay.fresh[:-1]), strict=True):
+        there = present[t, arena]
+        found_next = found.value[t + 1, 0, arena]
+        np.testing.assert_allclose(found_next, start[arena], atol=1e-6)  # float32
+        assert np.abs(found.next_value[t, 0, arena] - found_next)[there].max() > 0.01
+    # In the middle of an episode the two are one and the same.
+    going = ~replay.fresh[:-1]
+    np.testing.assert_array_equal(found.next_value[:-1, 0][going], found.value[1:, 0][going])
+
+
+def test_actions_are_drawn_from_the_policy(tiny_world: World, run: Run) -> None:
+    one = jax.tree.map(lambda leaf: leaf[0], run.learners)
+    action, seen = run.trajectory.action[:, 0], jnp.asarray(run.trajectory.observation[:, 0])
+    noise = (action - ppo.mode(one, tiny_world.config.algo, seen)) / 0.6  # the initial deviation
+    # 384 standard normal numbers: mean within 5 / sqrt(384), variance within 5 sqrt(2 / 384).
+    assert abs(noise.mean()) < 0.26
+    assert abs(noise.var() - 1.0) < 0.36
+    density = -0.5 * noise**2 - np.log(0.6 * np.sqrt(2 * np.pi))
+    # 1e-4: float32, squares of up to 10.
+    np.testing.assert_allclose(run.trajectory.log_prob[:, 0], density.sum(axis=-1), atol=1e-4)
+
+
+def test_a_broken_arena_starts_afresh_and_nothing_of_it_is_learnt(run: Run) -> None:
+    assert not run.trajectory.valid[0, 0, BROKEN].any()
+    assert run.ended.broken[:, BROKEN].tolist() == [1] + [0] * 7
+    assert run.ended.broken.sum() == 1
+    for leaf in jax.tree.leaves((run.trajectory, run.after.sim, run.after.episode)):
+        assert np.isfinite(leaf).all()
+    assert run.after.clock[BROKEN] == 7
+
+
+def _recount(run: Run, replay: Replay, arena: int) -> dict[int, dict[str, object]]:
+    """What ended in which step of an arena, counted from the replay."""
+    found, begin, clock, cohort, level = {}, 0, CLOCK[arena], NOW, _at(run.before.level, arena)
+    for end in np.flatnonzero(replay.fresh[:, arena]):
+        came = _at(replay.came, (slice(begin, end + 1), arena))
+        sensed = came.valid & (came.observation[..., :8].min(axis=-1) < RANGE)
+        found[int(end)] = {
+            "episodes": 1,
+            "stage": arena % 2,
+            "cohort": cohort,
+            "targets": level.present.sum(),
+            "reached": came.terminated.sum(),
+            "all_reached": came.terminated.sum() == level.present.sum(),
+            "steps": clock + len(came.done),
+            "robot_steps": came.valid.sum(),
+            "sensed": sensed.sum(),
+            "contacts": _contacts(level, replay.pose[begin : end + 1, arena]),
+            "reward": pytest.approx(came.reward.sum(), abs=DRIFT),
+            "broken": 0,
+        }
+        begin, clock, cohort, level = end + 1, 0, NEXT, _at(run.starts.state.level, arena)
+    return found
+
+
+def _contacts(level: Level, poses: np.ndarray) -> list[int]:
+    """Contacts of each kind of all robots of an arena on the way [T, R, 3] from its start."""
+    total, apart = np.zeros((ROBOTS, 3), int), np.full((ROBOTS, 3), gaps.CONTACT_PAUSE)
+    for pose in poses:
+        gap = gaps.gaps(pose, level.side, level.obstacle, HULL, np)
+        begins, apart = gaps.count_contacts(gap, apart, 0.032, np)
+        total += begins & level.present[:, None]
+    return total.sum(axis=0).tolist()
+
+
+def test_ended_episodes_add_up(run: Run, replay: Replay) -> None:
+    contacts = np.zeros(3, int)
+    for arena in set(range(ARENAS)) - {BROKEN}:  # whose poses are not finite
+        expected = _recount(run, replay, arena)
+        for t in range(T):
+            ended = _at(run.ended, (t, arena))
+            if t not in expected:
+                nothing = ended._replace(cohort=ended.cohort + 1)
+                assert not any(np.any(leaf) for leaf in nothing)
+                continue
+            found = ended._replace(contacts=ended.contacts.tolist())._asdict()
+            assert found == expected[t]
+            contacts += found["contacts"]
+    assert contacts.any()
