@@ -31,6 +31,7 @@ NAMES = [stage.name for stage in STAGES]
 PER_STAGE = 1430  # 10,010 in all
 HULL, REACH = 0.037, 0.05  # m: radius of the robot; distance at which it has arrived
 WIDTH = 2 * HULL
+PASSAGE = 0.10  # m, between obstacles, and between an obstacle and a wall
 SPACING = Spacing(robots=5, obstacles=4, hull_radius=HULL, target_radius=REACH)
 # Distances are kept in whole units and compared in float32, which adds 1e-6 m at most.
 ROUNDING = 1e-6
@@ -187,9 +188,9 @@ def test_nothing_overlaps(stage: StageConfig, drawn: Level) -> None:
 
 def test_a_robot_passes_between_obstacles_and_walls(stage: StageConfig, drawn: Level) -> None:
     box = drawn.obstacle[:, : stage.obstacles].astype(np.float64)
-    assert (_box_gaps(box) >= level.PASSAGE - ROUNDING).all()
+    assert (_box_gaps(box) >= PASSAGE - ROUNDING).all()
     reach = np.abs(_corners(box)).max(axis=(-2, -1))
-    assert (0.5 * stage.side - reach >= level.PASSAGE - ROUNDING).all()
+    assert (0.5 * stage.side - reach >= PASSAGE - ROUNDING).all()
 
 
 def test_targets_are_so_far_apart_that_a_robot_passes_between_two_parked_ones(
@@ -353,9 +354,9 @@ def test_nothing_overlaps_on_any_stage_that_is_accepted(
     _assert_nothing_overlaps(found, robots, obstacles)
     for i in range(64):
         box = found.obstacle[i : i + 1, found.obstacle_present[i]].astype(np.float64)
-        assert (_box_gaps(box) >= level.PASSAGE - ROUNDING).all()
+        assert (_box_gaps(box) >= PASSAGE - ROUNDING).all()
         corners = np.abs(_corners(box)).max(initial=0.0)
-        assert 0.5 * side - corners >= level.PASSAGE - ROUNDING or not box.size
+        assert 0.5 * side - corners >= PASSAGE - ROUNDING or not box.size
 
 
 def test_gaps_agree_with_this_geometry(levels: dict[str, Level]) -> None:

@@ -4,12 +4,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax.config import StageConfig
+from swarmjax.config import ConfigError, StageConfig
 from swarmjax.task import stage
 
 PLAIN = StageConfig(name="a", robots=2, side=0.5)
 BOXES = StageConfig(name="b", robots=5, side=1.2, obstacles=3, obstacle_size=0.2)
 FENCE = StageConfig(name="c", robots=3, side=1.4, obstacles=1, level="fixed", layout="fence")
+SMALL = StageConfig(name="d", robots=1, side=1.0, obstacles=1, obstacle_size=0.02, level="fixed")
 
 
 def test_stack() -> None:
@@ -41,7 +42,32 @@ def test_select_one_or_many() -> None:
         ([PLAIN], 0.05),
         ([PLAIN, BOXES], 0.1),
         ([PLAIN, BOXES, FENCE], 0.5),  # half of 0.50 m a 0.7 m of side, at 1.4 m
+        ([SMALL], 0.05),  # the boxes of a fixed level are 0.1 m, whatever `obstacle_size`
     ],
 )
 def test_largest_half(stages: list[StageConfig], expected: float) -> None:
     assert stage.largest_half(stages) == pytest.approx(expected, rel=1e-12)  # rounding of float64
+
+
+@pytest.mark.parametrize(
+    ("robots", "obstacles", "key", "most"),
+    [
+        # Starts at -0.26 * 10 / 7 + 0.1 n, up to 0.06 m from the wall at 0.5 m: n up to 8.
+        (10, 0, "robots", 9),
+        (2, 5, "obstacles", 4),
+    ],
+)
+def test_a_fixed_level_has_room_for_so_many(
+    robots: int, obstacles: int, key: str, most: int
+) -> None:
+    crowded = StageConfig(name="full", robots=robots, side=1.0, obstacles=obstacles, level="fixed")
+    with pytest.raises(ConfigError, match=f"{key} is .* give at most {most}"):
+        stage.stack([crowded])
+    fitting = StageConfig(
+        name="fits",
+        robots=min(robots, 9),
+        side=1.0,
+        obstacles=min(obstacles, 4),
+        level="fixed",
+    )
+    assert stage.stack([fitting]).fixed.all()
