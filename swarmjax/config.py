@@ -325,7 +325,7 @@ class RunConfig(_Section):
     )
     stop_after: int | None = field(
         default=None,
-        metadata=_about("updates after which the run saves and stops", 1, MAX_COUNT),
+        metadata=_about("updates after which the run saves and stops", 0, MAX_COUNT),
     )
     tensorboard: bool = field(default=True, metadata=_about("write TensorBoard events"))
     dry: bool = field(default=False, metadata=_about("check and describe the run, train nothing"))

@@ -58,8 +58,13 @@ BUMPS = [
     Robot(-0.05, -0.25, np.pi, (0.3, -0.25), AHEAD),
 ]
 OBSTACLE = (-0.2, -0.25, 0.0, 0.05, 0.05)
-SCENES = [ARRIVES, ALL_ARRIVE, PUSHED, STANDS, BUMPS]
-ARRIVING, ALL, PUSHING, STANDING, BUMPING, *RANDOM = range(ARENAS)
+# Arrives in the very step in which time runs out: 50 mm and 15.5 steps.
+JUST_IN_TIME = [
+    Robot(0.0, 0.0, 0.0, (REACH + 15.5 * PACE, 0.0), AHEAD),
+    Robot(0.0, 0.2, 0.0, (9.0, 9.0), STILL),
+]
+SCENES = [ARRIVES, ALL_ARRIVE, PUSHED, STANDS, BUMPS, JUST_IN_TIME]
+ARRIVING, ALL, PUSHING, STANDING, BUMPING, ENDING, *RANDOM = range(ARENAS)
 
 
 def _level(robots: list[Robot]) -> Level:
@@ -187,6 +192,11 @@ def test_time_runs_out_for_those_on_their_way(episode: Episode) -> None:
     assert episode.state.clock[:, 0].tolist() == list(range(LIMIT + 1))
 
 
+def test_arrival_in_the_last_step_is_no_timeout(episode: Episode) -> None:
+    assert np.flatnonzero(episode.came.terminated[:, ENDING, 0]).tolist() == [LIMIT - 1]
+    assert episode.came.truncated[-1, ENDING].tolist() == [False, True, False]
+
+
 def test_no_robot_terminates_twice_nor_ends_both_ways(episode: Episode) -> None:
     assert (episode.came.terminated.sum(axis=0) <= 1).all()
     assert not (episode.came.terminated & episode.came.truncated).any()
@@ -195,14 +205,14 @@ def test_no_robot_terminates_twice_nor_ends_both_ways(episode: Episode) -> None:
 
 def test_absent_robots_take_no_part(episode: Episode) -> None:
     absent = ~episode.state.level.present[0]
-    assert absent.sum() == 4
+    assert absent.sum() == 5
     for name in ("valid", "terminated", "truncated", "reward"):
         assert not getattr(episode.came, name)[:, absent].any(), name
     for total in episode.state.episode:
         assert not total[-1][absent].any()
     # They stand where they are parked, whatever their action.
     np.testing.assert_array_equal(
-        episode.pose[:, absent], np.broadcast_to(episode.pose[0][absent], (LIMIT + 1, 4, 3))
+        episode.pose[:, absent], np.broadcast_to(episode.pose[0][absent], (LIMIT + 1, 5, 3))
     )
 
 
