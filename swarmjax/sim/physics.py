@@ -118,6 +118,20 @@ def _quiet_warp() -> None:
     warp.config.log_level = warp.LOG_ERROR
 
 
+def build_kernels(physics: Physics, states: PhysicsState) -> None:
+    """Makes Warp build its kernels, which it does at its first step: half a minute on a new card.
+
+    Args:
+      physics: the compiled side, `impl` warp.
+      states: [A] arenas; as many as the program will step, since contacts are sized for them.
+    """
+
+    def step_once(state: PhysicsState) -> Array:
+        return mjx.step(physics.model, unpack(physics, state)).qpos
+
+    jax.block_until_ready(jax.jit(jax.vmap(step_once))(states))
+
+
 def rest(qpos: Array) -> PhysicsState:
     """Returns a state at rest at `qpos` [3R]."""
     return PhysicsState(qpos, jnp.zeros_like(qpos), jnp.zeros_like(qpos))

@@ -204,7 +204,7 @@ def step(world: World, state: EnvState, action: Array) -> tuple[EnvState, TimeSt
     )
     valid = active & sound
     gained = jnp.where(valid, reward.total(earned, world.config.task.reward), 0.0)
-    episode = _tally(state.episode, gained, begins, earned, active)
+    episode = _tally(state.episode, gained, begins, earned, valid)
     arrived = state.arrived | arrives
     clock = state.clock + 1
     timeout = clock >= world.config.task.step_limit
@@ -249,13 +249,13 @@ def _infrared(world: World, pose: Array, level: Level) -> Array:
 
 
 def _tally(
-    episode: Episode, gained: Array, begins: Array, earned: reward.Step, active: Array
+    episode: Episode, gained: Array, begins: Array, earned: reward.Step, valid: Array
 ) -> Episode:
     """Adds a step to the sums of the episode."""
-    sensed = active & (reward.proximity(earned) > 0.0)
+    sensed = valid & (reward.proximity(earned) > 0.0)
     return Episode(
         reward=episode.reward + gained,
         contacts=episode.contacts + begins,
         sensed=episode.sensed + sensed,
-        moving=episode.moving + active,
+        moving=episode.moving + valid,
     )

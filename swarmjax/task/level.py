@@ -27,6 +27,7 @@ PARKING = 5.0  # m; where absent robots and obstacles wait, outside the walls of
 PARKING_SPACING = 0.5  # m
 PASSAGE = 0.10  # m; between obstacles, and between an obstacle and a wall: wider than a robot
 MARGIN = 0.02  # m; least free space beside anything at the start
+TARGET_SPACING = 0.25  # m; least distance of targets where the arena has room
 
 
 class Level(NamedTuple):
@@ -166,7 +167,9 @@ def _place_targets(
         # A robot parked on this side of its target, and another one passing behind it.
         around.radius + _units(reach + 3.0 * hull),
     )
-    apart = Gap(_units(2.0 * hull + 2.0 * MARGIN), _units(2.0 * reach + 4.0 * hull))
+    # Two robots parked on the near sides of their targets let a third one through.
+    through = max(TARGET_SPACING, 2.0 * reach + 4.0 * hull)
+    apart = Gap(_units(2.0 * hull + 2.0 * MARGIN), _units(through))
     points = lattice(drawn.target_shift, side, xp)
     score = score_walls(points, side, _units(hull + MARGIN), xp)
     score = xp.minimum(score, score_things(points, around.centre, around.there, beside, xp))

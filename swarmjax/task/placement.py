@@ -1,14 +1,15 @@
 """Placing things one after the other on the points of a lattice, in whole numbers.
 
 Integer arithmetic makes NumPy and JAX choose the same point from the same uniform number. The
-unit is 0.25 mm, so that squared distances within the largest arena fit an int32.
+unit is 1/4096 m: a power of two, so that metres come out of it exactly, and so large that squared
+distances within the largest arena fit an int32.
 """
 
 from typing import Any, NamedTuple
 
 Array = Any
 
-UNITS = 4000  # per metre; (4 m * sqrt(2) * 4000)**2 = 5.1e8 < 2**30
+UNITS = 4096  # per metre; (4 m * sqrt(2) * 4096)**2 = 5.4e8 < 2**30
 LATTICE = 24  # points along a side
 _FORBIDDEN = -(2**30)  # scores at or below half of this break a hard distance
 

@@ -133,9 +133,7 @@ def test_numpy_and_jax_draw_the_same_levels(stage: StageConfig, drawn: Level) ->
     np.testing.assert_array_equal(drawn.obstacle[..., 3:], expected.obstacle[..., 3:])
     for name in ("start", "target", "obstacle"):
         mine, theirs = getattr(drawn, name)[..., :2], getattr(expected, name)[..., :2]
-        np.testing.assert_array_equal(np.rint(mine * UNITS), np.rint(theirs * UNITS), err_msg=name)
-        # Nothing but the conversion of whole units to metres may differ: one ulp at the parking.
-        np.testing.assert_allclose(mine, theirs, atol=5e-7)
+        np.testing.assert_array_equal(mine, theirs, err_msg=name)
     # Angles are float32 products, which XLA may round differently: 5e-7 rad is 2 ulp at pi.
     np.testing.assert_allclose(drawn.start[..., 2], expected.start[..., 2], atol=5e-7)
     np.testing.assert_allclose(drawn.obstacle[..., 2], expected.obstacle[..., 2], atol=5e-7)

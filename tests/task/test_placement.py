@@ -1,4 +1,4 @@
-"""Placement on a lattice, in whole units of 0.25 mm, by hand."""
+"""Placement on a lattice, in whole units of 1/4096 m, by hand."""
 
 from types import ModuleType
 
@@ -25,9 +25,9 @@ FORBIDDEN = -(2**30)
 
 
 @MODULES
-def test_units_are_quarter_millimetres(xp: ModuleType) -> None:
+def test_units_are_parts_of_4096_of_a_metre(xp: ModuleType) -> None:
     lengths = xp.asarray([0.0, 0.7, 0.0374, -0.1], dtype=xp.float32)
-    assert units(lengths, xp).tolist() == [0, 2800, 150, -400]  # 149.6 rounds to 150
+    assert units(lengths, xp).tolist() == [0, 2867, 153, -410]  # 2867.2, 153.19, -409.6
     back = metres(units(lengths, xp), xp)
     # Half a unit.
     np.testing.assert_allclose(back, lengths, atol=0.5 / UNITS)
