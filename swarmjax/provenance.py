@@ -31,13 +31,17 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str | None:
-    """Commit of the source tree, with `-dirty` if it was changed since; None without git."""
+    """Commit of the source tree, with `-dirty` if it was changed since.
+
+    Without git it is what the environment variable `SWARMJAX_COMMIT` says, or None: for copies of
+    the tree that left their history behind.
+    """
     tree = Path(__file__).resolve().parent
     try:
         head = _git(tree, "rev-parse", "--short=12", "HEAD")
         changed = _git(tree, "status", "--porcelain", "--untracked-files=no")
     except (OSError, subprocess.CalledProcessError):
-        return None
+        return os.environ.get("SWARMJAX_COMMIT")
     return f"{head}-dirty" if changed else head
 
 

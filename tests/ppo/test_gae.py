@@ -1,5 +1,6 @@
 """Advantages worked by hand, by a NumPy loop, and at the two limits of lambda."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -140,3 +141,30 @@ def test_shapes_that_would_broadcast_are_refused() -> None:
     rollout["rewards"] = rollout["rewards"][:, :1]
     with pytest.raises(AssertionError):
         generalized_advantages(**rollout, discount=0.99, gae_lambda=0.95)
+
+
+def test_agrees_with_brax_where_brax_is_right() -> None:
+    """Brax's own `advantages` are not GAE unless lambda is 1; its `vs - values` is."""
+    from brax.training.agents.ppo import losses as brax_losses
+
+    random = np.random.default_rng(3)
+    rewards, values = random.normal(size=(2, 12, 5)).astype(np.float32)
+    bootstrap = random.normal(size=5).astype(np.float32)
+    terminated = random.random((12, 5)) < 0.2
+    next_values = np.concatenate([values[1:], bootstrap[None]])
+    never = np.zeros_like(terminated)
+    targets, _ = brax_losses.compute_gae(
+        truncation=jnp.zeros((12, 5)),
+        termination=jnp.asarray(terminated, jnp.float32),
+        rewards=jnp.asarray(rewards),
+        values=jnp.asarray(values),
+        bootstrap_value=jnp.asarray(bootstrap),
+        lambda_=0.9,
+        discount=0.95,
+    )
+    advantages, returns = generalized_advantages(
+        rewards, values, next_values, terminated, never, discount=0.95, gae_lambda=0.9
+    )
+    # 2e-6: float32, sums of at most twelve terms in another order.
+    np.testing.assert_allclose(advantages, targets - values, atol=2e-6)
+    np.testing.assert_allclose(returns, targets, atol=2e-6)

@@ -1,6 +1,7 @@
 """Running moments against NumPy's moments of all valid observations at once."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -74,3 +75,19 @@ def test_mask_of_another_shape_is_refused() -> None:
             np.zeros((4, 2, OBSERVATION), np.float32),
             np.ones(4, bool),
         )
+
+
+def test_agrees_with_brax_over_several_batches() -> None:
+    from brax.training.acme import running_statistics, specs
+
+    random = np.random.default_rng(5)
+    mine = normalizer.init(3)
+    theirs = running_statistics.init_state(specs.Array((3,), jnp.dtype("float32")))
+    for scale in (1.0, 3.0, 0.5):
+        batch = jnp.asarray(random.normal(scale, scale, (40, 3)), jnp.float32)
+        valid = jnp.asarray(random.random(40) < 0.7)
+        mine = normalizer.update(mine, batch, valid)
+        theirs = running_statistics.update(theirs, batch, weights=valid.astype(jnp.float32))
+    # 1e-5: float32; Brax sums squares, this project merges moments.
+    np.testing.assert_allclose(mine.mean, theirs.mean, rtol=1e-5)
+    np.testing.assert_allclose(mine.std, theirs.std, rtol=1e-5)
