@@ -89,9 +89,14 @@ def environment(
         return arenas, jnp.sum(reward)
 
     arenas = replace(arenas, sim=unpack(arenas.sim))
-    keys = jax.random.split(key, CONTROL_STEPS // program.config.algo.rollout)
+    keys = jax.random.split(key, _rollouts(program.config))
     arenas, reward = jax.lax.scan(rolled, arenas, keys)
     return replace(arenas, sim=jax.vmap(physics.pack)(arenas.sim)), jnp.sum(reward)
+
+
+def _rollouts(settings: TrainConfig) -> int:
+    """How many rollouts a call of the environment is."""
+    return max(1, CONTROL_STEPS // settings.algo.rollout)
 
 
 def _actions(program: Program, key: Array) -> Array:
@@ -140,7 +145,7 @@ def results(settings: TrainConfig) -> list[dict]:
     lines.append(_line(program, "physics", CONTROL_STEPS, timing, None))
     arenas = start(schedule).arenas
     *timing, _ = measure(partial(environment, program), arenas, (schedule, key))
-    steps = CONTROL_STEPS // settings.algo.rollout * settings.algo.rollout
+    steps = _rollouts(settings) * settings.algo.rollout
     lines.append(_line(program, "environment", steps, timing, None))
     rate = lines[-1]["arena_steps_per_s"] / (settings.arenas * settings.algo.rollout)
     n = int(np.clip(TRAIN_SECONDS * rate / 2, 1, settings.updates))
@@ -158,6 +163,7 @@ def _trained(program: Program, schedule: curriculum.Schedule, state: Any, n: Arr
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings = config.load_train(["stage=s6", *arguments])
+    settings = replace(settings, stage=settings.stage[-1:])
     for line in results(settings):
         sys.stdout.write(json.dumps(line) + "\n")
         sys.stdout.flush()

@@ -27,12 +27,19 @@ class CheckpointError(ValueError):
 class Checkpoints:
     """The checkpoints of one run directory, for writing. Close it, or use `with`."""
 
-    def __init__(self, run: Path, keep: int) -> None:
-        """Opens `run`/checkpoints, keeping the `keep` newest."""
+    def __init__(self, run: Path, keep: int, update: int | None = None) -> None:
+        """Opens `run`/checkpoints, keeping the `keep` newest.
+
+        With `update`, where the run goes on, checkpoints after it are removed: they were passed
+        over as damaged, and Orbax would save nothing before them.
+        """
         absl_logging.set_verbosity(absl_logging.ERROR)  # Orbax tells every step of its own
         logging.getLogger("absl").setLevel(logging.ERROR)
         options = ocp.CheckpointManagerOptions(max_to_keep=keep, create=True)
         self._manager = ocp.CheckpointManager((run / "checkpoints").resolve(), options=options)
+        for step in self._manager.all_steps():
+            if update is not None and step > update:
+                self._manager.delete(step)
 
     def save(self, state: Any, update: int) -> None:
         """Writes a state; an update that is there already is left as it is."""

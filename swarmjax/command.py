@@ -8,6 +8,7 @@ from swarmjax.config import ConfigError
 from swarmjax.policy import PolicyError
 
 USER_ERROR = 2
+INTERRUPTED = 130  # 128 + SIGINT, as a shell gives it
 
 
 def run(
@@ -33,6 +34,8 @@ def run(
         return 0
     try:
         return main(arguments)
+    except KeyboardInterrupt:
+        return INTERRUPTED
     except (ConfigError, PolicyError, *also) as error:
         sys.stderr.write(f"swarmjax.{name}: error: {error}\n")
         return USER_ERROR

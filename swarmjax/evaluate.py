@@ -37,7 +37,6 @@ from swarmjax.sim import model as sim_model
 from swarmjax.task import level, observation
 from swarmjax.task import stage as task_stage
 
-INTERRUPTED = 130  # exit code: 128 + SIGINT, as a shell gives it
 BATCH = 64  # arenas that share NumPy's cost per call; more gain little
 SOLVER_ITERATIONS = 100  # MuJoCo's own default: until its tolerance of 1e-8 is met
 _RAY_GROUPS = np.array([1, 1, 1, 0, 1, 1], np.uint8)  # rays pass through the contact spheres
@@ -489,7 +488,7 @@ def evaluate(
 
 def _simulate_all(config: EvaluateConfig, trained: Policy) -> Iterator[Outcome]:
     """Runs all episodes in batches, by as many processes as are useful."""
-    workers = config.workers or _cores()
+    workers = config.workers or provenance.cores()
     size = min(BATCH, math.ceil(config.episodes / workers))
     batches = [
         range(first, min(first + size, config.episodes))
@@ -508,13 +507,6 @@ def _simulate_all(config: EvaluateConfig, trained: Policy) -> Iterator[Outcome]:
 
 def _simulate_batch(config: EvaluateConfig, trained: Policy, episodes: range) -> Outcome:
     return simulate(load(config, trained), episodes)
-
-
-def _cores() -> int:
-    """Counts the cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def summarize(outcome: Outcome, control_step: float) -> dict[str, Any]:
@@ -568,7 +560,7 @@ def main(arguments: Sequence[str]) -> int:
             result = evaluate(settings, trained, partial(progress.advance, bar))
     except KeyboardInterrupt:
         sys.stderr.write("swarmjax.evaluate: interrupted, nothing was written.\n")
-        return INTERRUPTED
+        return command.INTERRUPTED
     if settings.out is not None:
         _write(Path(settings.out), result)
     _print(Console(), result)

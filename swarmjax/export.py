@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from swarmjax import checkpoint, command, config, policy, provenance
-from swarmjax.checkpoint import Leaves
+from swarmjax.checkpoint import CheckpointError, Leaves
 from swarmjax.config import ConfigError, ExportConfig, TrainConfig
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import normalizer
@@ -63,8 +63,23 @@ def policy_meta(trained: TrainConfig, update: int) -> dict:
 
 
 def write_policy(path: Path, leaves: Leaves, trained: TrainConfig, update: int) -> None:
-    """Writes the policy of a checkpoint to `path`."""
-    policy.save(path, policy_arrays(leaves), policy_meta(trained, update))
+    """Writes the policy of a checkpoint to `path`.
+
+    Raises:
+      CheckpointError: if the config is not the one that made the checkpoint.
+    """
+    arrays = policy_arrays(leaves)
+    widths = tuple(
+        arrays[f"actor/hidden_{i}/bias"].shape[1]
+        for i in range(sum(name.endswith("/bias") for name in arrays) - 1)
+    )
+    found = (len(arrays["actor/log_std"]), widths)
+    if found != (trained.learners, trained.algo.hidden):
+        raise CheckpointError(
+            f"the checkpoint holds {found[0]} learners of layers {list(widths)}, but the config "
+            f"says {trained.learners} of {list(trained.algo.hidden)}: it is of another run."
+        )
+    policy.save(path, arrays, policy_meta(trained, update))
 
 
 def read_config(run: Path) -> dict:
@@ -97,4 +112,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(command.run("export", main, ExportConfig, (checkpoint.CheckpointError,)))
+    sys.exit(command.run("export", main, ExportConfig, (CheckpointError,)))

@@ -17,7 +17,7 @@ from swarmjax import rollout
 from swarmjax.config import TrainConfig
 from swarmjax.curriculum import Curriculum, Schedule
 from swarmjax.ppo import learner as ppo
-from swarmjax.ppo.learner import LearnerState
+from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.rollout import Ended
 from swarmjax.sim import gaps
 from swarmjax.task import env, observation
@@ -155,7 +155,7 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
         "stage_success": decision.success,
         "robots": jnp.sum(arenas.level.present),
         "transitions": jnp.sum(trajectory.valid),
-        **{name: jnp.mean(value) for name, value in learned.items()},
+        **_learner_metrics(learned, batch),
         **_episode_metrics(ended, state.curriculum.stage),
     }
     new = TrainState(
@@ -166,6 +166,13 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
         update=state.update + 1,
     )
     return new, metrics
+
+
+def _learner_metrics(learned: Metrics, batch: Batch) -> Metrics:
+    """Averages [L] over the learners that had anything to learn from."""
+    learns = jnp.any(batch.valid, axis=(1, 2))
+    count = jnp.maximum(jnp.sum(learns), 1)
+    return {name: jnp.sum(jnp.where(learns, x, 0.0)) / count for name, x in learned.items()}
 
 
 def _episode_metrics(ended: Ended, stage: Array) -> Metrics:

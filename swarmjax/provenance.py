@@ -52,7 +52,14 @@ def device() -> str:
     found = jax.devices()[0]
     if found.platform != "cpu":
         return f"{len(jax.devices())} x {found.device_kind}"
-    return f"CPU {platform.machine()}, {len(os.sched_getaffinity(0))} cores"
+    return f"CPU {platform.machine()}, {cores()} cores"
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # Linux alone has it
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _git(tree: Path, *arguments: str) -> str:

@@ -66,28 +66,30 @@ def _share(part: float, whole: float) -> float | None:
 class Recorder:
     """Appends to the files of a run directory. Use it with `with`."""
 
-    def __init__(self, run: Path, *, tensorboard: bool, update: int) -> None:
-        """Opens the files, dropping what a stopped run wrote after the checkpoint `update`."""
+    def __init__(self, run: Path, *, tensorboard: bool, update: int, arena_steps: int = 0) -> None:
+        """Opens the files, dropping what a stopped run wrote after the checkpoint `update`.
+
+        `arena_steps` is where that checkpoint stands, on TensorBoard's axis.
+        """
         run.mkdir(parents=True, exist_ok=True)
         for name in (METRICS, DECISIONS):
             _truncate(run / name, update)
         self._metrics = (run / METRICS).open("a")
         self._decisions = (run / DECISIONS).open("a")
-        purge = update or None  # TensorBoard hides what comes after this step
+        purge = arena_steps + 1 if update else None  # TensorBoard hides what it has from here on
         self._board = (
             SummaryWriter(str(run / "tensorboard"), purge_step=purge) if tensorboard else None
         )
 
     def write(self, found: Sequence[Row], decisions: Iterable[Row], speeds: Row) -> None:
-        """Writes the rows of a call, and the last of them with the speeds to TensorBoard."""
+        """Writes the rows of a call; the speeds go to TensorBoard with the last of them."""
         self._metrics.writelines(json.dumps(row) + "\n" for row in found)
         self._decisions.writelines(json.dumps(row) + "\n" for row in decisions)
         self._metrics.flush()
         self._decisions.flush()
         if self._board:
-            for name, value in (found[-1] | speeds).items():
-                if isinstance(value, int | float):
-                    self._board.add_scalar(name, value, found[-1]["arena_steps"])
+            for row in [*found[:-1], found[-1] | speeds]:
+                _add_scalars(self._board, row)
 
     def __enter__(self) -> "Recorder":
         """Returns itself."""
@@ -101,12 +103,29 @@ class Recorder:
             self._board.close()
 
 
+def _add_scalars(board: SummaryWriter, row: Row) -> None:
+    """Writes the numbers of a row to TensorBoard."""
+    for name, value in row.items():
+        if isinstance(value, int | float):
+            board.add_scalar(name, value, row["arena_steps"])
+
+
+def history(run: Path, update: int) -> tuple[list[Row], list[Row]]:
+    """Reads what a run had written down before `update`: its metrics and its promotions."""
+    return _kept(run / METRICS, update), _kept(run / DECISIONS, update)
+
+
+def _kept(path: Path, update: int) -> list[Row]:
+    """Reads the rows before `update`."""
+    if not path.exists():
+        return []
+    return [json.loads(line) for line in path.read_text().splitlines() if _update_of(line) < update]
+
+
 def _truncate(path: Path, update: int) -> None:
     """Keeps the rows before `update`."""
-    if not path.exists():
-        return
-    kept = [line for line in path.read_text().splitlines() if _update_of(line) < update]
-    path.write_text("".join(line + "\n" for line in kept))
+    if path.exists():
+        path.write_text("".join(json.dumps(row) + "\n" for row in _kept(path, update)))
 
 
 def _update_of(line: str) -> float:

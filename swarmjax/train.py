@@ -22,7 +22,6 @@ from swarmjax.loop import Program, TrainState
 from swarmjax.sim import physics
 from swarmjax.trainer import Stop, Tally, TrainingError, compile_chunk, train
 
-INTERRUPTED = 130  # exit code: 128 + SIGINT, as a shell gives it
 FAILED = 1
 
 
@@ -46,18 +45,19 @@ def main(arguments: Sequence[str]) -> int:
             return FAILED
     _write_results(run, program, state, tally)
     sys.stdout.write(_closing(run, settings, tally) + "\n")
-    return INTERRUPTED if stop.asked else 0
+    return command.INTERRUPTED if stop.asked else 0
 
 
 def _settings(arguments: Sequence[str]) -> TrainConfig:
     """Reads the command line; with `resume=` the stored config and what may be changed of it."""
     given = {key: value for key, _, value in (word.partition("=") for word in arguments)}
-    if given.get("resume", "null") in ("", "null"):
+    resumed = given.get("resume", "null").strip("'\"")
+    if resumed in ("", "null"):
         return config.load_train(arguments)
-    run = Path(given["resume"])
-    settings = config.load_resume(export.read_config(run), arguments)
-    directory = given.get("run.dir", str(run))
-    return replace(settings, resume=str(run), run=replace(settings.run, dir=directory))
+    settings = config.load_resume(export.read_config(Path(resumed)), arguments)
+    kept = given.get("run.dir", "null") in ("", "null") or settings.run.dir is None
+    directory = settings.resume if kept else settings.run.dir
+    return replace(settings, run=replace(settings.run, dir=directory))
 
 
 def _first_state(
@@ -66,7 +66,13 @@ def _first_state(
     """Starts from the seed, or from the newest sound checkpoint of the run that is resumed."""
     if program.config.resume is None:
         return jax.jit(partial(loop.init, program))(schedule), []
-    leaves, _, skipped = checkpoint.restore(Path(program.config.resume))
+    settings = program.config
+    leaves, update, skipped = checkpoint.restore(Path(program.config.resume))
+    if update > settings.updates:
+        raise ConfigError(
+            f"budget is {settings.budget}, but {settings.resume} has spent "
+            f"{update * settings.arenas * settings.algo.rollout} already: give at least that."
+        )
     return checkpoint.from_leaves(leaves, template), skipped
 
 
@@ -74,7 +80,8 @@ def _open_run(settings: TrainConfig) -> Path:
     """Makes the run directory and writes `config.json` into it."""
     name = f"{datetime.now():%Y%m%d-%H%M%S}-{settings.stage_name}-seed{settings.seed}"
     run = Path(settings.run.dir) if settings.run.dir else Path("runs") / name
-    if (run / "config.json").exists() and settings.resume is None:
+    resumed = settings.resume is not None and Path(settings.resume).resolve() == run.resolve()
+    if (run / "config.json").exists() and not resumed:
         raise ConfigError(
             f"run.dir is {run}, which holds a run already: give another directory, or "
             f"resume={run} to go on with it."
@@ -116,7 +123,7 @@ def _write_results(run: Path, program: Program, state: TrainState, tally: Tally)
     leaves = checkpoint.to_leaves(state)
     export.write_policy(run / "policy.npz", leaves, settings, tally.update)
     steps = tally.update * settings.arenas * settings.algo.rollout
-    trained = (tally.update - tally.first) * settings.arenas * settings.algo.rollout
+    train_s = tally.earlier_s + tally.seconds
     summary = {
         "stage": settings.stage_name,
         "stages": [stage.name for stage in settings.stage],
@@ -124,10 +131,10 @@ def _write_results(run: Path, program: Program, state: TrainState, tally: Tally)
         "budget_spent": tally.update >= settings.updates,
         "arena_steps": steps,
         "transitions": tally.transitions,
-        "train_s": tally.seconds,
+        "train_s": train_s,
         "compile_s": tally.compile_s,
-        "arena_steps_per_s": trained / tally.seconds if tally.seconds else None,
-        "transitions_per_s": tally.transitions / tally.seconds if tally.seconds else None,
+        "arena_steps_per_s": steps / train_s if train_s else None,
+        "transitions_per_s": tally.transitions / train_s if train_s else None,
         "targets_reached": tally.success,
         "promotions": tally.decisions,
         "impl": physics.resolve_impl(settings.sim.impl),

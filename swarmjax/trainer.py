@@ -1,6 +1,7 @@
 """The host side of a run: calls the compiled chunk, records, shows, saves, and stops when asked."""
 
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -46,13 +47,14 @@ class Compiled:
 
 @dataclass
 class Tally:
-    """What the host adds up over the calls of this process, in integers that do not wrap.
+    """What the host adds up over the whole run, in integers that do not wrap.
 
     Attributes:
       update: updates of the run that are done.
       first: updates that were done when this process began.
       transitions: robot steps that were trained on.
-      seconds: spent training, compilation apart.
+      earlier_s: spent training before this process began.
+      seconds: spent training by this process, compilation apart.
       compile_s: spent compiling.
       decisions: promotions.
       success: newest measured share of targets of each stage.
@@ -61,6 +63,7 @@ class Tally:
     update: int
     first: int
     compile_s: float
+    earlier_s: float = 0.0
     transitions: int = 0
     seconds: float = 0.0
     decisions: list[dict] = field(default_factory=list)
@@ -89,6 +92,7 @@ class Stop:
         if self.asked:  # asked twice: not even to wait for the end of the call
             raise KeyboardInterrupt
         self.asked = True
+        sys.stderr.write("stopping after this call, to save; once more stops at once\n")
 
 
 def compile_chunk(program: Program, schedule: Schedule, state: Any) -> Compiled:
@@ -140,11 +144,14 @@ def train(
     compiled = compile_chunk(program, schedule, state)
     done = int(state.update)
     compile_s = compiled.seconds + _build_kernels(program, state)
-    tally = Tally(update=done, first=done, compile_s=compile_s)
+    tally = _tally(program, done, compile_s)
+    arena_steps = done * program.config.arenas * program.config.algo.rollout
     saved_at = time.monotonic()
     with (
-        Recorder(run, tensorboard=settings.tensorboard, update=done) as record,
-        Checkpoints(run, settings.keep_checkpoints) as checkpoints,
+        Recorder(
+            run, tensorboard=settings.tensorboard, update=done, arena_steps=arena_steps
+        ) as record,
+        Checkpoints(run, settings.keep_checkpoints, done) as checkpoints,
     ):
         for n in _calls(program, tally, stop):
             began = time.perf_counter()
@@ -156,6 +163,19 @@ def train(
                 saved_at = time.monotonic()
         checkpoints.save(state, tally.update)
     return state, tally
+
+
+def _tally(program: Program, done: int, compile_s: float) -> Tally:
+    """Begins to add up, from what a resumed run had come to."""
+    tally = Tally(update=done, first=done, compile_s=compile_s)
+    if program.config.resume is None:
+        return tally
+    rows, tally.decisions = recorder.history(Path(program.config.resume), done)
+    tally.transitions = sum(row["transitions"] for row in rows)
+    tally.earlier_s = rows[-1]["train_s"] if rows else 0.0
+    measured = [row for row in rows if row["stage_success"] is not None]
+    tally.success = {row["stage"]: row["stage_success"] for row in measured}
+    return tally
 
 
 def _build_kernels(program: Program, state: TrainState) -> float:
@@ -201,13 +221,15 @@ def _report(
     tally.update += n
     tally.seconds += seconds
     rows = recorder.rows(metrics, n, names, control_steps)
-    rows: list[recorder.Row] = [row | {"train_s": tally.seconds} for row in rows]
+    rows: list[recorder.Row] = [row | {"train_s": tally.earlier_s + tally.seconds} for row in rows]
     _check_finite(rows)
     decisions = curriculum.log(rows, names)
     speeds = _speeds(program, rows, seconds) | {"compile_s": tally.compile_s}
     tally.transitions += sum(row["transitions"] for row in rows)
     tally.decisions += decisions
-    measured = {row["stage"]: row["stage_success"] for row in rows if row["stage_success"]}
+    measured = {
+        row["stage"]: row["stage_success"] for row in rows if row["stage_success"] is not None
+    }
     tally.success |= measured
     record.write(rows, decisions, speeds)
     for entry in decisions:

@@ -191,7 +191,7 @@ def test_an_interrupt_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
         time.sleep(0.1)
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=120)
-    assert process.returncode == train.INTERRUPTED
+    assert process.returncode == command.INTERRUPTED
     assert f"resume={tmp_path}" in output
     assert checkpoint.restore(tmp_path)[1] > 0
     assert (tmp_path / "policy.npz").exists()

@@ -89,5 +89,5 @@ def test_agrees_with_brax_over_several_batches() -> None:
         mine = normalizer.update(mine, batch, valid)
         theirs = running_statistics.update(theirs, batch, weights=valid.astype(jnp.float32))
     # 1e-5: float32; Brax sums squares, this project merges moments.
-    np.testing.assert_allclose(mine.mean, theirs.mean, rtol=1e-5)
-    np.testing.assert_allclose(mine.std, theirs.std, rtol=1e-5)
+    np.testing.assert_allclose(mine.mean, np.asarray(theirs.mean), rtol=1e-5)
+    np.testing.assert_allclose(mine.std, np.asarray(theirs.std), rtol=1e-5)
