@@ -98,6 +98,10 @@ def test_a_resumed_run_ends_where_an_uninterrupted_one_does(whole: Path, tmp_pat
     assert train.main([f"resume={tmp_path}"]) == 0
     assert _digest(tmp_path) == _digest(whole)
     assert _rows(tmp_path) == _rows(whole)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    kept = json.loads((whole / "summary.json").read_text())
+    for name in ("arena_steps", "transitions", "targets_reached", "promotions"):
+        assert summary[name] == kept[name], name
 
 
 def test_another_seed_is_another_run(whole: Path, tmp_path: Path) -> None:
@@ -122,6 +126,20 @@ def test_a_run_directory_is_never_written_over(
     sentence = _refusal(capsys, "train", *TINY, f"run.dir={whole}")
     assert "holds a run already" in sentence
     assert (whole / "metrics.jsonl").read_bytes() == before
+
+
+def test_a_resumed_run_spares_other_runs_and_what_is_spent(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other"
+    assert _train(f"run.dir={other}", "run.stop_after=1") == 0
+    capsys.readouterr()
+    before = (other / "config.json").read_bytes()
+    sentence = _refusal(capsys, "train", f"resume={whole}", f"run.dir={other}")
+    assert "holds a run already" in sentence
+    assert (other / "config.json").read_bytes() == before
+    sentence = _refusal(capsys, "train", f"resume={whole}", f"budget={4 * 4 * 5}")
+    assert f"has spent {4 * 4 * 9} already" in sentence
 
 
 def test_foreign_and_missing_runs_are_refused(
