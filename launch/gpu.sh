@@ -5,11 +5,11 @@ set -euo pipefail
 
 # Programs that take many seconds to compile are kept between runs.
 export JAX_COMPILATION_CACHE_DIR="${JAX_COMPILATION_CACHE_DIR:-${XDG_CACHE_HOME:-$HOME/.cache}/swarmjax/xla}"
-# Warp allocates its contacts and constraints outside JAX's pool; JAX alone would take 75 % of the
-# card at once and leave Warp what is left, which is enough, but says nothing when it is not.
+# JAX's own default, written out because it matters here: JAX takes this share of the card at once,
+# and Warp's kernels and temporary arrays live in what is left.
 export XLA_PYTHON_CLIENT_MEM_FRACTION="${XLA_PYTHON_CLIENT_MEM_FRACTION:-0.75}"
-# The networks' products may use the tensor cores' TF32: PPO does not notice. The physics never
-# goes through them: Warp's kernels are float32.
+# JAX's own default again: the networks' products may use TF32 on the tensor cores. The physics never
+# goes through them: Warp's kernels are float32. With sim.impl=jax set this to `highest`.
 export JAX_DEFAULT_MATMUL_PRECISION="${JAX_DEFAULT_MATMUL_PRECISION:-default}"
 
 # arenas: where an H100's speed levels off. budget: about a minute of training there; the share of
