@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -127,6 +128,7 @@ def count(curriculum: Curriculum, cohort: Array, targets: Array, reached: Array)
     Returns:
       The curriculum with new tallies.
     """
+    chex.assert_equal_shape([cohort, targets, reached])
 
     def add(tally: Tally, number: Array) -> Tally:
         mine = cohort == number

@@ -97,14 +97,29 @@ class Ended(NamedTuple):
 
 
 def to_learners(x: Array, learners: int) -> Array:
-    """Lays [A, R, ...] out as [L, A, N, ...]."""
+    """Lays robots out by learner.
+
+    Args:
+      x: [A, R, ...].
+      learners: L, 1 or R.
+
+    Returns:
+      [L, A, N, ...], N = R / L.
+    """
     if learners == 1:
         return x[None]
     return jnp.moveaxis(x, 1, 0)[:, :, None]
 
 
 def to_arenas(x: Array) -> Array:
-    """Lays [L, A, N, ...] out as [A, R, ...] again."""
+    """Undoes `to_learners`.
+
+    Args:
+      x: [L, A, N, ...].
+
+    Returns:
+      [A, R, ...], R = L N.
+    """
     if x.shape[0] == 1:
         return x[0]
     return jnp.moveaxis(x[:, :, 0], 0, 1)

@@ -11,6 +11,7 @@ import io
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -173,6 +174,9 @@ def step(
       The arena, one control step later.
     """
     ids = physics.ids
+    chex.assert_rank(side, 0)
+    chex.assert_shape(obstacle, (len(ids.obstacle_geom), 5))
+    chex.assert_shape(velocity, (len(ids.hull_body), 2))
     place, turn = sim_model.fixture_poses(side, obstacle, jnp)
     forward, turn_rate = velocity[:, 0], velocity[:, 1]
     ctrl = jnp.stack([forward, jnp.zeros_like(forward), turn_rate], axis=-1).reshape(-1)

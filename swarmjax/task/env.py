@@ -7,6 +7,7 @@ to, and the rollout decides what comes next.
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import chex
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
@@ -166,7 +167,15 @@ def reset(world: World, level: Level, stage: Array, cohort: Array) -> tuple[EnvS
 
 
 def observe(world: World, state: EnvState) -> Array:
-    """Observes an arena as it stands: [R, O]."""
+    """Observes an arena as it stands.
+
+    Args:
+      world: the compiled environment.
+      state: the arena.
+
+    Returns:
+      [R, O] in the order of `observation.NAMES`.
+    """
     pose = physics.poses(state.sim)
     distance, bearing = observation.to_target(pose, state.level.target, jnp)
     seen = _infrared(world, pose, state.level)
@@ -184,6 +193,7 @@ def step(world: World, state: EnvState, action: Array) -> tuple[EnvState, TimeSt
     Returns:
       The new state, and what the step came to.
     """
+    chex.assert_shape(action, (state.level.present.shape[0], 2))
     active = state.level.present & ~state.arrived
     data, pose, sound = _move(world, state, action, active)
     seen = _infrared(world, pose, state.level)

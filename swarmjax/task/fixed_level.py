@@ -32,7 +32,16 @@ def most_robots(side: float) -> int:
 
 
 def starts(robots: int, side: Array, xp: Any) -> Array:
-    """Returns starts [robots, 3]: a row along the upper wall, facing +x."""
+    """Places the starts: a row along the upper wall, facing +x.
+
+    Args:
+      robots: R.
+      side: [] of the arena, m.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [R, 3] x (m), y (m), yaw (rad).
+    """
     scale = side / EXAMPLE_SIDE
     row = SPACING * np.arange(robots, dtype=np.float32)
     x = START[0] * scale + row
@@ -40,7 +49,16 @@ def starts(robots: int, side: Array, xp: Any) -> Array:
 
 
 def targets(robots: int, side: Array, xp: Any) -> Array:
-    """Returns targets [robots, 2]: columns of two, from the far corner back along the wall."""
+    """Places the targets: columns of two, from the far corner back along the wall.
+
+    Args:
+      robots: R.
+      side: [] of the arena, m.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [R, 2] x (m), y (m).
+    """
     scale = side / EXAMPLE_SIDE
     index = np.arange(robots)
     back = (SPACING * (index // 2)).astype(np.float32)
@@ -49,7 +67,17 @@ def targets(robots: int, side: Array, xp: Any) -> Array:
 
 
 def obstacles(count: int, side: Array, fenced: Array, xp: Any) -> Array:
-    """Returns obstacles [count, 5]: the fence where `fenced` [], else boxes."""
+    """Places the obstacles: the fence, as often as asked, or boxes.
+
+    Args:
+      count: M.
+      side: [] of the arena, m.
+      fenced: [] whether it is the fence.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [M, 5] x (m), y (m), yaw (rad), half edges (m).
+    """
     if not count:
         return xp.zeros((0, 5), dtype=xp.float32)
     scale = side / EXAMPLE_SIDE

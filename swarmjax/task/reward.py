@@ -7,6 +7,7 @@ A new term is one function here, one row of `TERMS`, one weight in `RewardConfig
 from collections.abc import Callable
 from typing import NamedTuple
 
+import chex
 import jax.numpy as jnp
 from jax import Array
 
@@ -77,6 +78,7 @@ def total(step: Step, weights: RewardConfig) -> Array:
     Returns:
       [R] reward.
     """
+    chex.assert_equal_shape([step.distance_before, step.distance, step.arrives])
     reward = jnp.zeros_like(step.distance)
     for name, term in TERMS.items():
         weight = getattr(weights, name)
