@@ -6,7 +6,6 @@ A checkpoint is a flat dictionary from names such as `learners/params/actor/mean
 arrays, so that it can be read without the program that wrote it.
 """
 
-import hashlib
 import logging
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 from absl import logging as absl_logging
+
+from swarmjax.policy import digest
 
 Leaves = dict[str, np.ndarray]
 
@@ -104,16 +105,6 @@ def from_leaves(leaves: Leaves, template: Any) -> Any:
         return jax.random.wrap_key_data(array) if is_key else array
 
     return jax.tree_util.tree_map_with_path(fill, template)
-
-
-def digest(leaves: Leaves) -> str:
-    """Returns the SHA-256 over names, types, shapes and contents."""
-    sha = hashlib.sha256()
-    for name in sorted(leaves):
-        array = np.ascontiguousarray(leaves[name])
-        sha.update(f"{name} {array.dtype.str} {array.shape}".encode())
-        sha.update(array.tobytes())
-    return sha.hexdigest()
 
 
 def restore(run: Path, update: int | None = None) -> tuple[Leaves, int, list[str]]:

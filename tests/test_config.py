@@ -429,7 +429,8 @@ def test_too_small_an_arena_names_the_least_side():
 @settings(max_examples=50, deadline=None)
 @given(st.integers(1, 100), st.integers(0, 20), st.floats(0.02, 0.3))
 def test_every_stage_fits_the_largest_arena(robots, obstacles, size):
-    StageConfig(name="a", robots=robots, side=4.0, obstacles=obstacles, obstacle_size=size)
+    stage = StageConfig(name="a", robots=robots, side=4.0, obstacles=obstacles, obstacle_size=size)
+    assert smallest_side(stage) <= 4.0
 
 
 @pytest.mark.parametrize("name", ["a b", "../a", "a.b"])

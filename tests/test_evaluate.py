@@ -256,7 +256,7 @@ def test_the_judge_counts_what_the_training_environment_counts(tmp_path: Path) -
     stage = _stage(robots=3, side=0.7, obstacles=1)
     judge = _judge(tmp_path, stage)
     # An episode in which robots meet one another and the obstacle, and all arrive.
-    drawn = evaluate.draw_level(judge.stage, judge.spacing, 1, 58)
+    drawn = evaluate.draw_level(judge.stage, judge.spacing, 1, 65)
     arenas = evaluate.start(judge, [drawn])
     sim = SimConfig(impl="jax", max_robots=3, max_obstacles=1)
     world = env.load(TrainConfig(stage=(stage,), sim=sim))
@@ -266,7 +266,7 @@ def test_the_judge_counts_what_the_training_environment_counts(tmp_path: Path) -
     step = jax.jit(lambda state, action: env.step(world, state, action))
     # Float32 against double along the way; the paths hardly magnify it, contacts included.
     np.testing.assert_allclose(seen, arenas.observation[0], atol=1e-5)
-    for _ in range(153):
+    for _ in range(168):
         state, came = step(state, policy.mean_action(judge.policy, np.asarray(seen)))
         seen = np.asarray(came.observation)
         arenas = evaluate.step(judge, arenas)

@@ -10,14 +10,14 @@ import swarmjax
 ROOT = Path(swarmjax.__file__).parent
 # A module imports from rows above its own, and a package from itself.
 LAYERS = (
-    {"epuck"},
+    {"epuck", "policy"},
     {"config"},
     {"sim"},
     {"task"},
     {"curriculum", "ppo"},
     {"rollout"},
     {"loop"},
-    {"policy", "provenance", "checkpoint", "recorder", "display"},
+    {"provenance", "checkpoint", "recorder", "display"},
     {"command", "trainer"},
     {"export"},
     {"train", "evaluate"},
