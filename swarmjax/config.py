@@ -30,7 +30,7 @@ MAX_COUNT = 2**31 - 1  # counts and seeds are int32 on the device
 # widened by a passage through which one robot fits with 13 mm to spare on either side; along the
 # walls a border of half a passage stays free.
 DISC = 0.15  # m, edge of the square about the disc of a start or a target
-PASSAGE = 0.10  # m
+PASSAGE = 0.10  # m; between obstacles, and between an obstacle and a wall
 FILLING = 0.4  # boxes per square of a grid that random placing surely reaches
 
 # Filled in by the loader, so no key of the command line.

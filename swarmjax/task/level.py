@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from swarmjax.config import PASSAGE
 from swarmjax.task import fixed_level
 from swarmjax.task.placement import (
     UNITS,
@@ -25,7 +26,6 @@ Array = Any
 
 PARKING = 5.0  # m; where absent robots and obstacles wait, outside the walls of any arena
 PARKING_SPACING = 0.5  # m
-PASSAGE = 0.10  # m; between obstacles, and between an obstacle and a wall: wider than a robot
 MARGIN = 0.02  # m; least free space beside anything at the start
 TARGET_SPACING = 0.25  # m; least distance of targets where the arena has room
 
