@@ -47,12 +47,11 @@ def write(path: Path, ahead: Sequence[float], *sides: Sequence[float]) -> None:
         "normalizer/std": none + 1.0,
     }
     turn = epuck.MAX_TURN_RATE
-    layout = {"names": list(observation.NAMES), "units": list(observation.UNITS), "limit": 10.0}
     meta = {
         "policy": "shared",
         "learners": 1,
         "activation": "relu",
-        "observation": layout,
+        "observation": observation.describe("metric") | {"limit": 10.0},
         "action": {
             "names": ["speed", "turn_rate"],
             "units": ["m/s", "rad/s"],

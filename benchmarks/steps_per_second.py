@@ -58,8 +58,9 @@ def physics_alone(program: Program, arenas: EnvState, key: Array) -> tuple[EnvSt
     data = jax.vmap(partial(physics.unpack, world.physics))(arenas.sim)
 
     def body(data: Any, key: Array) -> tuple[Any, None]:
-        velocity = drive.command(_actions(program, key), world.drive, jnp)
-        return move(data, level.side, level.obstacle, velocity), None
+        command = drive.command(_actions(program, key), world.drive, jnp)
+        wheels = drive.wheel_speeds(command, world.drive, jnp)
+        return move(data, level.side, level.obstacle, wheels), None
 
     data, _ = jax.lax.scan(body, data, jax.random.split(key, CONTROL_STEPS))
     packed = jax.vmap(physics.pack)(data)
@@ -75,10 +76,10 @@ def environment(
     step = jax.vmap(partial(env.step, world))
     unpack = jax.vmap(partial(physics.unpack, world.physics))
 
-    def body(arenas: EnvState, key: Array, starts: rollout.Starts) -> tuple[EnvState, Array]:
+    def body(arenas: EnvState, key: Array, starts: EnvState) -> tuple[EnvState, Array]:
         arenas, came = step(arenas, _actions(program, key))
         reward = jnp.sum(came.reward) + jnp.sum(came.observation)
-        return rollout.restart(arenas, starts.state, came.done), reward
+        return rollout.restart(arenas, starts, came.done), reward
 
     def rolled(arenas: EnvState, key: Array) -> tuple[EnvState, Array]:
         level_key, key = jax.random.split(key)
@@ -117,16 +118,17 @@ def _line(
     compile_s, seconds = timing
     arena_steps = control_steps * settings.arenas / seconds
     robots = settings.stage[-1].robots
+    substeps = config.substeps(settings.robot, settings.sim.substeps)
     return {
         "benchmark": f"steps_per_second.{name}",
         "robot": settings.robot.body,
         "impl": physics.resolve_impl(settings.sim.impl),
         "arenas": settings.arenas,
         "robots": robots,
-        "substeps": settings.sim.substeps,
+        "substeps": substeps,
         "arena_steps_per_s": arena_steps,
         "robot_steps_per_s": arena_steps * robots,
-        "physics_steps_per_s": arena_steps * settings.sim.substeps,
+        "physics_steps_per_s": arena_steps * substeps,
         "transitions_per_s": None if transitions is None else transitions / seconds,
         "compile_s": compile_s,
         "device": provenance.device(),

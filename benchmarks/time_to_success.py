@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from swarmjax.config import TrainConfig, build, substeps
 from swarmjax.recorder import METRICS
 
 
@@ -27,7 +28,7 @@ def line(run: Path, share: float) -> dict:
     config = json.loads((run / "config.json").read_text())
     summary = json.loads((run / "summary.json").read_text())
     rows = [json.loads(text) for text in (run / METRICS).read_text().splitlines()]
-    last = config["stage"][-1]
+    last, trained = config["stage"][-1], build(TrainConfig, config)
     there = [r for r in rows if r["stage"] == last["name"] and (r["stage_success"] or 0.0) >= share]
     return {
         "benchmark": "time_to_success",
@@ -40,7 +41,7 @@ def line(run: Path, share: float) -> dict:
         "robot": config["robot"]["body"],
         "arenas": config["arenas"],
         "robots": last["robots"],
-        "substeps": config["sim"]["substeps"],
+        "substeps": substeps(trained.robot, trained.sim.substeps),
         **{k: summary[k] for k in ("impl", "arena_steps_per_s", "transitions_per_s")},
         **{k: summary[k] for k in ("train_s", "compile_s", "device", "versions", "commit")},
     }

@@ -8,6 +8,7 @@ Episode n of a seed starts from the same level whatever else is asked for, and e
 computed on its own, so that a result does not depend on how the work is split up.
 """
 
+import copy
 import json
 import math
 import os
@@ -29,17 +30,23 @@ from rich.progress import Progress
 from rich.table import Table
 
 from swarmjax import command, config, epuck, policy, provenance
-from swarmjax.config import ConfigError, EvaluateConfig
+from swarmjax.config import ConfigError, EvaluateConfig, substeps
 from swarmjax.policy import Policy, PolicyError
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps, infrared
 from swarmjax.sim import model as sim_model
-from swarmjax.task import level, observation
+from swarmjax.sim.body import Chassis
+from swarmjax.sim.geom import FLOOR_GROUP, HULL_GROUP
+from swarmjax.task import factors as task_factors
+from swarmjax.task import level, observation, senses
 from swarmjax.task import stage as task_stage
+from swarmjax.task.factors import Factors
+from swarmjax.task.senses import Electronics, Memory, Sight
 
 BATCH = 64  # arenas that share NumPy's cost per call; more gain little
 SOLVER_ITERATIONS = 100  # MuJoCo's own default: until its tolerance of 1e-8 is met
-_RAY_GROUPS = np.array([1, 1, 1, 0, 1, 1], np.uint8)  # rays pass through the contact spheres
+# Rays pass through contact spheres, wheels, skids and floor.
+_RAY_GROUPS = np.array([i not in (HULL_GROUP, FLOOR_GROUP) for i in range(6)], np.uint8)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,10 +59,12 @@ class Judge:
         stage: Of the levels, fields [].
         spacing: Sizes that levels are drawn with.
         drive: The robot's drive, with the range of commands that the policy was trained for.
+        electronics: What lies between policy and world; it observes as the policy was trained to.
         model: One arena, compiled.
         ids: Rows of its moving bodies.
         geom_robot: Of each of its geoms the robot whose contact geom it is, else -1.
         geom_kind: Of each of its geoms the index in `gaps.KINDS` of what it belongs to.
+        substeps: Physics steps of a control step.
     """
 
     config: EvaluateConfig
@@ -63,10 +72,12 @@ class Judge:
     stage: task_stage.Stage
     spacing: level.Spacing
     drive: sim_drive.Drive
+    electronics: Electronics
     model: mujoco.MjModel
     ids: sim_model.Ids
     geom_robot: np.ndarray
     geom_kind: np.ndarray
+    substeps: int
 
 
 class Outcome(NamedTuple):
@@ -93,7 +104,10 @@ class Arenas(NamedTuple):
     """Arenas between two control steps. Of these, MuJoCo edits `data` in place.
 
     Attributes:
+        model: [A] of `MjModel`, all the same one unless robots differ from the nominal one.
         data: [A] of `MjData`, positions up to date.
+        factors: [A] of the episodes.
+        memory: [A] of the robots' electronics.
         target: [A, R, 2] x (m), y (m).
         obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
         observation: [A, R, O].
@@ -101,7 +115,10 @@ class Arenas(NamedTuple):
         outcome: Since the start.
     """
 
+    model: np.ndarray
     data: np.ndarray
+    factors: Factors
+    memory: Memory
     target: np.ndarray
     obstacle: np.ndarray
     observation: np.ndarray
@@ -138,19 +155,32 @@ def load(config: EvaluateConfig, trained: Policy) -> Judge:
         drive=sim_drive.from_config(config.robot)._replace(
             max_speed=trained.max_speed, max_turn_rate=trained.max_turn_rate
         ),
+        electronics=senses.load(config.task, config.realism, trained.encoding),
         model=compiled,
         ids=ids,
         geom_robot=geom_robot,
         geom_kind=geom_kind,
+        substeps=_substeps(config),
     )
+
+
+def _substeps(config: EvaluateConfig) -> int:
+    """Physics steps of a control step: half as long as in training, where nothing else is given.
+
+    A wheel that slips while its robot is blocked hops by about as much as it slips in one physics
+    step: MuJoCo's contacts, like all convex ones, separate surfaces that slide.
+    """
+    finer = 2 if config.robot.body == "wheeled" and config.substeps is None else 1
+    return finer * substeps(config.robot, config.substeps)
 
 
 def _compile(
     config: EvaluateConfig, size: sim_model.ArenaSize, example: level.Level
 ) -> mujoco.MjModel:
     """Compiles the arena for obstacles of the sizes that they have in any level of the stage."""
-    timestep = config.task.control_step / config.substeps
-    spec = sim_model.build(config.robot, size, timestep, ray_geoms=True)
+    timestep = config.task.control_step / _substeps(config)
+    robot = task_factors.largest(config.robot, config.realism)
+    spec = sim_model.build(robot, size, timestep, ray_geoms=True)
     spec.option.iterations = SOLVER_ITERATIONS
     # Rather numbers that are not finite than a robot put back to where its world began.
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
@@ -233,12 +263,13 @@ def simulate(judge: Judge, episodes: Sequence[int]) -> Outcome:
     return total
 
 
-def _select(arenas: Arenas, rows: np.ndarray) -> Arenas:
-    """Keeps some of the arenas."""
-    outcome = Outcome(*(field[rows] for field in arenas.outcome))
-    fields = arenas._asdict().items()
-    kept = {name: field[rows] for name, field in fields if name != "outcome"}
-    return Arenas(**kept, outcome=outcome)
+def _select(tree: Any, rows: Any) -> Any:
+    """Keeps some of the arenas, in tuples of arrays however deep."""
+    if tree is None:
+        return None
+    if isinstance(tree, np.ndarray):
+        return tree[rows]
+    return type(tree)(*(_select(part, rows) for part in tree))
 
 
 def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
@@ -251,15 +282,37 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     Returns:
         The arenas at rest, observed.
     """
-    count, robots = len(levels), judge.spacing.robots
-    pose, target, obstacle = (
-        np.stack([getattr(each, name) for each in levels]).astype(np.float64)
-        for name in ("start", "target", "obstacle")
+    pose, target, obstacle, seed = (
+        np.stack([getattr(each, name) for each in levels])
+        for name in ("start", "target", "obstacle", "seed")
     )
-    data = np.empty(count, object)
-    data[:] = [place(judge, *each) for each in zip(pose, obstacle, strict=True)]
+    pose, target, obstacle = (x.astype(np.float64) for x in (pose, target, obstacle))
+    factors = task_factors.draw(
+        seed, judge.config.realism, judge.config.robot, *judge.spacing[:2], np
+    )
+    model = _models(judge, factors, len(levels))
+    data = np.empty(len(levels), object)
+    data[:] = [place(judge, *each) for each in zip(model, pose, obstacle, strict=True)]
+    outcome = _no_outcome(len(levels), judge.spacing.robots)
+    sight = look(judge, data, factors, pose, target, obstacle)
+    memory, seen = senses.begin(judge.electronics, factors, sight, outcome.clock, np)
+    return Arenas(
+        model=model,
+        data=data,
+        factors=factors,
+        memory=memory,
+        target=target,
+        obstacle=obstacle,
+        observation=seen,
+        apart=np.full(outcome.contacts.shape, gaps.CONTACT_PAUSE),
+        outcome=outcome,
+    )
+
+
+def _no_outcome(count: int, robots: int) -> Outcome:
+    """Returns what episodes have come to that have just begun."""
     none = np.zeros((count, robots), np.int64)
-    outcome = Outcome(
+    return Outcome(
         clock=none[:, 0],
         arrived=none.astype(bool),
         arrival=none,
@@ -267,36 +320,49 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
         sensed=none,
         moving=none,
     )
-    seen = read_infrared(judge, data, pose, obstacle)
-    distance, bearing = observation.to_target(pose, target, np)
-    return Arenas(
-        data=data,
-        target=target,
-        obstacle=obstacle,
-        observation=observation.observe(seen, distance, bearing, np),
-        apart=np.full(outcome.contacts.shape, gaps.CONTACT_PAUSE),
-        outcome=outcome,
-    )
 
 
-def place(judge: Judge, pose: np.ndarray, obstacle: np.ndarray) -> mujoco.MjData:
+def _chassis(factors: Factors) -> Chassis:
+    return Chassis(factors.wheel_radius, factors.track, factors.mass, factors.friction)
+
+
+def _models(judge: Judge, factors: Factors, count: int) -> np.ndarray:
+    """Returns the models [A] of arenas, each with the robots that its episode has."""
+    models = np.full(count, judge.model, object)
+    chassis = _chassis(factors)
+    if all(part is None for part in chassis):
+        return models
+    body = sim_model.BODIES[judge.config.robot.body]
+    for i in range(count):
+        models[i] = copy.copy(judge.model)
+        mine = _select(chassis, i)
+        changes = body.changes(mine, judge.ids.robots, judge.config.robot, judge.model)
+        for name, (rows, values) in changes.items():
+            getattr(models[i], name)[rows] = values
+    return models
+
+
+def place(
+    judge: Judge, model: mujoco.MjModel, pose: np.ndarray, obstacle: np.ndarray
+) -> mujoco.MjData:
     """Sets an arena up, at rest.
 
     Args:
         judge: What the arenas share.
+        model: Of the arena.
         pose: [R, 3] x (m), y (m), yaw (rad).
         obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m; those the model was compiled for).
 
     Returns:
         The arena, its positions up to date.
     """
-    data = mujoco.MjData(judge.model)
+    data = mujoco.MjData(model)
     side = np.float64(judge.stage.side)
     where, turn = sim_model.fixture_poses(side, obstacle, np)
     data.mocap_pos[judge.ids.fixture_mocap] = where
     data.mocap_quat[judge.ids.fixture_mocap] = turn
-    data.qpos = pose.reshape(-1)
-    mujoco.mj_step1(judge.model, data)
+    data.qpos = sim_model.BODIES[judge.config.robot.body].qpos(pose, np)
+    mujoco.mj_step1(model, data)
     return data
 
 
@@ -315,49 +381,62 @@ def step(judge: Judge, arenas: Arenas) -> Arenas:
     """
     task, before = judge.config.task, arenas.outcome
     active = ~before.arrived
-    pose = _drive(judge, arenas, active)
-    seen = read_infrared(judge, arenas.data, pose, arenas.obstacle)
-    distance, bearing = observation.to_target(pose, arenas.target, np)
-    arrives = active & (distance <= task.target_radius)
+    memory, pose = _drive(judge, arenas, active)
+    sight = look(judge, arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)
+    arrives = active & (sight.distance <= task.target_radius)
     gap = np.where(touching(judge, arenas.data), 0.0, np.inf)
     begins, apart = gaps.count_contacts(gap, arenas.apart, task.control_step, np)
     clock = before.clock + 1
+    memory, seen = senses.sense(judge.electronics, memory, arenas.factors, sight, clock, np)
     outcome = Outcome(
         clock=clock,
         arrived=before.arrived | arrives,
         arrival=np.where(arrives, clock[:, None], before.arrival),
         contacts=before.contacts + begins,
-        sensed=before.sensed + (active & (seen < task.sensor_range).any(axis=-1)),
+        sensed=before.sensed + (active & (sight.ray < task.sensor_range).any(axis=-1)),
         moving=before.moving + active,
     )
-    seen = observation.observe(seen, distance, bearing, np)
-    return arenas._replace(observation=seen, apart=apart, outcome=outcome)
+    return arenas._replace(memory=memory, observation=seen, apart=apart, outcome=outcome)
 
 
-def _drive(judge: Judge, arenas: Arenas, active: np.ndarray) -> np.ndarray:
-    """Lets the robots that are on their way drive; returns the new poses [A, R, 3]."""
+def _drive(judge: Judge, arenas: Arenas, active: np.ndarray) -> tuple[Memory, np.ndarray]:
+    """Lets the robots that are on their way drive; returns memory and new poses [A, R, 3]."""
     action = policy.mean_action(judge.policy, arenas.observation)
     wanted = sim_drive.command(action, judge.drive, np)
-    wanted = np.where(active[..., None], wanted, 0.0)
-    wheels = sim_drive.wheel_speeds(wanted, judge.drive, np)
-    velocity = sim_drive.body_velocity(wheels, judge.drive, np)
-    forward, turn_rate = velocity[..., 0], velocity[..., 1]
-    servos = np.stack([forward, np.zeros_like(forward), turn_rate], axis=-1)
-    pose = np.empty((*servos.shape[:-2], judge.model.nq))
-    for i, (data, ctrl) in enumerate(zip(arenas.data, servos.reshape(len(pose), -1), strict=True)):
-        data.ctrl = ctrl
-        # The halves of mj_step, the other way round: the positions that the rays of this control
-        # step need are those that the next one starts from.
-        for _ in range(judge.config.substeps):
-            mujoco.mj_step2(judge.model, data)
-            mujoco.mj_step1(judge.model, data)
-        pose[i] = data.qpos
-    if not np.isfinite(pose).all():
+    memory, wheels = senses.drive(
+        judge.electronics,
+        arenas.memory,
+        arenas.factors,
+        wanted,
+        judge.drive,
+        arenas.outcome.clock,
+        np,
+    )
+    wheels = np.where(active[..., None], wheels, 0.0)
+    body, robot = sim_model.BODIES[judge.config.robot.body], judge.config.robot
+    ctrl = body.ctrl(wheels, _chassis(arenas.factors), robot, np)
+    qpos = np.stack(
+        [_advance(judge, *each) for each in zip(arenas.model, arenas.data, ctrl, strict=True)]
+    )
+    if not np.isfinite(qpos).all():
         raise ConfigError(
             "the physics broke down, with positions that are not finite: give substeps of more "
-            f"than {judge.config.substeps}, or a robot nearer to the real one."
+            f"than {judge.substeps}, or a robot nearer to the real one."
         )
-    return pose.reshape(*servos.shape[:-1], 3)
+    return memory, body.pose(qpos, np)
+
+
+def _advance(
+    judge: Judge, model: mujoco.MjModel, data: mujoco.MjData, ctrl: np.ndarray
+) -> np.ndarray:
+    """Moves one arena on by a control step; returns a copy of its new positions."""
+    data.ctrl = ctrl
+    # The halves of mj_step, the other way round: the positions that the rays of this control
+    # step need are those that the next one starts from.
+    for _ in range(judge.substeps):
+        mujoco.mj_step2(model, data)
+        mujoco.mj_step1(model, data)
+    return data.qpos.copy()
 
 
 def touching(judge: Judge, data: np.ndarray) -> np.ndarray:
@@ -380,10 +459,41 @@ def touching(judge: Judge, data: np.ndarray) -> np.ndarray:
     return found
 
 
-def read_infrared(
-    judge: Judge, data: np.ndarray, pose: np.ndarray, obstacle: np.ndarray
-) -> np.ndarray:
-    """Reads the infrared sensors by MuJoCo's rays.
+def look(
+    judge: Judge,
+    data: np.ndarray,
+    factors: Factors,
+    pose: np.ndarray,
+    target: np.ndarray,
+    obstacle: np.ndarray,
+) -> Sight:
+    """Finds out what there is to be sensed.
+
+    Args:
+        judge: What the arenas share.
+        data: [A] of `MjData`, positions up to date.
+        factors: [A] of the episodes.
+        pose: [A, R, 3] x (m), y (m), yaw (rad).
+        target: [A, R, 2] x (m), y (m).
+        obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+
+    Returns:
+        What the sensors have before them.
+    """
+    ray, geom = cast_rays(judge, data, pose, obstacle, senses.mount(factors))
+    shades = senses.reflectance(factors)
+    bright = None if shades is None else _brightness(judge, shades, geom)
+    return Sight(ray, bright, *observation.to_target(pose, target, np))
+
+
+def cast_rays(
+    judge: Judge,
+    data: np.ndarray,
+    pose: np.ndarray,
+    obstacle: np.ndarray,
+    mount: infrared.Mount | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Casts the infrared sensors' rays by MuJoCo.
 
     A ray that starts inside something reads 0. MuJoCo reports where such a ray leaves, on a face
     whose normal points along it; so of each sensor two rays are cast, ahead and back, and the
@@ -395,30 +505,47 @@ def read_infrared(
         data: [A] of `MjData`, positions up to date.
         pose: [A, R, 3] x (m), y (m), yaw (rad).
         obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+        mount: How far off the sensors sit.
 
     Returns:
-        [A, R, K] distance from the sensor's origin to the nearest surface, m, 0..sensor_range.
+        [A, R, K] distance from the sensor's origin to the nearest surface, m, 0 to the reach of
+        the electronics; and the geom that is there, -1 where nothing is.
     """
-    limit = judge.config.task.sensor_range
-    origin, direction = infrared.rays(pose, np)
+    limit = judge.electronics.reach
+    origin, direction = infrared.rays(pose, np, mount)
     near = _near(judge, origin + 0.5 * limit * direction, pose[..., :2], obstacle)
+    arena, robot, _ = np.nonzero(near)
     origin, direction = origin[near], direction[near]
     flat = np.zeros((len(origin), 1))
     origin = np.concatenate([origin, flat + epuck.SENSOR_HEIGHT], axis=-1)
     toward = np.concatenate([direction, flat, -direction, flat], axis=-1)
     distance, normal = np.zeros((len(origin), 2)), np.zeros_like(toward)
-    geom = np.empty(2, np.int32)
-    cast, far = partial(mujoco.mj_multiRay, judge.model), mujoco.mjMAXVAL
-    arena, robot, _ = np.nonzero(near)
+    met = np.full((len(origin), 2), -1, np.int32)
+    cast_one, far = partial(mujoco.mj_multiRay, judge.model), mujoco.mjMAXVAL
     body = judge.ids.hull_body[robot].tolist()
-    rays = zip(data[arena], body, origin, toward, distance, normal, strict=True)
-    for where, me, start, ways, reach, face in rays:
-        cast(where, start, ways, _RAY_GROUPS, True, me, geom, reach, face, 2, far)
+    rays = zip(data[arena], body, origin, toward, met, distance, normal, strict=True)
+    for where, me, start, ways, geom, reach, face in rays:
+        cast_one(where, start, ways, _RAY_GROUPS, True, me, geom, reach, face, 2, far)
     leaves = (normal * toward).reshape(-1, 2, 3).sum(axis=-1) > 0.0
     ahead = np.where(distance[:, 0] < 0.0, limit, distance[:, 0])  # -1: nothing there
-    seen = np.full(near.shape, limit)
+    seen, geoms = np.full(near.shape, limit), np.full(near.shape, -1)
     seen[near] = np.where(leaves.any(axis=-1), 0.0, np.minimum(ahead, limit))
-    return seen
+    geoms[near] = met[:, 0]
+    return seen, geoms
+
+
+def _brightness(judge: Judge, shades: infrared.Reflectance, geom: np.ndarray) -> np.ndarray:
+    """Reflectance [A, R, K] of the geoms that rays meet; 1 of nothing."""
+    model, table = judge.model, np.ones((len(geom), judge.model.ngeom + 1))  # the last: nothing
+    walls = np.flatnonzero(model.body_mocapid[model.geom_bodyid] >= 0)
+    if shades.wall is not None:
+        table[:, walls] = shades.wall[:, None]
+    if shades.obstacle is not None or shades.wall is not None:
+        table[:, judge.ids.obstacle_geom] = 1.0 if shades.obstacle is None else shades.obstacle
+    if shades.robot is not None:
+        hulls = [model.geom(f"robot{i}_body").id for i in range(judge.spacing.robots)]
+        table[:, hulls] = shades.robot
+    return np.take_along_axis(table, geom.reshape(len(geom), -1), axis=1).reshape(geom.shape)
 
 
 def _near(judge: Judge, middle: np.ndarray, place: np.ndarray, obstacle: np.ndarray) -> np.ndarray:
@@ -441,7 +568,7 @@ def _near(judge: Judge, middle: np.ndarray, place: np.ndarray, obstacle: np.ndar
     boxes -= np.linalg.norm(obstacle[:, None, None, :, 3:], axis=-1)
     wall = 0.5 * judge.stage.side - np.abs(middle).max(axis=-1)
     things = [np.where(myself, np.inf, robots), boxes, wall[..., None]]
-    radius = 0.5 * judge.config.task.sensor_range
+    radius = 0.5 * judge.electronics.reach
     return np.concatenate(things, axis=-1).min(axis=-1) <= radius
 
 
@@ -477,6 +604,7 @@ def evaluate(
         "episodes": config.episodes,
         "engine": config.engine,
         "robot": config.robot.body,
+        "realism": config.realism.name,
         "stage": config.stage.name,
         "steps": config.steps,
         "seed": config.seed,

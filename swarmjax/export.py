@@ -41,15 +41,12 @@ def policy_arrays(leaves: Leaves) -> dict[str, np.ndarray]:
 def policy_meta(trained: TrainConfig, update: int) -> dict:
     """Describes a policy: its layout with units, the config it was trained with, versions."""
     robot = trained.robot
+    encoding = config.encoding(trained.task, trained.realism)
     return {
         "policy": trained.algo.policy,
         "learners": trained.learners,
         "activation": trained.algo.activation,
-        "observation": {
-            "names": list(observation.NAMES),
-            "units": list(observation.UNITS),
-            "limit": ppo.OBSERVATION_LIMIT,
-        },
+        "observation": observation.describe(encoding) | {"limit": ppo.OBSERVATION_LIMIT},
         "action": {
             "names": ["speed", "turn_rate"],
             "units": ["m/s", "rad/s"],

@@ -89,7 +89,7 @@ def init(program: Program, schedule: Schedule) -> TrainState:
     )(jax.random.split(learner_key, config.learners))
     return TrainState(
         learners=learners,
-        arenas=starts.state,
+        arenas=starts,
         curriculum=curriculum,
         key=run_key,
         update=jnp.zeros((), jnp.int32),

@@ -6,7 +6,8 @@ the width of a hidden layer. `meta` is a string of JSON that says what the numbe
     actor/hidden_{i}/kernel [L, in, H]    actor/hidden_{i}/bias [L, H]    i = 0, 1, ...
     actor/mean/kernel [L, H, U]           actor/mean/bias [L, U]
     actor/log_std [L, U]                  normalizer/mean, normalizer/std [L, O]
-    meta: format, policy, learners, activation, observation {names, units, limit},
+    meta: format, policy, learners, activation,
+          observation {names, encoding, units, offset, scale, limit},
           action {names, units, low, high}, config, versions, update, digest
 """
 
@@ -20,13 +21,14 @@ import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any, Literal, NamedTuple, TypeGuard
 
 import numpy as np
 
 FORMAT = 1
 ACTION_NAMES = ("speed", "turn_rate")
 ACTION_UNITS = ("m/s", "rad/s")
+ENCODINGS = ("metric", "webots")
 
 _DTYPE = np.dtype("<f4")
 _META = {  # what `meta` holds, and as which type of JSON
@@ -100,6 +102,11 @@ class Policy:
         return self.meta["digest"]
 
     @property
+    def encoding(self) -> Literal["metric", "webots"]:
+        """How the robot's electronics put its observation together, `metric` or `webots`."""
+        return self.meta["observation"]["encoding"]
+
+    @property
     def max_speed(self) -> float:
         """Upper end of the commanded speed, m/s; the lower end is 0."""
         return float(self.meta["action"]["high"][0])
@@ -134,7 +141,8 @@ def mean_action(policy: Policy, observation: np.ndarray) -> np.ndarray:
 
     Args:
         policy: What `load` returned.
-        observation: [..., R, O], raw, in the order and units of the policy's `observation`.
+        observation: [..., R, O], (quantity - offset) / scale in the order of the policy's
+            `observation`, whose units are those of the quantities.
 
     Returns:
         The mean of the action, [..., R, U], float32 and unbounded; -1..1 spans the command's
@@ -324,10 +332,26 @@ def _check_observation(layout: Mapping[str, Any]) -> int:
             f"meta.observation.units has {len(units)} entries: expected {len(names)}, "
             "as many as names."
         )
+    encoding = layout.get("encoding")
+    if encoding not in ENCODINGS:
+        raise PolicyError(
+            f"meta.observation.encoding is {_show(encoding)}: expected {' or '.join(ENCODINGS)}."
+        )
+    for key in ("offset", "scale"):
+        _check_numbers(key, layout.get(key), len(names))
+    if 0.0 in layout["scale"]:
+        raise PolicyError("meta.observation.scale holds 0: it divides.")
     limit = layout.get("limit")
     if not _is_number(limit) or limit <= 0:
         raise PolicyError(f"meta.observation.limit is {_show(limit)}: expected a number above 0.")
     return len(names)
+
+
+def _check_numbers(key: str, value: object, size: int) -> None:
+    if not isinstance(value, list | tuple) or len(value) != size or not all(map(_is_number, value)):
+        raise PolicyError(
+            f"meta.observation.{key} is {_show(value)}: expected {size} finite numbers."
+        )
 
 
 def _strings(layout: Mapping[str, Any], key: str) -> list[str]:

@@ -24,20 +24,6 @@ from swarmjax.task.stage import Stage
 ACTION_SIZE = 2
 
 
-class Starts(NamedTuple):
-    """An episode that waits for each arena: its level is drawn once a rollout, not at every step.
-
-    An arena that ends two episodes in one rollout begins the second and third on the same level.
-
-    Attributes:
-      state: [A], packed.
-      observation: [A, R, O].
-    """
-
-    state: EnvState
-    observation: Array
-
-
 class Trajectory(NamedTuple):
     """What the learners did and what came of it, [T, L, A, N, ...].
 
@@ -125,8 +111,11 @@ def to_arenas(x: Array) -> Array:
     return jnp.moveaxis(x[:, :, 0], 0, 1)
 
 
-def draw_starts(world: World, stages: Stage, index: Array, cohort: Array, key: Array) -> Starts:
-    """Draws a fresh level for every arena.
+def draw_starts(world: World, stages: Stage, index: Array, cohort: Array, key: Array) -> EnvState:
+    """Draws a fresh level for every arena, an episode that waits until the arena is free.
+
+    It is drawn once a rollout, not at every step: an arena that ends two episodes in one rollout
+    begins the second and third on the same level.
 
     Args:
       world: the compiled environment.
@@ -136,20 +125,20 @@ def draw_starts(world: World, stages: Stage, index: Array, cohort: Array, key: A
       key: random key, consumed.
 
     Returns:
-      The episodes that wait.
+      [A] the episodes that wait, packed.
     """
     uniforms = jax.random.uniform(key, (*index.shape, level.uniform_count(world.spacing)))
     stages = jax.tree.map(jnp.asarray, stages)
 
-    def start(uniform: Array, i: Array) -> tuple[EnvState, Array]:
+    def start(uniform: Array, i: Array) -> EnvState:
         drawn = level.sample(uniform, task_stage.select(stages, i), world.spacing, jnp)
         return env.reset(world, drawn, i, cohort)
 
-    return Starts(*jax.vmap(start)(uniforms, index))
+    return jax.vmap(start)(uniforms, index)
 
 
 def collect(
-    world: World, learners: LearnerState, arenas: EnvState, starts: Starts, key: Array
+    world: World, learners: LearnerState, arenas: EnvState, starts: EnvState, key: Array
 ) -> tuple[EnvState, Trajectory, Ended]:
     """Drives all arenas for one rollout; an arena whose episode ends takes the one that waits.
 
@@ -157,7 +146,7 @@ def collect(
       world: the compiled environment.
       learners: [L].
       arenas: [A], packed.
-      starts: [A] episodes that wait.
+      starts: [A] episodes that wait, packed.
       key: random key, consumed.
 
     Returns:
@@ -167,10 +156,9 @@ def collect(
     step = functools.partial(_step, world, learners, starts, start_value)
     unpack = functools.partial(physics.unpack, world.physics)
     arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
-    seen = jax.vmap(functools.partial(env.observe, world))(arenas)
-    carry = (arenas, seen, _values(world, learners, seen))
+    carry = (arenas, _values(world, learners, arenas.observation))
     keys = jax.random.split(key, world.config.algo.rollout)
-    (arenas, _, _), (trajectory, ended) = jax.lax.scan(step, carry, keys)
+    (arenas, _), (trajectory, ended) = jax.lax.scan(step, carry, keys)
     packed = jax.vmap(physics.pack)(arenas.sim)
     return replace(arenas, sim=packed), trajectory, ended
 
@@ -210,21 +198,21 @@ def batch(trajectory: Trajectory, *, discount: float, gae_lambda: float) -> Batc
     )
 
 
-_Carry = tuple[EnvState, Array, Array]
+_Carry = tuple[EnvState, Array]
 
 
 def _step(
     world: World,
     learners: LearnerState,
-    starts: Starts,
+    starts: EnvState,
     start_value: Array,
     carry: _Carry,
     key: Array,
 ) -> tuple[_Carry, tuple[Trajectory, Ended]]:
     """One control step of all arenas."""
-    arenas, seen, value = carry
+    arenas, value = carry
     count = value.shape[0]
-    mine = to_learners(seen, count)
+    mine = to_learners(arenas.observation, count)
     noise = jax.random.normal(key, (*mine.shape[:-1], ACTION_SIZE))
     config = world.config.algo
     action, log_prob = jax.vmap(lambda learner, o, n: ppo.act(learner, config, o, n))(
@@ -233,8 +221,7 @@ def _step(
     arenas, came = jax.vmap(functools.partial(env.step, world))(arenas, to_arenas(action))
     next_value = _values(world, learners, came.observation)
     ended = _ended(arenas, came)
-    arenas = restart(arenas, starts.state, came.done)
-    seen = _pick(came.done, starts.observation, came.observation)
+    arenas = restart(arenas, starts, came.done)
     over = jnp.broadcast_to(came.done[None, :, None], next_value.shape)
     transition = Trajectory(
         observation=mine,
@@ -247,7 +234,7 @@ def _step(
         truncated=to_learners(came.truncated, count),
         valid=to_learners(came.valid, count),
     )
-    return (arenas, seen, jnp.where(over, start_value, next_value)), (transition, ended)
+    return (arenas, jnp.where(over, start_value, next_value)), (transition, ended)
 
 
 def _values(world: World, learners: LearnerState, seen: Array) -> Array:

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from swarmjax import curriculum, loop, recorder
+from swarmjax import config, curriculum, loop, recorder
 from swarmjax.checkpoint import Checkpoints
 from swarmjax.curriculum import Schedule
 from swarmjax.display import Display, summarize
@@ -253,10 +253,11 @@ def _speeds(program: Program, rows: list[dict], seconds: float) -> dict[str, flo
     """Speeds of a call: arena, robot and physics steps, and transitions, a second."""
     settings = program.config
     arena_steps = len(rows) * settings.arenas * settings.algo.rollout
+    substeps = config.substeps(settings.robot, settings.sim.substeps)
     return {
         "arena_steps_per_s": arena_steps / seconds,
         "robot_steps_per_s": settings.algo.rollout * sum(row["robots"] for row in rows) / seconds,
-        "physics_steps_per_s": arena_steps * settings.sim.substeps / seconds,
+        "physics_steps_per_s": arena_steps * substeps / seconds,
         "transitions_per_s": sum(row["transitions"] for row in rows) / seconds,
     }
 

@@ -56,11 +56,7 @@ def _policy(path: Path, drive: tuple = STEER, learners: int = 1, **meta: Any) ->
         "policy": "shared",
         "learners": learners,
         "activation": "relu",
-        "observation": {
-            "names": list(observation.NAMES),
-            "units": list(observation.UNITS),
-            "limit": 10.0,
-        },
+        "observation": observation.describe("metric") | {"limit": 10.0},
         "action": {
             "names": ["speed", "turn_rate"],
             "units": ["m/s", "rad/s"],
@@ -102,6 +98,7 @@ def _start(
                 target=start[:, :2] + 100 * ahead if target is None else np.array(target),
                 obstacle_present=np.ones(obstacles, bool),
                 obstacle=np.array(obstacle or np.zeros((0, 5)), np.float32),
+                seed=np.uint32(0),
             )
         ],
     )
@@ -222,7 +219,7 @@ def test_a_control_step_is_that_many_steps_of_mujoco(tmp_path: Path) -> None:
     pose = [[-0.1, 0.02, 0.1], [0.1, 0.0, 2.5]]
     box = [[0.0, 0.15, 0.3, 0.05, 0.05]]
     arenas = _run(judge, _start(judge, pose, obstacle=box), 50)
-    data = evaluate.place(judge, np.array(pose, np.float32), np.array(box, np.float32))
+    data = evaluate.place(judge, judge.model, np.array(pose, np.float32), np.array(box, np.float32))
     data.ctrl = [SPEED, 0.0, 0.0] * 2
     # Float32 rounds the policy's action, which contacts do not magnify here.
     mujoco.mj_step(judge.model, data, 150)
@@ -239,7 +236,7 @@ def test_touching_is_a_gap_below_zero(tmp_path: Path) -> None:
     box[..., 2] *= 8.0
     box[..., 3:] = 0.05
     data = np.empty(count, object)
-    data[:] = [evaluate.place(judge, *each) for each in zip(pose, box, strict=True)]
+    data[:] = [evaluate.place(judge, judge.model, *each) for each in zip(pose, box, strict=True)]
     gap = np.stack(
         [
             gaps.gaps(p.astype(float), judge.stage.side, b.astype(float), 0.037, np)
@@ -261,7 +258,8 @@ def test_the_judge_counts_what_the_training_environment_counts(tmp_path: Path) -
     sim = SimConfig(impl="jax", max_robots=3, max_obstacles=1)
     world = env.load(TrainConfig(stage=(stage,), sim=sim))
     zero = jnp.zeros((), jnp.int32)
-    state, seen = env.reset(world, jax.tree.map(jnp.asarray, drawn), zero, zero)
+    state = env.reset(world, jax.tree.map(jnp.asarray, drawn), zero, zero)
+    seen = np.asarray(state.observation)
     state = dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
     step = jax.jit(lambda state, action: env.step(world, state, action))
     # Float32 against double along the way; the paths hardly magnify it, contacts included.
@@ -470,7 +468,7 @@ def test_the_command_refuses_in_one_sentence(
 ) -> None:
     _policy(tmp_path / "policy.npz")
     _policy(tmp_path / "three.npz", learners=3, policy="independent")
-    layout = {"names": ["a"] * observation.SIZE, "units": ["m"] * observation.SIZE, "limit": 10.0}
+    layout = observation.describe("metric") | {"names": ["a"] * observation.SIZE, "limit": 10.0}
     _policy(tmp_path / "other.npz", observation=layout)
     words = [word.format(tmp=tmp_path) for word in words]
     assert _command(monkeypatch, *words, "workers=1", "episodes=1") == 2

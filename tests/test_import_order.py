@@ -10,7 +10,8 @@ import swarmjax
 ROOT = Path(swarmjax.__file__).parent
 # A module imports from rows above its own, and a package from itself.
 LAYERS = (
-    {"epuck", "policy"},
+    {"epuck", "policy", "settings"},
+    {"compose"},
     {"config"},
     {"sim"},
     {"task"},
@@ -23,7 +24,7 @@ LAYERS = (
     {"train", "evaluate"},
 )
 # These stand alone: the learner knows nothing of robots, a policy file needs only NumPy.
-ONLY = {"ppo": {"config"}, "policy": set(), "epuck": set()}
+ONLY = {"ppo": {"config"}, "policy": set(), "epuck": set(), "settings": set()}
 FILES = sorted(ROOT.rglob("*.py"))
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 

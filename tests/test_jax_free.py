@@ -29,11 +29,7 @@ def _write_policy(path: Path) -> None:
         "policy": "shared",
         "learners": 1,
         "activation": "tanh",
-        "observation": {
-            "names": observation.NAMES,
-            "units": observation.UNITS,
-            "limit": 10.0,
-        },
+        "observation": observation.describe("metric") | {"limit": 10.0},
         "action": {
             "names": policy.ACTION_NAMES,
             "units": policy.ACTION_UNITS,

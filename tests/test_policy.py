@@ -50,7 +50,14 @@ def _meta(**changes: Any) -> dict[str, Any]:
         "policy": "shared",
         "learners": 1,
         "activation": "tanh",
-        "observation": {"names": list("abcde"), "units": ["m"] * OBSERVATIONS, "limit": 10.0},
+        "observation": {
+            "names": list("abcde"),
+            "encoding": "metric",
+            "units": ["m"] * OBSERVATIONS,
+            "offset": [0.0] * OBSERVATIONS,
+            "scale": [1.0] * OBSERVATIONS,
+            "limit": 10.0,
+        },
         "action": {
             "names": ["speed", "turn_rate"],
             "units": ["m/s", "rad/s"],
@@ -323,6 +330,21 @@ _OBSERVATION = _meta()["observation"]
             _arrays(),
             {"observation": _OBSERVATION | {"units": ["m"]}},
             r"meta.observation.units has 1 entries: expected 5",
+        ),
+        (
+            _arrays(),
+            {"observation": _OBSERVATION | {"encoding": "feet"}},
+            r'meta.observation.encoding is "feet": expected metric or webots',
+        ),
+        (
+            _arrays(),
+            {"observation": _OBSERVATION | {"offset": [0.0]}},
+            r"meta.observation.offset is \[0.0\]: expected 5 finite numbers",
+        ),
+        (
+            _arrays(),
+            {"observation": _OBSERVATION | {"scale": [1.0, 0.0, 1.0, 1.0, 1.0]}},
+            r"meta.observation.scale holds 0: it divides",
         ),
         (
             _arrays(),

@@ -14,7 +14,7 @@ from swarmjax import rollout
 from swarmjax.ppo import gae
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
-from swarmjax.rollout import Ended, Starts, Trajectory
+from swarmjax.rollout import Ended, Trajectory
 from swarmjax.sim import gaps, physics
 from swarmjax.task import env, observation
 from swarmjax.task import stage as task_stage
@@ -22,7 +22,7 @@ from swarmjax.task.env import EnvState, TimeStep, World
 from swarmjax.task.level import Level
 
 ArenaStep = Callable[[EnvState, jax.Array], tuple[EnvState, TimeStep]]
-Draw = Callable[[int, int], Starts]
+Draw = Callable[[int, int], EnvState]
 
 T, ARENAS, ROBOTS, LIMIT = 8, 8, 3, 16  # of the tiny configuration
 HULL, RANGE = 0.037, 0.04  # m
@@ -36,7 +36,7 @@ class Run(NamedTuple):
 
     learners: LearnerState
     before: EnvState
-    starts: Starts
+    starts: EnvState
     after: EnvState
     trajectory: Trajectory
     ended: Ended
@@ -73,7 +73,7 @@ def draw(tiny_world: World) -> Draw:
 @pytest.fixture(scope="module")
 def before(tiny_world: World, draw: Draw) -> EnvState:
     """Arenas in the middle of their episodes; in one all arrive, one drives into a wall."""
-    drawn = draw(0, NOW).state
+    drawn = draw(0, NOW)
     pose, target = drawn.level.start[ARRIVES], drawn.level.target
     toward = jnp.stack([jnp.cos(pose[:, 2]), jnp.sin(pose[:, 2])], axis=-1)
     target = target.at[ARRIVES].set(pose[:, :2] + 0.053 * toward)
@@ -81,7 +81,7 @@ def before(tiny_world: World, draw: Draw) -> EnvState:
     start = drawn.level.start.at[BUMPS, 0].set(at_wall)
     level = drawn.level._replace(start=start, target=target)
     reset = jax.jit(jax.vmap(functools.partial(env.reset, tiny_world)))
-    state, _ = reset(level, drawn.stage, drawn.cohort)
+    state = reset(level, drawn.stage, drawn.cohort)
     sim = state.sim._replace(qvel=state.sim.qvel.at[BROKEN, 1].set(jnp.inf))
     return dataclasses.replace(state, sim=sim, clock=jnp.array(CLOCK, jnp.int32))
 
@@ -109,15 +109,15 @@ def _where(done: jax.Array, yes: jax.Array, no: jax.Array) -> jax.Array:
 
 @pytest.fixture(scope="module")
 def replay(tiny_world: World, run: Run, tiny_step: ArenaStep) -> Replay:
-    state, waiting = _unpack(tiny_world, run.before), _unpack(tiny_world, run.starts.state)
-    seen = jax.jit(jax.vmap(functools.partial(env.observe, tiny_world)))(state)
+    state, waiting = _unpack(tiny_world, run.before), _unpack(tiny_world, run.starts)
     rows = []
     for action in run.trajectory.action[:, 0]:  # one learner
+        seen = state.observation
         state, came = tiny_step(state, jnp.asarray(action))
-        rows.append((came, seen, jax.vmap(physics.poses)(state.sim), came.done))
+        pose = jax.vmap(functools.partial(physics.poses, tiny_world.physics))(state.sim)
+        rows.append((came, seen, pose, came.done))
         # All of the waiting episode, and not only what is packed of it.
         state = jax.tree.map(functools.partial(_where, came.done), waiting, state)
-        seen = _where(came.done, run.starts.observation, came.observation)
     came, observed, pose, fresh = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
     return Replay(came, observed, pose, fresh, state)
 
@@ -195,8 +195,7 @@ def test_batch_groups_the_samples_of_an_arena(count: int, robots: int) -> None:
 
 
 def test_starts_are_of_the_stage_they_are_asked_for(draw: Draw) -> None:
-    starts = draw(3, NEXT)
-    state = starts.state
+    state = draw(3, NEXT)
     assert state.stage.tolist() == [0, 1] * 4
     assert state.cohort.tolist() == [NEXT] * ARENAS
     # The first stage has 2 robots in 0.5 m, the second 3 and 2 obstacles in 0.8 m.
@@ -208,7 +207,7 @@ def test_starts_are_of_the_stage_they_are_asked_for(draw: Draw) -> None:
     pose = np.asarray(state.sim.qpos).reshape(ARENAS, ROBOTS, 3)
     np.testing.assert_array_equal(pose, state.level.start)
     assert not state.sim.qvel.any()
-    jax.tree.map(np.testing.assert_array_equal, draw(3, NEXT), starts)
+    jax.tree.map(np.testing.assert_array_equal, draw(3, NEXT), state)
 
 
 def test_restart_puts_the_waiting_episode_into_arenas_that_are_over(
@@ -216,7 +215,7 @@ def test_restart_puts_the_waiting_episode_into_arenas_that_are_over(
 ) -> None:
     running = _unpack(tiny_world, run.before)
     done = jnp.arange(ARENAS) % 3 == 0
-    found = rollout.restart(running, run.starts.state, done)
+    found = rollout.restart(running, run.starts, done)
     packed = dataclasses.replace(found, sim=physics.pack(found.sim))
 
     def check(mine: jax.Array, waiting: jax.Array, before: jax.Array) -> None:
@@ -224,7 +223,7 @@ def test_restart_puts_the_waiting_episode_into_arenas_that_are_over(
             expected = waiting if arena in (0, 3, 6) else before
             np.testing.assert_array_equal(mine[arena], expected[arena])
 
-    jax.tree.map(check, packed, run.starts.state, run.before)
+    jax.tree.map(check, packed, run.starts, run.before)
 
 
 # --- the rollout against its replay
@@ -322,7 +321,7 @@ def _recount(run: Run, replay: Replay, arena: int) -> dict[int, dict[str, object
             "reward": pytest.approx(came.reward.sum(), abs=DRIFT),
             "broken": 0,
         }
-        begin, clock, cohort, level = end + 1, 0, NEXT, _at(run.starts.state.level, arena)
+        begin, clock, cohort, level = end + 1, 0, NEXT, _at(run.starts.level, arena)
     return found
 
 

@@ -65,16 +65,18 @@ def wheel_speeds(command: Array, drive: Drive, xp: Any) -> Array:
     return xp.clip(speeds / drive.wheel_radius, -drive.max_wheel_speed, drive.max_wheel_speed)
 
 
-def body_velocity(wheels: Array, drive: Drive, xp: Any) -> Array:
+def body_velocity(wheels: Array, wheel_radius: Array, track: Array, xp: Any) -> Array:
     """Velocity of the body that rolls on these wheels without slip.
 
     Args:
       wheels: [..., 2] left and right wheel speed, rad/s.
-      drive: the drive.
+      wheel_radius: [] or [..., 2] left and right, m.
+      track: [] or [...] between the points where the wheels touch the floor, m.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
       [..., 2] forward speed (m/s) and turn rate (rad/s).
     """
-    left, right = wheels[..., 0] * drive.wheel_radius, wheels[..., 1] * drive.wheel_radius
-    return xp.stack([0.5 * (left + right), (right - left) / drive.track], axis=-1)
+    rim = wheels * wheel_radius
+    left, right = rim[..., 0], rim[..., 1]
+    return xp.stack([0.5 * (left + right), (right - left) / track], axis=-1)

@@ -12,14 +12,16 @@ import numpy as np
 
 from swarmjax import epuck
 from swarmjax.config import RobotConfig
+from swarmjax.sim.body import Body, Rows, find_rows
+from swarmjax.sim.geom import add_geom, add_ray_hull
+from swarmjax.sim.planar import PLANAR
+from swarmjax.sim.wheeled import WHEELED
 
 WALL_HALF_THICKNESS = 0.05  # m; a robot sinks 4 mm into a wall at most, so none gets through
 WALL_HALF_LENGTH = 2.5  # m; longer than half the largest arena (4 m)
 HALF_HEIGHT = 0.05  # m; walls and obstacles are 0.1 m high (Webots RectangleArena)
-# Contacts are between a sphere at half the obstacles' height and upright faces, which is exactly
-# a disc of the hull's radius in the plane, at one contact point a pair instead of a capsule's two.
-CONTACT_HEIGHT = HALF_HEIGHT
 WALLS = 4
+BODIES: dict[str, Body] = {"planar": PLANAR, "wheeled": WHEELED}
 
 
 class ArenaSize(NamedTuple):
@@ -43,17 +45,19 @@ class Ids(NamedTuple):
       fixture_mocap: [M + 4] rows of `mocap_pos`: obstacles, then walls east, north, west, south.
       obstacle_geom: [M] rows of `geom_size`.
       hull_body: [R] bodies, for `bodyexclude` of a ray.
+      robots: rows of the robots.
     """
 
     fixture_mocap: np.ndarray
     obstacle_geom: np.ndarray
     hull_body: np.ndarray
+    robots: Rows
 
 
 def build(
     robot: RobotConfig, size: ArenaSize, timestep: float, *, ray_geoms: bool = False
 ) -> mujoco.MjSpec:
-    """Describes one arena with `planar` robots.
+    """Describes one arena.
 
     Args:
       robot: the robot's numbers.
@@ -62,12 +66,14 @@ def build(
       ray_geoms: add the hull as the cylinder that a ray sees; the analytic sensors need none.
 
     Returns:
-      The spec, ready to compile: qpos and qvel are [x, y, yaw] of each robot in turn, ctrl is
-      [forward speed, lateral speed, turn rate] of each robot in turn.
+      The spec, ready to compile: qpos, qvel and ctrl hold each robot in turn, as its body says.
     """
     spec = mujoco.MjSpec()
     _set_options(spec, timestep)
-    hulls = [_add_robot(spec, i, robot, timestep, ray_geoms) for i in range(size.robots)]
+    names = [f"robot{i}" for i in range(size.robots)]
+    hulls = [BODIES[robot.body].add(spec, name, robot, timestep) for name in names]
+    for name in names if ray_geoms else ():
+        add_ray_hull(spec.body(name), name, robot.hull_radius)
     obstacles = [_add_box(spec, f"obstacle{i}", size.largest_half) for i in range(size.obstacles)]
     walls = [_add_box(spec, f"wall{i}", WALL_HALF_LENGTH) for i in range(WALLS)]
     solid = itertools.product(hulls, obstacles + walls)
@@ -85,6 +91,7 @@ def ids(model: mujoco.MjModel, size: ArenaSize) -> Ids:
         fixture_mocap=np.array([model.body_mocapid[b.id] for b in obstacles + walls], np.int32),
         obstacle_geom=np.array([model.body_geomadr[b.id] for b in obstacles], np.int32),
         hull_body=np.array([model.body(f"robot{i}").id for i in range(size.robots)], np.int32),
+        robots=find_rows(model, size.robots),
     )
 
 
@@ -110,90 +117,17 @@ def fixture_poses(side: Any, obstacle: Any, xp: Any) -> tuple[Any, Any]:
 
 
 def _set_options(spec: mujoco.MjSpec, timestep: float) -> None:
-    """Euler and no gravity: three planar joints carry each robot, the servo is discrete."""
+    """Euler: the servos are discrete. Gravity acts along no joint of a planar robot."""
     spec.option.timestep = timestep
-    spec.option.gravity = [0.0, 0.0, 0.0]
+    spec.option.gravity = [0.0, 0.0, -epuck.GRAVITY]
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     # Nothing is damped, and MJX pays a factorisation a step for asking.
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-
-
-def _add_robot(
-    spec: mujoco.MjSpec, index: int, robot: RobotConfig, timestep: float, ray_geoms: bool
-) -> str:
-    """Adds one robot and returns the name of its contact geom."""
-    name = f"robot{index}"
-    body = spec.worldbody.add_body(name=name)
-    body.explicitinertial = True
-    body.mass = robot.mass
-    # The first two never turn; MuJoCo asks that no axis exceed the other two together.
-    body.inertia = [robot.yaw_inertia] * 3
-    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
-    body.add_joint(name=f"{name}_x", type=slide, axis=[1, 0, 0])
-    body.add_joint(name=f"{name}_y", type=slide, axis=[0, 1, 0])
-    body.add_joint(name=f"{name}_yaw", type=hinge, axis=[0, 0, 1])
-    sphere = mujoco.mjtGeom.mjGEOM_SPHERE
-    _add_geom(body, f"{name}_hull", sphere, [robot.hull_radius, 0, 0], CONTACT_HEIGHT, group=3)
-    if ray_geoms:
-        cylinder = mujoco.mjtGeom.mjGEOM_CYLINDER
-        half = 0.5 * (epuck.HULL_TOP - epuck.HULL_BOTTOM)
-        middle = 0.5 * (epuck.HULL_TOP + epuck.HULL_BOTTOM)
-        _add_geom(body, f"{name}_body", cylinder, [robot.hull_radius, half, 0], middle)
-    body.add_site(name=f"{name}_axle")
-    _add_servos(spec, name, robot, timestep)
-    return f"{name}_hull"
-
-
-def _add_servos(spec: mujoco.MjSpec, name: str, robot: RobotConfig, timestep: float) -> None:
-    """Adds the servos of the forward, lateral and turning velocity of a robot.
-
-    Gains are deadbeat: mass / timestep takes the velocity to its set point in one Euler step.
-    The force limits are what the wheels can pass to the floor (Coulomb): mu m g along either
-    axis, and mu m g times half the track as a torque.
-    """
-    grip = robot.friction * robot.mass * epuck.GRAVITY
-    servos = (
-        ("forward", 0, robot.mass, grip),
-        ("lateral", 1, robot.mass, grip),
-        ("turn", 5, robot.yaw_inertia, grip * 0.5 * robot.track),
-    )
-    for label, axis, inertia, limit in servos:
-        actuator = spec.add_actuator(
-            name=f"{name}_{label}",
-            trntype=mujoco.mjtTrn.mjTRN_SITE,
-            target=f"{name}_axle",
-            gear=np.eye(6)[axis],
-            forcelimited=True,
-            forcerange=[-limit, limit],
-        )
-        actuator.set_to_velocity(inertia / timestep)
 
 
 def _add_box(spec: mujoco.MjSpec, name: str, half: float) -> str:
     """Adds a box that is moved by its mocap pose and returns the name of its geom."""
     body = spec.worldbody.add_body(name=name, mocap=True)
     thickness = WALL_HALF_THICKNESS if name.startswith("wall") else half
-    box = mujoco.mjtGeom.mjGEOM_BOX
-    _add_geom(body, f"{name}_box", box, [thickness, half, HALF_HEIGHT], HALF_HEIGHT)
-    return f"{name}_box"
-
-
-def _add_geom(
-    body: mujoco.MjsBody,
-    name: str,
-    kind: mujoco.mjtGeom,
-    size: list[float],
-    height: float,
-    group: int = 0,
-) -> None:
-    """Adds a massless geom that touches nothing but through an explicit pair."""
-    body.add_geom(
-        name=name,
-        type=kind,
-        size=size,
-        pos=[0.0, 0.0, height],
-        contype=0,
-        conaffinity=0,
-        mass=0.0,
-        group=group,
-    )
+    box, size = mujoco.mjtGeom.mjGEOM_BOX, [thickness, half, HALF_HEIGHT]
+    return add_geom(body, f"{name}_box", box, size, [0.0, 0.0, HALF_HEIGHT])

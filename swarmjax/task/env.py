@@ -12,13 +12,17 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from swarmjax.config import TrainConfig
+from swarmjax.config import TrainConfig, substeps
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps as sim_gaps
 from swarmjax.sim import infrared, model, physics
-from swarmjax.task import observation, reward
+from swarmjax.sim.body import Chassis
+from swarmjax.task import factors as task_factors
+from swarmjax.task import observation, reward, senses
 from swarmjax.task import stage as task_stage
+from swarmjax.task.factors import Factors
 from swarmjax.task.level import Level, Spacing
+from swarmjax.task.senses import Electronics, Memory, Sight
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,12 +34,14 @@ class World:
       physics: the compiled side of the physics.
       spacing: sizes that levels are drawn with.
       drive: the robot's drive.
+      electronics: what lies between policy and world.
     """
 
     config: TrainConfig
     physics: physics.Physics
     spacing: Spacing
     drive: sim_drive.Drive
+    electronics: Electronics
 
 
 class Episode(NamedTuple):
@@ -62,6 +68,9 @@ class EnvState:
     Attributes:
       sim: `PhysicsState` at the edges of a rollout, `mjx.Data` inside.
       level: what the episode started from.
+      factors: what realism makes of the episode; they follow from the level's seed.
+      memory: what the robots' electronics carry along.
+      observation: [R, O] what the policy sees now.
       stage: [] index of the stage on which the episode began, int32.
       cohort: [] the curriculum's cohort in which it began, int32.
       clock: [] control steps since the start, int32.
@@ -73,6 +82,9 @@ class EnvState:
 
     sim: Any
     level: Level
+    factors: Factors
+    memory: Memory
+    observation: Array
     stage: Array
     cohort: Array
     clock: Array
@@ -116,24 +128,32 @@ def load(config: TrainConfig) -> World:
     Raises:
       ConfigError: if Warp is asked for and not installed.
     """
-    sim = config.sim
+    sim, count = config.sim, substeps(config.robot, config.sim.substeps)
     impl = physics.resolve_impl(sim.impl)
     largest = task_stage.largest_half(config.stage)
     size = model.ArenaSize(sim.max_robots, sim.max_obstacles, largest)
-    spec = model.build(config.robot, size, config.task.control_step / sim.substeps)
-    iterations, ls_iterations = physics.SOLVER_STEPS[impl]
+    robot = task_factors.largest(config.robot, config.realism)
+    spec = model.build(robot, size, config.task.control_step / count)
+    iterations, ls_iterations = physics.SOLVER_STEPS[config.robot.body, impl]
     spec.option.iterations = sim.iterations or iterations
     spec.option.ls_iterations = sim.ls_iterations or ls_iterations
     compiled = spec.compile()
-    ids = model.ids(compiled, size)
-    engine = physics.load(compiled, ids, impl=impl, arenas=config.arenas, substeps=sim.substeps)
+    engine = physics.load(
+        compiled,
+        model.ids(compiled, size),
+        config.robot,
+        impl=impl,
+        arenas=config.arenas,
+        substeps=count,
+    )
     spacing = Spacing(
         sim.max_robots, sim.max_obstacles, config.robot.hull_radius, config.task.target_radius
     )
-    return World(config, engine, spacing, sim_drive.from_config(config.robot))
+    electronics = senses.load(config.task, config.realism)
+    return World(config, engine, spacing, sim_drive.from_config(config.robot), electronics)
 
 
-def reset(world: World, level: Level, stage: Array, cohort: Array) -> tuple[EnvState, Array]:
+def reset(world: World, level: Level, stage: Array, cohort: Array) -> EnvState:
     """Starts an episode.
 
     Args:
@@ -143,43 +163,38 @@ def reset(world: World, level: Level, stage: Array, cohort: Array) -> tuple[EnvS
       cohort: [] the curriculum's cohort that the episode counts for.
 
     Returns:
-      The state, its `sim` packed, and the first observation [R, O].
+      The state, its `sim` packed.
     """
-    robots = level.present.shape[0]
-    distance, _ = observation.to_target(level.start, level.target, jnp)
-    state = EnvState(
-        sim=physics.rest(level.start.reshape(-1)),
+    robots, obstacles = level.present.shape[0], level.obstacle_present.shape[0]
+    realism, robot = world.config.realism, world.config.robot
+    factors = task_factors.draw(level.seed, realism, robot, robots, obstacles, jnp)
+    sight = _look(world, level.start, level, factors)
+    clock = jnp.zeros((), jnp.int32)
+    memory, seen = senses.begin(world.electronics, factors, sight, clock, jnp)
+    return EnvState(
+        sim=physics.rest(world.physics, level.start),
         level=level,
+        factors=factors,
+        memory=memory,
+        observation=seen,
         stage=jnp.asarray(stage, jnp.int32),
         cohort=jnp.asarray(cohort, jnp.int32),
-        clock=jnp.zeros((), jnp.int32),
+        clock=clock,
         arrived=jnp.zeros(robots, bool),
-        distance=distance,
+        distance=sight.distance,
         apart=jnp.full((robots, len(sim_gaps.KINDS)), sim_gaps.CONTACT_PAUSE),
-        episode=Episode(
-            reward=jnp.zeros(robots),
-            contacts=jnp.zeros((robots, len(sim_gaps.KINDS)), jnp.int32),
-            sensed=jnp.zeros(robots, jnp.int32),
-            moving=jnp.zeros(robots, jnp.int32),
-        ),
+        episode=_no_episode(robots),
     )
-    return state, observe(world, state)
 
 
-def observe(world: World, state: EnvState) -> Array:
-    """Observes an arena as it stands.
-
-    Args:
-      world: the compiled environment.
-      state: the arena.
-
-    Returns:
-      [R, O] in the order of `observation.NAMES`.
-    """
-    pose = physics.poses(state.sim)
-    distance, bearing = observation.to_target(pose, state.level.target, jnp)
-    seen = _infrared(world, pose, state.level)
-    return observation.observe(seen, distance, bearing, jnp)
+def _no_episode(robots: int) -> Episode:
+    """Returns the sums of an episode that has just begun."""
+    return Episode(
+        reward=jnp.zeros(robots),
+        contacts=jnp.zeros((robots, len(sim_gaps.KINDS)), jnp.int32),
+        sensed=jnp.zeros(robots, jnp.int32),
+        moving=jnp.zeros(robots, jnp.int32),
+    )
 
 
 def step(world: World, state: EnvState, action: Array) -> tuple[EnvState, TimeStep]:
@@ -195,10 +210,11 @@ def step(world: World, state: EnvState, action: Array) -> tuple[EnvState, TimeSt
     """
     chex.assert_shape(action, (state.level.present.shape[0], 2))
     active = state.level.present & ~state.arrived
-    data, pose, sound = _move(world, state, action, active)
-    seen = _infrared(world, pose, state.level)
-    distance, bearing = observation.to_target(pose, state.level.target, jnp)
-    arrives = active & (distance <= world.config.task.target_radius)
+    clock = state.clock + 1
+    data, memory, pose, sound = _move(world, state, action, active)
+    sight = _look(world, pose, state.level, state.factors)
+    memory, seen = senses.sense(world.electronics, memory, state.factors, sight, clock, jnp)
+    arrives = active & (sight.distance <= world.config.task.target_radius)
     gap = sim_gaps.gaps(
         pose, state.level.side, state.level.obstacle, world.config.robot.hull_radius, jnp
     )
@@ -206,8 +222,8 @@ def step(world: World, state: EnvState, action: Array) -> tuple[EnvState, TimeSt
     begins = begins & state.level.present[:, None]
     earned = reward.Step(
         state.distance,
-        distance,
-        seen,
+        sight.distance,
+        sight.ray,
         world.config.task.sensor_range,
         arrives,
         begins & active[:, None],
@@ -216,19 +232,20 @@ def step(world: World, state: EnvState, action: Array) -> tuple[EnvState, TimeSt
     gained = jnp.where(valid, reward.total(earned, world.config.task.reward), 0.0)
     episode = _tally(state.episode, gained, begins, earned, valid)
     arrived = state.arrived | arrives
-    clock = state.clock + 1
     timeout = clock >= world.config.task.step_limit
     new = replace(
         state,
         sim=data,
+        memory=memory,
+        observation=seen,
         clock=clock,
         arrived=arrived,
-        distance=distance,
+        distance=sight.distance,
         apart=apart,
         episode=episode,
     )
     return new, TimeStep(
-        observation=observation.observe(seen, distance, bearing, jnp),
+        observation=seen,
         reward=gained,
         terminated=arrives,
         truncated=active & ~arrives & (timeout | ~sound),
@@ -238,24 +255,39 @@ def step(world: World, state: EnvState, action: Array) -> tuple[EnvState, TimeSt
     )
 
 
-def _move(world: World, state: EnvState, action: Array, active: Array) -> tuple[Any, Array, Array]:
-    """Lets the robots that are on their way drive; returns data, poses and whether it is sound."""
+def _move(
+    world: World, state: EnvState, action: Array, active: Array
+) -> tuple[Any, Memory, Array, Array]:
+    """Lets the robots that are on their way drive.
+
+    Returns:
+      Data, memory, poses, and whether the physics is sound.
+    """
+    found, level = state.factors, state.level
     command = sim_drive.command(action, world.drive, jnp)
-    command = jnp.where(active[:, None], command, 0.0)
-    wheels = sim_drive.wheel_speeds(command, world.drive, jnp)
-    velocity = sim_drive.body_velocity(wheels, world.drive, jnp)
-    data = physics.step(world.physics, state.sim, state.level.side, state.level.obstacle, velocity)
+    memory, wheels = senses.drive(
+        world.electronics, state.memory, found, command, world.drive, state.clock, jnp
+    )
+    wheels = jnp.where(active[:, None], wheels, 0.0)
+    chassis = Chassis(found.wheel_radius, found.track, found.mass, found.friction)
+    data = physics.step(world.physics, state.sim, level.side, level.obstacle, wheels, chassis)
     sound = physics.is_finite(data)
     # What follows stays finite: an arena that broke is seen where it last was, and reset.
-    pose = jnp.where(sound, physics.poses(data), physics.poses(state.sim))
-    return data, pose, sound
+    before, after = (physics.poses(world.physics, each) for each in (state.sim, data))
+    return data, memory, jnp.where(sound, after, before), sound
 
 
-def _infrared(world: World, pose: Array, level: Level) -> Array:
-    """Returns ray lengths [R, K], m."""
-    config = world.config
-    radius, reach = config.robot.hull_radius, config.task.sensor_range
-    return infrared.distances(pose, level.side, level.obstacle, radius, reach, jnp)
+def _look(world: World, pose: Array, level: Level, factors: Factors) -> Sight:
+    """Works out what there is to be sensed at poses [R, 3]."""
+    distance, bearing = observation.to_target(pose, level.target, jnp)
+    radius, reach = world.config.robot.hull_radius, world.electronics.reach
+    mount, shades = senses.mount(factors), senses.reflectance(factors)
+    arena = (pose, level.side, level.obstacle, radius, reach)
+    if shades is None:
+        ray, bright = infrared.distances(*arena, jnp, mount), None
+    else:
+        ray, bright = infrared.sights(*arena, shades, mount, jnp)
+    return Sight(ray, bright, distance, bearing)
 
 
 def _tally(

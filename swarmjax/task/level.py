@@ -40,6 +40,7 @@ class Level(NamedTuple):
       target: [R, 2] x (m), y (m).
       obstacle_present: [M] whether the obstacle is there.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
+      seed: [] uint32, from which everything else that is random about the episode follows.
     """
 
     side: Array
@@ -48,6 +49,7 @@ class Level(NamedTuple):
     target: Array
     obstacle_present: Array
     obstacle: Array
+    seed: Array
 
 
 class Spacing(NamedTuple):
@@ -67,7 +69,7 @@ class Spacing(NamedTuple):
 
 
 class _Uniforms(NamedTuple):
-    """The uniform numbers by their use: [2], [M] or [R] each."""
+    """The uniform numbers by their use: [2], [M] or [R] each; two for the seed."""
 
     obstacle_shift: Array
     target_shift: Array
@@ -77,6 +79,7 @@ class _Uniforms(NamedTuple):
     target: Array
     start: Array
     heading: Array
+    seed: Array
 
 
 class _Obstacles(NamedTuple):
@@ -89,7 +92,7 @@ class _Obstacles(NamedTuple):
 
 def uniform_count(spacing: Spacing) -> int:
     """How many uniform numbers a level takes."""
-    return 6 + 2 * spacing.obstacles + 3 * spacing.robots
+    return 8 + 2 * spacing.obstacles + 3 * spacing.robots
 
 
 def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
@@ -111,7 +114,7 @@ def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     """
     drawn = _split(uniforms, spacing)
     random = _random(drawn, stage, spacing, xp)
-    fixed = _fixed(stage, spacing, xp)
+    fixed = _fixed(drawn, stage, spacing, xp)
     level = [xp.where(stage.fixed, f, r) for f, r in zip(fixed, random, strict=True)]
     return _park(Level(*level), xp)
 
@@ -119,7 +122,7 @@ def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
 def _split(uniforms: Array, spacing: Spacing) -> _Uniforms:
     """Deals the uniform numbers out."""
     many, few = spacing.obstacles, spacing.robots
-    ends = np.cumsum([2, 2, 2, many, many, few, few, few])
+    ends = np.cumsum([2, 2, 2, many, many, few, few, few, 2])
     starts = [0, *ends[:-1]]
     return _Uniforms(*(uniforms[a:b] for a, b in zip(starts, ends, strict=True)))
 
@@ -143,7 +146,14 @@ def _random(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
         obstacle=xp.concatenate(
             [metres(around.centre, xp), xp.stack([turn, half, half], axis=-1)], axis=-1
         ),
+        seed=_seed(drawn, xp),
     )
+
+
+def _seed(drawn: _Uniforms, xp: Any) -> Array:
+    """Makes 32 random bits of two uniform numbers, of which a float32 holds 16 for sure."""
+    high, low = (drawn.seed * np.float32(2**16)).astype(xp.uint32)
+    return (high << 16) | low
 
 
 def _place_obstacles(drawn: _Uniforms, stage: Stage, side: Array, xp: Any) -> _Obstacles:
@@ -199,8 +209,8 @@ def _place_starts(
     return place(points, score, drawn.start, present, apart, xp)[0]
 
 
-def _fixed(stage: Stage, spacing: Spacing, xp: Any) -> Level:
-    """Returns the paper's level, scaled with the arena."""
+def _fixed(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
+    """Returns the paper's level, scaled with the arena; its seed alone is drawn."""
     count = xp.where(stage.fence, xp.minimum(stage.obstacles, 1), stage.obstacles)
     return Level(
         side=stage.side,
@@ -209,6 +219,7 @@ def _fixed(stage: Stage, spacing: Spacing, xp: Any) -> Level:
         target=fixed_level.targets(spacing.robots, stage.side, xp),
         obstacle_present=xp.arange(spacing.obstacles) < count,
         obstacle=fixed_level.obstacles(spacing.obstacles, stage.side, stage.fence, xp),
+        seed=_seed(drawn, xp),
     )
 
 

@@ -1,5 +1,7 @@
 """The drive against the table of the e-puck's wheels, and its inverse."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -33,6 +35,10 @@ WHEEL = st.floats(-epuck.MAX_WHEEL_SPEED, epuck.MAX_WHEEL_SPEED, allow_subnormal
 ANY_ACTION = st.floats(-1e6, 1e6, width=32, allow_subnormal=False)
 
 
+def _roll(wheels: np.ndarray, robot: drive.Drive, xp: Any) -> np.ndarray:
+    return drive.body_velocity(wheels, robot.wheel_radius, robot.track, xp)
+
+
 @pytest.mark.parametrize(("command", "unclipped", "realised"), TABLE)
 def test_wheels_and_motion_of_the_table(
     command: tuple[float, float],
@@ -42,7 +48,7 @@ def test_wheels_and_motion_of_the_table(
     wheels = drive.wheel_speeds(np.array(command), EPUCK, np)
     expected = np.clip(unclipped, -epuck.MAX_WHEEL_SPEED, epuck.MAX_WHEEL_SPEED)
     np.testing.assert_allclose(wheels, expected, atol=0.005)  # half of the table's last digit
-    speed, turn_rate = drive.body_velocity(wheels, EPUCK, np)
+    speed, turn_rate = _roll(wheels, EPUCK, np)
     assert speed == pytest.approx(realised[0], abs=0.0005)  # likewise
     assert turn_rate == pytest.approx(realised[1], abs=0.005)  # likewise
 
@@ -89,12 +95,12 @@ def test_wheels_keep_within_their_limit(speed: float, turn_rate: float) -> None:
 @given(WHEEL, WHEEL)
 def test_body_velocity_is_the_inverse_where_nothing_is_clamped(left: float, right: float) -> None:
     wheels = np.array([left, right])
-    command = drive.body_velocity(wheels, EPUCK, np)
+    command = _roll(wheels, EPUCK, np)
     again = drive.wheel_speeds(command, EPUCK, np)
     # 1e-14 rad/s: a few roundings of float64 at 6.28.
     np.testing.assert_allclose(again, wheels, atol=1e-14)
     # 1e-15 m/s and 1e-14 rad/s: likewise.
-    np.testing.assert_allclose(drive.body_velocity(again, EPUCK, np), command, atol=1e-14)
+    np.testing.assert_allclose(_roll(again, EPUCK, np), command, atol=1e-14)
 
 
 @given(ANY_ACTION, ANY_ACTION)
@@ -104,7 +110,7 @@ def test_numpy_and_jax_drive_alike(first: float, second: float) -> None:
     for xp in (np, jnp):
         command = drive.command(xp.asarray(action), PAPER, xp)
         wheels = drive.wheel_speeds(command, PAPER, xp)
-        results.append([command, wheels, drive.body_velocity(wheels, PAPER, xp)])
+        results.append([command, wheels, _roll(wheels, PAPER, xp)])
     for expected, found in zip(*results, strict=True):
         # float32 rounds differently where XLA multiplies by a reciprocal: 2e-6 is 4 ulp at 6.28.
         np.testing.assert_allclose(found, expected, atol=2e-6)

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -140,6 +141,105 @@ def test_two_robots_side_by_side_see_each_other_and_not_themselves(xp: ModuleTyp
     np.testing.assert_allclose(found, expected, atol=ROUNDING)
 
 
+@MODULES
+def test_a_crooked_sensor_looks_where_it_is_turned_from_where_it_is_shifted(
+    xp: ModuleType,
+) -> None:
+    """Two robots that look along +y; of the second, the right sensor is crooked."""
+    pose = xp.array(_f32([0.1, 0.2, math.pi / 2], [-0.3, 0.0, math.pi / 2]))
+    yaw = np.zeros((2, 8), np.float32)
+    yaw[1, 2] = math.pi / 6
+    shift = np.zeros((2, 8, 2), np.float32)
+    shift[1, 2] = 0.002, 0.003  # 2 mm forward, 3 mm to the left
+    mount = infrared.Mount(yaw=xp.array(yaw), position=xp.array(shift))
+    origin, direction = infrared.rays(pose, xp, mount)
+    straight = infrared.rays(pose, xp)
+    for found, nominal in zip((origin, direction), straight, strict=True):
+        keep = np.ones((2, 8), bool)
+        keep[1, 2] = False
+        np.testing.assert_allclose(
+            np.asarray(found)[keep], np.asarray(nominal)[keep], atol=ROUNDING
+        )
+    # Forward is +y and left is -x: the sensor at (0, -0.031) of its robot comes to (0.002, -0.028).
+    np.testing.assert_allclose(origin[1, 2], [-0.3 + 0.028, 0.002], atol=ROUNDING)
+    # It looks along +x, the robot's right, and 30 degrees further to the left, towards +y.
+    np.testing.assert_allclose(
+        direction[1, 2], [math.cos(math.pi / 6), math.sin(math.pi / 6)], atol=ROUNDING
+    )
+
+
+@MODULES
+def test_a_crooked_sensor_measures_along_its_own_ray(xp: ModuleType) -> None:
+    pose = xp.array(_f32([0.45, 0.0, 0.0]))
+    yaw, shift = np.zeros((1, 8), np.float32), np.zeros((1, 8, 2), np.float32)
+    yaw[0, 7] = -0.29920  # straight ahead
+    shift[0, 7, 0] = -0.001
+    shift[0, 0, 0] = 0.001
+    mount = infrared.Mount(yaw=xp.array(yaw), position=xp.array(shift))
+    found = infrared.distances(pose, _f32(1.0)[0], _no_box(xp), RADIUS, RANGE, xp, mount)[0]
+    # The wall is 0.05 m before the centre and the two front sensors sit at 0.030.
+    np.testing.assert_allclose(
+        found[np.array([0, 7])], [0.019 / math.cos(0.30081), 0.021], atol=ROUNDING
+    )
+
+
+SHADES = {"wall": 0.9, "obstacle": (0.6, 0.7), "robot": (0.3, 0.4, 0.5)}
+
+
+def _reflectance(xp: ModuleType, **shades: Any) -> infrared.Reflectance:
+    return infrared.Reflectance(
+        **{name: xp.array(_f32(shade)[0]) for name, shade in shades.items()}
+    )
+
+
+@MODULES
+def test_sights_tell_how_bright_the_nearest_thing_is(xp: ModuleType) -> None:
+    """Robot 1 is left of robot 0, a box right of it, the wall behind; the second box is far."""
+    pose = xp.array(_f32([-0.45, 0.0, 0.0], [-0.45, 0.09, 0.0], [0.2, 0.3, 0.0]))
+    box = xp.array(_f32([-0.45, -0.06, 0.0, 0.01, 0.01], [0.2, 0.0, 0.0, 0.02, 0.02]))
+    distance, bright = infrared.sights(
+        pose, _f32(1.0)[0], box, RADIUS, RANGE, _reflectance(xp, **SHADES), None, xp
+    )
+    expected = np.ones((3, 8))  # where nothing is
+    expected[0, 5] = 0.4
+    expected[1, 2] = 0.3
+    expected[0, 2] = 0.6
+    expected[:2, [3, 4]] = 0.9  # 0.05 m behind the centre, 0.02 m behind the sensors
+    np.testing.assert_allclose(bright, expected, atol=ROUNDING)
+    np.testing.assert_array_equal(
+        distance, infrared.distances(pose, _f32(1.0)[0], box, RADIUS, RANGE, xp)
+    )
+    # 0.031 m off the centre; the box's face 0.05 m, the other hull's surface 0.09 - 0.037 m.
+    np.testing.assert_allclose(distance[0, [2, 5]], [0.019, 0.022], atol=ROUNDING)
+
+
+@MODULES
+def test_what_has_no_reflectance_of_its_own_is_as_bright_as_can_be(xp: ModuleType) -> None:
+    pose = xp.array(_f32([-0.45, 0.0, 0.0], [-0.45, 0.09, 0.0]))
+    only_robots = _reflectance(xp, robot=(0.38, 0.38))
+    _, bright = infrared.sights(
+        pose, _f32(1.0)[0], _no_box(xp), RADIUS, RANGE, only_robots, None, xp
+    )
+    expected = np.ones((2, 8))
+    expected[0, 5] = expected[1, 2] = 0.38
+    np.testing.assert_allclose(bright, expected, atol=ROUNDING)
+
+
+@MODULES
+def test_of_two_things_that_hold_a_sensor_the_wall_counts_then_the_brightest(
+    xp: ModuleType,
+) -> None:
+    # Sensors 0 and 7 are inside both boxes; 2 mm further on, inside the wall as well.
+    box = xp.array(_f32([0.47, 0.0, 0.0, 0.03, 0.03], [0.48, 0.0, 0.0, 0.03, 0.03]))
+    for x, shade in ((0.45, 0.7), (0.472, 0.9)):
+        pose = xp.array(_f32([x, 0.0, 0.0]))
+        distance, bright = infrared.sights(
+            pose, _f32(1.0)[0], box, RADIUS, RANGE, _reflectance(xp, **SHADES), None, xp
+        )
+        np.testing.assert_array_equal(np.asarray(distance)[0, [0, 7]], 0.0)
+        np.testing.assert_allclose(np.asarray(bright)[0, [0, 7]], shade, atol=ROUNDING)
+
+
 def _no_box(xp: ModuleType) -> Any:
     return xp.zeros((0, 5), xp.float32)
 
@@ -150,7 +250,7 @@ def _judge(stage: StageConfig) -> Judge:
     size = np.zeros((1, observation.SIZE))
     meta = {
         "policy": "shared",
-        "observation": {"names": observation.NAMES},
+        "observation": {"names": observation.NAMES, "encoding": "metric"},
         "action": {"high": [0.1256, 3.14]},
     }
     policy = Policy(
@@ -204,8 +304,8 @@ def test_distances_are_those_of_mujoco_at_1000_random_poses(xp: ModuleType) -> N
     judge = _judge(StageConfig(name="test", robots=ROBOTS, side=SIDE, obstacles=BOXES))
     pose, box = _scenes()
     data = np.empty(ARENAS, object)
-    data[:] = [evaluate.place(judge, *scene) for scene in zip(pose, box, strict=True)]
-    seen_by_mujoco = evaluate.read_infrared(judge, data, pose.astype(float), box.astype(float))
+    data[:] = [evaluate.place(judge, judge.model, *scene) for scene in zip(pose, box, strict=True)]
+    seen_by_mujoco, _ = evaluate.cast_rays(judge, data, pose.astype(float), box.astype(float))
     found = np.array(_distances(pose, box, xp))
     # Rays that meet something, and rays that start inside something.
     assert (seen_by_mujoco < RANGE).sum() > 1000
@@ -227,3 +327,202 @@ def _distances(pose: np.ndarray, box: np.ndarray, xp: ModuleType) -> Any:
         infrared.distances(p, _f32(SIDE)[0], b, RADIUS, RANGE, np)
         for p, b in zip(pose.astype(float), box.astype(float), strict=True)
     ]
+
+
+ARENA = 0.5  # m
+MANY = 2000  # arenas, of `ROBOTS` robots each: 10,000 poses, 80,000 rays
+HALVES = ((13 / 256, 5 / 256), (1 / 32, 5 / 64))  # m; exact in float32
+
+
+class _World:
+    """A square arena of MuJoCo's own, with cylinders and boxes that are put where they should."""
+
+    def __init__(self, cylinders: list[float], boxes: tuple[tuple[float, float], ...]) -> None:
+        spec = mujoco.MjSpec()
+        for radius in cylinders:
+            self._add(spec, mujoco.mjtGeom.mjGEOM_CYLINDER, [radius, 0.05, 0.0])
+        for half in boxes:
+            self._add(spec, mujoco.mjtGeom.mjGEOM_BOX, [*half, 0.05])
+        for _ in range(4):
+            self._add(spec, mujoco.mjtGeom.mjGEOM_BOX, [0.5, 2.0, 0.05])
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+
+    @staticmethod
+    def _add(spec: mujoco.MjSpec, kind: Any, size: list[float]) -> None:
+        spec.worldbody.add_body(mocap=True).add_geom(type=kind, size=size)
+
+    def put(self, pose: np.ndarray, side: float) -> None:
+        """Puts the things at poses [N, 3] and the walls about an arena."""
+        quarter = np.arange(4) * math.pi / 2
+        away = 0.5 * side + 0.5
+        walls = np.stack([away * np.cos(quarter), away * np.sin(quarter), quarter], axis=-1)
+        pose = np.concatenate([pose, walls])
+        self.data.mocap_pos[:, :2] = pose[:, :2]
+        self.data.mocap_quat[:, 0] = np.cos(0.5 * pose[:, 2])
+        self.data.mocap_quat[:, 3] = np.sin(0.5 * pose[:, 2])
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+
+    def cast(
+        self, origin: np.ndarray, direction: np.ndarray, me: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Casts rays [N, 2] that ignore geom `me` [N]; returns distances and geoms (-1: none).
+
+        A ray from inside is told by where its start lies in the geom's own frame.
+        """
+        flat = np.zeros((len(origin), 1))
+        origin = np.concatenate([origin, flat], axis=-1)
+        direction = np.concatenate([direction, flat], axis=-1)
+        reach, geom = np.zeros(len(origin)), np.full(len(origin), -1, np.int32)
+        normal = np.zeros(3)
+        for i in range(len(origin)):
+            mujoco.mj_multiRay(
+                self.model, self.data, origin[i], direction[i], None, True, int(me[i]) + 1,
+                geom[i : i + 1], reach[i : i + 1], normal, 1, mujoco.mjMAXVAL,
+            )  # fmt: skip
+        reach = np.where((reach < 0.0) | (reach > RANGE), RANGE, reach)
+        inside = self._inside(origin) & (np.arange(self.model.ngeom) != me[:, None])
+        return np.where(inside.any(axis=-1), 0.0, reach), geom
+
+    def _inside(self, point: np.ndarray) -> np.ndarray:
+        """Tells [N, G] whether points [N, 3] are inside geoms."""
+        offset = point[:, None] - self.data.geom_xpos
+        local = np.einsum("gij,ngi->ngj", self.data.geom_xmat.reshape(-1, 3, 3), offset)
+        size = self.model.geom_size
+        disc = np.hypot(local[..., 0], local[..., 1]) < size[:, 0]
+        box = (np.abs(local[..., :2]) < size[:, :2]).all(axis=-1)
+        return np.where(self.model.geom_type == mujoco.mjtGeom.mjGEOM_CYLINDER, disc, box)
+
+
+@functools.cache
+def _many_scenes() -> tuple[np.ndarray, ...]:
+    """Draws poses and boxes; returns them with what MuJoCo sees and on which geom, [A, R, K].
+
+    They lie anywhere, so that things overlap and many a sensor is inside one.
+    """
+    draw = np.random.default_rng(1)
+    pose = draw.uniform([-0.27, -0.27, -9.0], [0.27, 0.27, 9.0], (MANY, ROBOTS, 3))
+    box = draw.uniform([-0.25, -0.25, -4.0], [0.25, 0.25, 4.0], (MANY, len(HALVES), 3))
+    pose, box = pose.astype(np.float32), box.astype(np.float32)
+    world = _World([RADIUS] * ROBOTS, HALVES)
+    me = np.repeat(np.arange(ROBOTS), 8)
+    reach, geom = np.empty((MANY, ROBOTS * 8)), np.empty((MANY, ROBOTS * 8), int)
+    for i, robots in enumerate(pose.astype(float)):
+        world.put(np.concatenate([robots, box[i].astype(float)]), ARENA)
+        origin, direction = infrared.rays(robots, np)
+        reach[i], geom[i] = world.cast(origin.reshape(-1, 2), direction.reshape(-1, 2), me)
+    half = np.broadcast_to(_f32(HALVES)[0], (MANY, len(HALVES), 2))
+    shape = (MANY, ROBOTS, 8)
+    return pose, np.concatenate([box, half], axis=-1), reach.reshape(shape), geom.reshape(shape)
+
+
+@MODULES
+def test_sights_are_those_of_mujoco_at_10000_random_poses(xp: ModuleType) -> None:
+    pose, box, truth, geom = _many_scenes()
+    hits = (truth > 0.0) & (truth < RANGE)
+    assert (truth == 0.0).sum() > 10_000  # they start inside something
+    assert hits.sum() > 10_000
+    kind = xp.float32 if xp is jnp else float
+    # One shade a geom, in MuJoCo's order: the robots, the boxes, four times the wall.
+    shade = np.array([0.30, 0.31, 0.32, 0.33, 0.34, 0.60, 0.61, *[0.9] * 4])
+    reflectance = infrared.Reflectance(
+        wall=xp.full(MANY, shade[-1], kind),
+        robot=xp.array(np.tile(shade[:ROBOTS], (MANY, 1)), kind),
+        obstacle=xp.array(np.tile(shade[ROBOTS:-4], (MANY, 1)), kind),
+    )
+    side = xp.full(MANY, ARENA, kind)
+    pose, box = xp.array(pose, kind), xp.array(box, kind)
+    distance, bright = infrared.sights(pose, side, box, RADIUS, RANGE, reflectance, None, xp)
+    # Float32 rounds positions of up to 0.5 m to 3e-8 m, and a slanted face or a chord of a hull
+    # stretches that some times: 3.0e-7 m at most here. In double 1.3e-8 m are left: the sensors'
+    # poses are constants of float32, so that directions are 6e-8 longer or shorter than 1, which
+    # MuJoCo allows for and a chord stretches.
+    tolerance = 5e-7 if xp is jnp else 3e-8
+    np.testing.assert_allclose(distance, truth, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(np.asarray(bright)[hits], shade[geom[hits]], atol=ROUNDING)
+
+
+GRAZES = 5000  # rays of each of two sorts
+# m; ten times what float32 rounds positions of up to 0.5 m by. A distance counts as right if a
+# sensor within that of where it is would report it: at an edge that a ray grazes, whether it meets
+# the edge is a matter of the last bit, and so it is whether a sensor on a surface is inside.
+NUDGE = 3e-7
+NUDGES = ((0, 0), (0, 1), (0, -1), (1, 0), (1, 1), (1, -1), (-1, 0), (-1, 1), (-1, -1))
+DISC, BOX = (0.05, -0.03, 0.06), (0.05, -0.03, 0.4, *HALVES[0])
+
+
+def _edge_rays(shape: str) -> tuple[np.ndarray, np.ndarray]:
+    """Draws origins and directions [N, 2], doubles, of rays that are hard to tell about a shape.
+
+    Half of them pass a tangent point of a disc, a corner of a box, or along a wall, by 1e-9 to
+    1e-2 m, from before or behind it; half start there, inside or outside by as much, and look
+    anywhere.
+    """
+    draw = np.random.default_rng(2)
+    count = 2 * GRAZES
+    if shape == "wall":
+        tilt = draw.choice([-1.0, 1.0], count) * 10.0 ** draw.uniform(-6, -2, count)
+        outward = tilt - 0.5 * math.pi
+        x = draw.uniform(-0.2, 0.2, count)
+        point = np.stack([x, np.full(count, 0.5 * ARENA)], axis=-1)
+    elif shape == "disc":
+        outward = draw.uniform(-math.pi, math.pi, count)
+        point = np.array(DISC[:2]) + DISC[2] * _toward(outward)
+    else:
+        # Rays across these directions of a corner pass it, with 0.3 rad or more to either face.
+        outward = BOX[2] + draw.uniform(0.3, 0.5 * math.pi - 0.3, count)
+        point = (
+            np.array(BOX[:2]) + _toward(BOX[2]) * BOX[3] + _toward(BOX[2] + math.pi / 2) * BOX[4]
+        )
+    by = draw.choice([-1.0, 1.0], count) * 10.0 ** draw.uniform(-9, -2, count)
+    yaw = outward + draw.choice([-0.5, 0.5], count) * math.pi
+    yaw[GRAZES:] = draw.uniform(-math.pi, math.pi, GRAZES)
+    back = draw.uniform(-0.01, 0.035, count)
+    back[GRAZES:] = 0.0
+    return point + by[:, None] * _toward(outward) - back[:, None] * _toward(yaw), _toward(yaw)
+
+
+def _toward(yaw: Any) -> np.ndarray:
+    return np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
+
+
+@functools.cache
+def _seen_of_edges(shape: str) -> np.ndarray:
+    """Returns what MuJoCo sees along the rays of `_edge_rays`, from there and nearby, [9, N]."""
+    world = _World([DISC[2]] if shape == "disc" else [], HALVES[:1] if shape == "box" else ())
+    thing = {"wall": np.zeros((0, 3)), "disc": [(*DISC[:2], 0.0)], "box": [BOX[:3]]}[shape]
+    world.put(np.array(thing), ARENA)
+    origin, direction = _edge_rays(shape)
+    across = np.stack([-direction[:, 1], direction[:, 0]], axis=-1)
+    starts = [origin + NUDGE * (ahead * direction + aside * across) for ahead, aside in NUDGES]
+    nobody = np.full(len(origin), -1)
+    return np.array([world.cast(start, direction, nobody)[0] for start in starts])
+
+
+@MODULES
+@pytest.mark.parametrize("shape", ["wall", "disc", "box"])
+def test_rays_that_graze_and_rays_that_start_at_a_surface(xp: ModuleType, shape: str) -> None:
+    truth = _seen_of_edges(shape)
+    grazing = truth[:, :GRAZES]
+    kind = xp.float32 if xp is jnp else float
+    origin, direction = (xp.array(each, kind) for each in _edge_rays(shape))
+    if shape == "wall":
+        half = xp.full(2 * GRAZES, 0.5 * ARENA, kind)
+        found = infrared.ray_walls(origin, direction, half, xp)
+    elif shape == "disc":
+        found = infrared.ray_disc(origin, direction, xp.array(DISC[:2], kind), DISC[2], xp)
+    else:
+        found = infrared.ray_box(origin, direction, xp.array(BOX, kind), xp)
+    assert (truth[0, GRAZES:] == 0.0).sum() > 1000
+    if shape != "wall":  # a wall has no end that a ray could pass
+        assert (grazing[0] == RANGE).sum() > 1000
+        assert ((grazing[0] > 0.0) & (grazing[0] < RANGE)).sum() > 1000
+    found = np.clip(np.asarray(found), 0.0, RANGE)
+    if xp is np:
+        # The wall's tilt of 1e-6 rad or more stretches a rounding of 0.25 m, 3e-17 m, to 5.1e-11.
+        np.testing.assert_allclose(found, truth[0], rtol=0, atol=1e-10)
+    # What a ray between two nudged ones meets lies between what those meet; 1e-7 m are the
+    # roundings of the distance itself.
+    assert (found >= truth.min(axis=0) - 1e-7).all()
+    assert (found <= truth.max(axis=0) + 1e-7).all()

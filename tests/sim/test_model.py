@@ -58,7 +58,9 @@ def test_only_hulls_touch(compiled: mujoco.MjModel) -> None:
 
 
 def test_robot_has_the_numbers_of_the_config() -> None:
-    robot = RobotConfig(mass=0.2, yaw_inertia=3e-4, hull_radius=0.04, track=0.06, friction=0.5)
+    robot = RobotConfig(
+        mass=0.2, yaw_inertia=3e-4, hull_radius=0.04, effective_track=0.06, friction=0.5
+    )
     built = model.build(robot, SIZE, STEP).compile()
     body = built.body("robot1")
     assert body.mass[0] == 0.2

@@ -19,6 +19,7 @@ ArenaStep = Callable[[EnvState, jax.Array], tuple[EnvState, TimeStep]]
 
 ARENAS, ROBOTS, OBSTACLES, LIMIT = 8, 3, 2, 16  # of the tiny configuration
 HULL, REACH, RANGE = 0.037, 0.05, 0.04  # m
+METRIC = observation.LAYOUTS["metric"]
 PACE = 0.1256 * 0.032  # m a step at full speed: 4.02 mm
 AHEAD, STILL = (1.0, 0.0), (-1.0, 0.0)  # actions
 
@@ -78,6 +79,7 @@ def _level(robots: list[Robot]) -> Level:
         target=np.array([robot.target for robot in everyone], np.float32),
         obstacle_present=np.array([True, False]),
         obstacle=np.array([OBSTACLE, (-5.5, -5.0, 0.0, 0.05, 0.05)], np.float32),
+        seed=np.uint32(0),
     )
 
 
@@ -90,7 +92,7 @@ def _crowd(random: np.random.Generator) -> list[Robot]:
 def _start(world: World, levels: list[Level]) -> EnvState:
     stacked = jax.tree.map(lambda *fields: jnp.asarray(np.stack(fields)), *levels)
     number = jnp.arange(len(levels))
-    state, _ = jax.jit(jax.vmap(functools.partial(env.reset, world)))(stacked, number, number)
+    state = jax.jit(jax.vmap(functools.partial(env.reset, world)))(stacked, number, number)
     sim = jax.vmap(functools.partial(physics.unpack, world.physics))(state.sim)
     return dataclasses.replace(state, sim=sim)
 
@@ -227,7 +229,7 @@ def test_observation_is_of_the_state_after_the_step_before_any_reset(episode: Ep
             side, box, target = level.side[0, a], level.obstacle[0, a], level.target[0, a]
             seen = infrared.distances(pose, side, box, HULL, RANGE, np)
             distance, bearing = observation.to_target(pose, target, np)
-            expected = observation.observe(seen, distance, bearing, np)
+            expected = observation.observe(seen, distance, bearing, METRIC, np)
             found = episode.came.observation[t, a]
             # 1e-5 m: float32, where a glancing ray multiplies its rounding.
             np.testing.assert_allclose(found[:, :9], expected[:, :9], atol=1e-5)
@@ -239,7 +241,8 @@ def test_observation_is_of_the_state_after_the_step_before_any_reset(episode: Ep
 
 def test_first_observation(tiny_world: World, start: EnvState) -> None:
     level = jax.tree.map(np.asarray, start.level)
-    state, found = env.reset(tiny_world, jax.tree.map(lambda x: x[STANDING], start.level), 1, 7)
+    state = env.reset(tiny_world, jax.tree.map(lambda x: x[STANDING], start.level), 1, 7)
+    found = state.observation
     expected = infrared.distances(
         level.start[STANDING], level.side[STANDING], level.obstacle[STANDING], HULL, RANGE, np
     )

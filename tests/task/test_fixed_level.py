@@ -125,12 +125,13 @@ def test_row_of_starts_holds_most_robots(side: float) -> None:
 def test_nothing_is_drawn_and_numpy_and_jax_agree(layout: Layout) -> None:
     stage = _stage(1.2, 3, 2, layout)
     expected = _level(stage, 0.1)
-    for mine, theirs in zip(_level(stage, 0.9), expected, strict=True):
+    # The seed of all that is not the layout is drawn all the same.
+    for mine, theirs in zip(_level(stage, 0.9)[:-1], expected[:-1], strict=True):
         np.testing.assert_array_equal(mine, theirs)
     single = jax.tree.map(jnp.asarray, task_stage.select(task_stage.stack([stage]), 0))
     uniforms = jnp.full(level.uniform_count(SPACING), 0.3)
     found = level.sample(uniforms, single, SPACING, jnp)
-    for mine, theirs in zip(found, expected, strict=True):
+    for mine, theirs in zip(found[:-1], expected[:-1], strict=True):
         # float32 products that XLA may round differently; one ulp at the parking, 5 m.
         np.testing.assert_allclose(mine, theirs, atol=5e-7)
 

@@ -1,5 +1,6 @@
 """What a robot observes, by hand."""
 
+import json
 from types import ModuleType
 
 import jax.numpy as jnp
@@ -17,8 +18,21 @@ PI = np.pi
 def test_layout() -> None:
     infrared = [f"infrared_{i}" for i in range(8)]
     assert list(observation.NAMES) == [*infrared, "target_distance", "target_bearing"]
-    assert list(observation.UNITS) == ["m"] * 9 + ["rad"]
+    assert observation.LAYOUTS["metric"].units == ("m",) * 9 + ("rad",)
+    assert observation.LAYOUTS["webots"].units == ("counts",) * 8 + ("m", "rad")
     assert observation.SIZE == 10
+
+
+def test_description_is_plain_data_that_says_everything() -> None:
+    found = observation.describe("webots")
+    assert json.loads(json.dumps(found)) == found
+    assert found == {
+        "names": list(observation.NAMES),
+        "encoding": "webots",
+        "units": ["counts"] * 8 + ["m", "rad"],
+        "offset": [0.0] * 9 + [-PI],
+        "scale": [1023.0] * 8 + [1.5, 2 * PI],
+    }
 
 
 @MODULES
@@ -63,8 +77,30 @@ def test_bearing_lies_within_half_a_turn(yaw: float, angle: float, distance: flo
 def test_order(xp: ModuleType) -> None:
     rays = 0.001 * np.arange(16).reshape(2, 8)
     found = observation.observe(
-        xp.asarray(rays), xp.asarray([0.5, 0.6]), xp.asarray([-1.0, 2.0]), xp
+        xp.asarray(rays),
+        xp.asarray([0.5, 0.6]),
+        xp.asarray([-1.0, 2.0]),
+        observation.LAYOUTS["metric"],
+        xp,
     )
     expected = np.array([[*rays[0], 0.5, -1.0], [*rays[1], 0.6, 2.0]], np.float32)
     np.testing.assert_array_equal(found, expected)
     assert found.dtype == np.float32
+
+
+@MODULES
+def test_scale_of_the_published_example(xp: ModuleType) -> None:
+    # Counts / 1023, distance / 1.5 m, and a bearing that is 0.5 dead ahead and 1 at +pi.
+    found = observation.observe(
+        xp.asarray([[1023.0] * 7 + [67.19]]),
+        xp.asarray([0.75]),
+        xp.asarray([0.5 * PI]),
+        observation.LAYOUTS["webots"],
+        xp,
+    )
+    expected = [[*[1.0] * 7, 67.19 / 1023.0, 0.5, 0.75]]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)  # float32
+    ahead = observation.observe(
+        xp.zeros(8), xp.zeros(()), xp.zeros(()), observation.LAYOUTS["webots"], xp
+    )
+    np.testing.assert_allclose(ahead, [0.0] * 9 + [0.5], atol=1e-7)  # likewise

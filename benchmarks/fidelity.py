@@ -1,0 +1,199 @@
+"""How true is the simulated robot? Every figure of the real or Webots robot beside ours.
+
+`python -m benchmarks.fidelity [out=FILE] [docs=DIR]` measures both bodies in MuJoCo's C engine and
+prints one table. `out` writes JSON lines: a head with versions and commit, then one for each row.
+`docs` writes the table into DIR/robot.md, between its two markers, and plots into DIR/figures.
+
+Ours is read from the compiled model or from what the robot does, theirs is restated here with its
+source: a number that both took from the same line would prove nothing. An error beside a source
+that differs from Webots' own is the spread between sources.
+"""
+
+import itertools
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks import fidelity_body, fidelity_infrared, fidelity_motion, rig
+from benchmarks.fidelity_row import Row
+from benchmarks.rig import Rig
+from swarmjax import command, compose, config, provenance
+from swarmjax.settings import ConfigError, Section, about, build
+
+ROBOTS = ("planar", "wheeled", "planar_v2", "wheeled_v2")  # files of configs/robot/
+PAGE = "robot.md"
+BEGIN, END = "<!-- fidelity -->", "<!-- /fidelity -->"
+PLAIN_WIDTH = 180  # columns
+HEADS = ("quantity", "unit", "theirs", "source", "planar", "wheeled", "error")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FidelityConfig(Section):
+    """Where the table goes besides the terminal."""
+
+    out: str | None = field(default=None, metadata=about("file of JSON lines"))
+    docs: str | None = field(
+        default=None, metadata=about(f"folder of {PAGE}, which gets the table and the plots")
+    )
+
+
+def load(arguments: Sequence[str]) -> FidelityConfig:
+    """Makes the configuration of its `key=value` words; raises ConfigError."""
+    return build(FidelityConfig, compose.values(compose.split_words(FidelityConfig, arguments)))
+
+
+def rigs() -> list[Rig]:
+    """Puts the robots of configs/robot/ on rigs, in the order of `ROBOTS`."""
+    keys = (["policy=none", f"robot={name}"] for name in ROBOTS)
+    return [rig.load(config.load_evaluate(words).robot) for words in keys]
+
+
+def measure(benches: Sequence[Rig]) -> list[Row]:
+    """Measures all rows.
+
+    Args:
+      benches: as `rigs` gives them.
+
+    Returns:
+      The rows, those of a section together.
+    """
+    planar, wheeled, planar_v2, wheeled_v2 = benches
+    return [
+        *fidelity_body.rows(planar, wheeled, planar_v2, wheeled_v2),
+        *fidelity_motion.rows(planar, wheeled, planar_v2, wheeled_v2),
+        *fidelity_infrared.rows(planar, wheeled),
+    ]
+
+
+# Output
+
+
+def head() -> dict[str, Any]:
+    """Returns the first JSON line: what the rows were made with."""
+    return {
+        "benchmark": "fidelity",
+        "engine": "c",
+        "control_step": rig.CONTROL_STEP,
+        "substeps": rig.SUBSTEPS,
+        "versions": provenance.versions(),
+        "commit": provenance.commit(),
+    }
+
+
+def _sections(rows: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
+    for name, members in itertools.groupby(rows, key=lambda row: row.section):
+        yield name, list(members)
+
+
+def _cells(row: Row) -> list[str]:
+    """Words of a row, in the order of `HEADS`."""
+    numbers = [_number(value) for value in (row.theirs, row.planar, row.wheeled)]
+    error = "" if row.error is None else f"{100 * row.error:.2f} %"
+    return [row.quantity, row.unit, numbers[0], row.source, *numbers[1:], error]
+
+
+def _number(value: float | None) -> str:
+    """Five digits; what is below a millionth of a millionth is rounding."""
+    if value is None:
+        return ""
+    return "0" if abs(value) < 1e-12 else f"{value:.5g}"
+
+
+def print_table(rows: Sequence[Row], console: Console) -> None:
+    """Prints the rows, a part of the table for each section."""
+    if not console.is_terminal:  # a file has room
+        console.width = PLAIN_WIDTH
+    table = Table(box=box.SIMPLE if console.is_terminal else None)
+    for name in HEADS:
+        table.add_column(name, justify="right" if name in ("theirs", *HEADS[4:]) else "left")
+    for section, members in _sections(rows):
+        table.add_row(f"[bold]{section}[/bold]")
+        for row in members:
+            table.add_row(*_cells(row))
+        table.add_section()
+    console.print(table)
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """Returns the table for the documentation, a heading for each section."""
+    lines = []
+    for section, members in _sections(rows):
+        lines += [f"### {section}", "", f"| {' | '.join(HEADS)} |", "|---|---|--:|---|--:|--:|--:|"]
+        lines += [f"| {' | '.join(_cells(row))} |" for row in members]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def insert(page: str, table: str) -> str:
+    """Puts a table between the markers of a page.
+
+    Args:
+      page: the whole text.
+      table: what comes between.
+
+    Returns:
+      The new text.
+
+    Raises:
+      ConfigError: the page has not both markers, in order.
+    """
+    before, begin, rest = page.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        raise ConfigError(f"{PAGE} has no place for the table: give it {BEGIN} and {END}.")
+    return f"{before}{BEGIN}\n\n{table}\n{END}{after}"
+
+
+def write_docs(folder: Path, rows: Sequence[Row], benches: Sequence[Rig]) -> None:
+    """Writes the table into the page, and the plots beside it.
+
+    Args:
+      folder: of the page.
+      rows: of the table.
+      benches: for the plots, as `rigs` gives them.
+
+    Raises:
+      ConfigError: the page is not there, or has no place for the table.
+    """
+    # Matplotlib comes with the developers' tools alone.
+    from benchmarks import fidelity_figures
+
+    path = folder / PAGE
+    try:
+        path.write_text(insert(path.read_text(), markdown(rows)))
+        fidelity_figures.draw(folder / "figures", benches[0], benches[1])
+    except OSError as error:
+        raise ConfigError(f"docs is {folder}, which cannot be used: {error.strerror}.") from None
+
+
+def write_lines(path: Path, rows: Sequence[Row]) -> None:
+    """Writes the JSON lines; raises ConfigError where that cannot be done."""
+    lines = [head(), *(row.line() for row in rows)]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
+    except OSError as error:
+        raise ConfigError(f"out is {path}, which cannot be written: {error.strerror}.") from None
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    settings, benches = load(arguments), rigs()
+    rows = measure(benches)
+    if settings.out is not None:
+        write_lines(Path(settings.out), rows)
+    if settings.docs is not None:
+        write_docs(Path(settings.docs), rows, benches)
+    print_table(rows, Console())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("fidelity", main, FidelityConfig))

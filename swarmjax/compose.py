@@ -1,0 +1,286 @@
+"""From the files of configs/ and the words of a command line to plain data, through Hydra.
+
+Hydra composes the YAML files with the `key=value` words and nothing else: it sets up no logging
+and changes no directory, and is imported when it is used. What comes out is for
+`settings.build`.
+"""
+
+import difflib
+import re
+import typing
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from swarmjax import settings
+from swarmjax.settings import ConfigError, Section, show
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def compose(
+    cls: type[Section], command: str, overrides: Sequence[str]
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Let Hydra put the files and the words together.
+
+    Args:
+        cls: the command's dataclass, for the keys it has.
+        command: name of its file in configs/.
+        overrides: `key=value` words.
+
+    Returns:
+        The keys and values that were given anywhere, and the choice of each group.
+
+    Raises:
+        ConfigError: a word, a choice or a file is unsound.
+    """
+    words = split_words(cls, overrides)
+    groups = {key: word.partition("=")[2] for key, word in words.items() if choices(key)}
+    for key, choice in groups.items():
+        _check_choice(key, choice, key)
+    for key in words.keys() - groups.keys():
+        _parse(words[key])
+    chosen = defaults(command) | groups
+    for group, choice in chosen.items():
+        _read_yaml(f"{group}/{choice}")  # names a broken file, where Hydra would not
+    forced = [word if key in groups else f"++{word}" for key, word in words.items()]
+    return _resolve(_hydra(command, forced)), chosen
+
+
+def stages(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
+    """Return the stages that a file of configs/stage/ stands for: itself, or its sequence.
+
+    Args:
+        stage: what `compose` made of the group `stage`.
+        choice: the name of its file.
+
+    Raises:
+        ConfigError: the file or its sequence is unsound, or keys are given for a sequence.
+    """
+    if not is_sequence(choice):
+        return [_named(stage, choice)]
+    names = settings.convert(tuple[str, ...], stage["sequence"], "stage.sequence")
+    names = typing.cast(tuple[str, ...], names)
+    if not names:
+        raise ConfigError("stage.sequence is []: give at least one stage.")
+    for key in stage.keys() - {"sequence"}:
+        raise ConfigError(
+            f"stage.{key} cannot be given for {choice}, a curriculum: choose one stage, "
+            f"as in stage={names[-1]}."
+        )
+    return [_member(name) for name in names]
+
+
+def is_sequence(choice: str) -> bool:
+    """Tell whether a file of configs/stage/ names a sequence of others."""
+    return "sequence" in _read_yaml(f"stage/{choice}")
+
+
+def _member(name: str) -> dict[str, Any]:
+    """Read one stage of a curriculum."""
+    _check_choice("stage", name, "stage.sequence")
+    if is_sequence(name):
+        raise ConfigError(f"stage.sequence names {name}, a curriculum itself: give single stages.")
+    return _named(_read_yaml(f"stage/{name}"), name)
+
+
+def _named(stage: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return the stage if it bears the name of its file."""
+    found = stage.get("name", name)
+    if found != name:
+        raise ConfigError(f"stage.name is {show(found)} in {name}.yaml: give the file's name.")
+    return stage
+
+
+# Files
+
+
+def choices(group: str) -> list[str]:
+    """Return the names of a group's files, or none if it is no group."""
+    return sorted(path.stem for path in (_config_dir() / group).glob("*.yaml"))
+
+
+def defaults(command: str) -> dict[str, str]:
+    """Return the groups of a command and the choices that its file makes."""
+    entries = _read_yaml(command).get("defaults", [])
+    return {
+        str(group): str(choice)
+        for entry in entries
+        if isinstance(entry, dict)
+        for group, choice in entry.items()
+    }
+
+
+def describe_groups(command: str) -> list[str]:
+    """Return a line for each group of a command: its default and its choices."""
+    return [
+        f"  {f'{group}={choice}':<38}  ({', '.join(choices(group))})"
+        for group, choice in defaults(command).items()
+    ]
+
+
+def _config_dir() -> Path:
+    """Find configs/: at the root of the source tree, otherwise inside the installed package."""
+    root = _PACKAGE.parent
+    source, installed = root / "configs", _PACKAGE / "configs"
+    # The folder above an installed package holds other packages too, so a folder configs/ there
+    # is ours only beside the project file.
+    if (root / "pyproject.toml").is_file() and source.is_dir():
+        return source
+    if installed.is_dir():
+        return installed
+    raise ConfigError(f"configs is missing: neither {source} nor {installed} is a folder.")
+
+
+def _read_yaml(name: str) -> dict[str, Any]:
+    """Read one file of configs/ as it stands."""
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
+
+    path = _config_dir() / f"{name}.yaml"
+    try:
+        mapping = OmegaConf.to_container(OmegaConf.load(path))
+    except (OSError, YAMLError, OmegaConfBaseException) as error:
+        raise ConfigError(f"{path} cannot be read: {_first_line(error)}.") from None
+    if not isinstance(mapping, dict):
+        raise ConfigError(f"{path} is no list of keys and values: write key: value.")
+    return {str(key): value for key, value in mapping.items()}
+
+
+def _example(group: str) -> str:
+    return f"{group}={choices(group)[-1]}"
+
+
+def _check_choice(group: str, choice: str, key: str) -> None:
+    names = choices(group)
+    if choice not in names:
+        # Names as short as s7 and s6 share half their letters, below difflib's own cutoff of 0.6.
+        near = difflib.get_close_matches(choice, names, n=1, cutoff=0.5)
+        hint = f" (nearest: {near[0]})" if near else ""
+        raise ConfigError(f"{key} is {show(choice)}: give one of {', '.join(names)}{hint}.")
+
+
+# Words
+
+
+def split_words(cls: type[Section], overrides: Sequence[str]) -> dict[str, str]:
+    """Return the words of a command line by key; of a key given twice, the last.
+
+    Args:
+        cls: the command's dataclass.
+        overrides: `key=value` words.
+
+    Returns:
+        The words, texts in them quoted for Hydra's grammar.
+
+    Raises:
+        ConfigError: a word is no `key=value`, begins with a key that `cls` does not have, or sets
+            what the choice of a file sets.
+    """
+    roots, derived = settings.names(cls), settings.keys(cls, derived=True)
+    words = {}
+    for word in overrides:
+        key, equals, _ = word.partition("=")
+        if not equals or not re.fullmatch(r"\w[\w-]*(\.[\w-]+)*", key):
+            raise ConfigError(f"{show(word)} is not a setting: give key=value.")
+        root = key.partition(".")[0]
+        if root not in roots:
+            raise settings.unknown_key(root, cls)
+        if key in derived:
+            raise ConfigError(f"{key} cannot be given: choose a file, as in {_example(root)}.")
+        words[key] = word
+    texts = {key for key, item in settings.keys(cls).items() if str in settings.options(item.type)}
+    return {key: _quote(word) if key in texts else word for key, word in words.items()}
+
+
+def values(words: Mapping[str, str]) -> dict[str, Any]:
+    """Return the values of words as nested plain data.
+
+    Args:
+        words: as `split_words` returns them.
+
+    Raises:
+        ConfigError: Hydra's grammar has no value for a word, or two words contradict each other.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    given = OmegaConf.create({})
+    for key, word in words.items():
+        try:
+            OmegaConf.update(given, key, _parse(word))
+        except OmegaConfBaseException as error:
+            raise ConfigError(f"{show(word)} cannot be used: {_first_line(error)}.") from None
+    return _resolve(given)
+
+
+def _quote(word: str) -> str:
+    """Quote a text for Hydra's grammar, so that a path may hold `=`, a comma or a space."""
+    from hydra.core.override_parser.types import Quote, QuotedString
+
+    key, _, value = word.partition("=")
+    if value in ("", "null") or value[0] in "'\"":
+        return word
+    return f"{key}={QuotedString(text=value, quote=Quote.single).with_quotes()}"
+
+
+def _parse(word: str) -> object:
+    """Parse one word with Hydra's grammar and return its value."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    key = word.partition("=")[0]
+    try:
+        parsed = OverridesParser.create().parse_override(f"++{word}")
+    except HydraException:
+        raise ConfigError(
+            f"{show(word)} cannot be read: quote a value with special characters, "
+            f"as in \"{key}='a=b'\"."
+        ) from None
+    if parsed.is_sweep_override():
+        raise ConfigError(
+            f"{show(word)} gives several values, and a run takes one: write a list as {key}=[1,2]."
+        )
+    return parsed.value()
+
+
+# Hydra
+
+
+def _hydra(command: str, overrides: list[str]) -> "DictConfig":
+    """Compose in a Hydra of our own, and leave one that the caller may have as it was."""
+    import hydra
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
+
+    outer = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with hydra.initialize_config_dir(config_dir=str(_config_dir()), version_base="1.3"):
+            return hydra.compose(command, overrides=overrides)
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
+        raise ConfigError(f"the settings do not fit together: {_first_line(error)}.") from None
+    finally:
+        GlobalHydra.instance().hydra = outer
+
+
+def _resolve(config: "DictConfig") -> dict[str, Any]:
+    """Return what Hydra composed as plain data, its interpolations filled in."""
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        mapping = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"the settings cannot be resolved: {_first_line(error)}.") from None
+    return typing.cast(dict[str, Any], mapping)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")

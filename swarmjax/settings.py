@@ -1,0 +1,349 @@
+"""Sections of settings: strict conversion, bounds, and mistakes put in one sentence each.
+
+A section is a frozen dataclass whose fields say with `about` what they mean and which numbers
+they take. `build` makes one from plain data, `to_dict` turns it back. What the settings are for
+is not known here.
+"""
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+
+class ConfigError(ValueError):
+    """A setting that is refused, in one sentence for the person who typed it."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """The numbers that a setting takes: low..high with its ends, above..below without them."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    above: float = -math.inf
+    below: float = math.inf
+
+    def hold(self, value: float) -> bool:
+        """Tell whether a number lies within."""
+        return self.low <= value <= self.high and self.above < value < self.below
+
+    def __str__(self) -> str:
+        if math.isfinite(self.low) and math.isfinite(self.high):
+            return f"{show(self.low)} to {show(self.high)}"
+        ends = {
+            "{} or more": self.low,
+            "more than {}": self.above,
+            "at most {}": self.high,
+            "less than {}": self.below,
+        }
+        given = [text.format(show(end)) for text, end in ends.items() if math.isfinite(end)]
+        return ", ".join(given) or "any finite number"
+
+
+def about(
+    meaning: str,
+    low: float = -math.inf,
+    high: float = math.inf,
+    *,
+    above: float = -math.inf,
+    below: float = math.inf,
+    derived: bool = False,
+) -> dict[str, Any]:
+    """Return the metadata of a field.
+
+    Args:
+        meaning: what it is, with its unit.
+        low: the least number it takes.
+        high: the largest.
+        above: a number that it must exceed.
+        below: a number that it must not reach.
+        derived: whether it follows from the files chosen, and is no key of the command line.
+    """
+    return {"meaning": meaning, "bounds": Bounds(low, high, above, below), "derived": derived}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """A group of settings, whose numbers are held to their bounds when it is made."""
+
+    def __post_init__(self) -> None:
+        for item in dataclasses.fields(self):
+            value = getattr(self, item.name)
+            bounds = item.metadata.get("bounds", Bounds())
+            for number in value if isinstance(value, tuple) else (value,):
+                if isinstance(number, int | float) and not bounds.hold(number):
+                    raise ConfigError(f"{item.name} is {show(value)}: give {bounds}.")
+            if isinstance(value, tuple) and any(map(_is_range, options(item.type))):
+                _check_range(item.name, value)
+        self._check()
+
+    def _check(self) -> None:
+        """Refuse what no single bound can say; keys are named from this section on."""
+
+
+def _check_range(key: str, value: tuple[Any, ...]) -> None:
+    if len(value) != 2:
+        raise ConfigError(f"{key} is {show(value)}: give two numbers.")
+    if value[0] > value[1]:
+        raise ConfigError(f"{key} is {show(value)}: give the lower number first.")
+
+
+def build[C: Section](cls: type[C], mapping: Mapping[str, Any], where: str = "") -> C:
+    """Make a section from plain data, strictly.
+
+    Whole floats and numeric strings become integers, integers become floats, and lists become
+    tuples; nothing else is converted, and no key is dropped.
+
+    Args:
+        cls: the dataclass to make.
+        mapping: its keys and values, as `to_dict`, JSON or YAML give them.
+        where: what comes before its keys in a sentence, such as `sim.`.
+
+    Returns:
+        An instance of `cls`.
+
+    Raises:
+        ConfigError: an unknown or missing key, a wrong type, or a value out of bounds.
+    """
+    if not isinstance(mapping, Mapping):
+        key = where.rstrip(": .")
+        example = dataclasses.fields(cls)[0].name
+        raise ConfigError(f"{key} is {show(mapping)}: give keys of its own, as {where}{example}.")
+    known = {item.name: item for item in dataclasses.fields(cls)}
+    for key in mapping:
+        if key not in known:
+            raise unknown_key(str(key), cls, where)
+    for item in known.values():
+        if item.name not in mapping and _is_required(item):
+            raise ConfigError(f"{where}{item.name} is missing and has no default: give it.")
+    values = {
+        key: convert(known[key].type, value, f"{where}{key}") for key, value in mapping.items()
+    }
+    try:
+        return cls(**values)
+    except ConfigError as error:
+        raise ConfigError(f"{where}{error}") from None
+
+
+def to_dict(config: Section) -> dict[str, Any]:
+    """Return a section as plain data for JSON, from which `build` makes it again."""
+    return {key: _plain(value) for key, value in dataclasses.asdict(config).items()}
+
+
+def _plain(value: object) -> object:
+    """Turn the tuples of nested plain data into lists."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return value
+
+
+# Keys
+
+
+def names(cls: type[Section]) -> list[str]:
+    """Return the keys and sections that a word of the command line may begin with."""
+    return [item.name for item in dataclasses.fields(cls) if not _is_derived(item)]
+
+
+def keys(
+    cls: type[Section], where: str = "", *, derived: bool = False
+) -> dict[str, dataclasses.Field[Any]]:
+    """Return the dotted keys of the command line and the fields they set.
+
+    Args:
+        cls: the section they are of.
+        where: what comes before its keys.
+        derived: return the derived fields instead, which the command line does not set.
+    """
+    found = {}
+    for item in dataclasses.fields(cls):
+        inner = _section(item.type)
+        if inner is not None:
+            found |= keys(inner, f"{where}{item.name}.", derived=derived)
+        elif _is_derived(item) == derived:
+            found[f"{where}{item.name}"] = item
+    return found
+
+
+def describe_keys(cls: type[Section]) -> list[str]:
+    """Return a line for each key: its default, its meaning and what it takes."""
+    lines = []
+    for key, item in keys(cls).items():
+        section = key.partition(".")[0]
+        default = f"<{'required' if section == key else f'the {section}'}>"
+        if not _is_required(item):
+            default = show(item.default, quote="")
+        bounds = item.metadata["bounds"]
+        allowed = _describe(item.type, "" if bounds == Bounds() else f" {bounds}")
+        lines.append(f"  {f'{key}={default}':<38}  {item.metadata['meaning']} ({allowed})")
+    return lines
+
+
+def unknown_key(key: str, cls: type[Section], where: str = "") -> ConfigError:
+    """Say that a key does not exist, and which one was probably meant.
+
+    Args:
+        key: as it was given, without what stands before it.
+        cls: the section that has no such key.
+        where: what stands before it, such as `sim.`.
+    """
+    known = names(cls)
+    dotted = {full.rpartition(".")[2]: full for full in reversed(keys(cls))}
+    near = [dotted[key]] if key in dotted else difflib.get_close_matches(key, known, n=1)
+    near = near or [dotted[leaf] for leaf in difflib.get_close_matches(key, dotted, n=1)]
+    hint = f"did you mean {where}{near[0]}?" if near else f"give one of {', '.join(known)}."
+    return ConfigError(f"{where}{key} is not a key: {hint}")
+
+
+def _is_derived(item: dataclasses.Field[Any]) -> bool:
+    return item.metadata.get("derived", False)
+
+
+def _is_required(item: dataclasses.Field[Any]) -> bool:
+    return item.default is dataclasses.MISSING and item.default_factory is dataclasses.MISSING
+
+
+# Types
+
+
+def options(hint: object) -> tuple[Any, ...]:
+    """Return the members of a union, or the type itself."""
+    if typing.get_origin(hint) in (types.UnionType, typing.Union):
+        return typing.get_args(hint)
+    return (types.NoneType,) if hint is None else (hint,)
+
+
+def _section(hint: object) -> type[Section] | None:
+    """Return the section that a field holds, alone or in a tuple, if it holds one."""
+    inner = typing.get_args(hint)[0] if typing.get_origin(hint) is tuple else hint
+    return inner if isinstance(inner, type) and issubclass(inner, Section) else None
+
+
+def _is_range(hint: object) -> bool:
+    """Tell whether a type is that of two numbers, the lower first."""
+    return typing.get_origin(hint) is tuple and Ellipsis not in typing.get_args(hint)
+
+
+def _is_list(hint: object) -> bool:
+    return typing.get_origin(hint) is tuple and Ellipsis in typing.get_args(hint)
+
+
+def convert(hint: object, value: object, key: str) -> object:
+    """Turn plain data into what a field's type says.
+
+    Args:
+        hint: the type.
+        value: the data.
+        key: what a sentence calls it.
+
+    Raises:
+        ConfigError: it cannot be turned into that.
+    """
+    section = _section(hint)
+    if _is_list(hint):
+        if not isinstance(value, list | tuple):
+            raise ConfigError(f"{key} is {show(value)}: give {_describe(hint)}.")
+        inner = typing.get_args(hint)[0]
+        return tuple(
+            convert(inner, item, _item_key(key, value, index) if section else key)
+            for index, item in enumerate(value)
+        )
+    if section is not None:
+        mapping = typing.cast(Mapping[str, Any], value)
+        return build(section, mapping, key if key.endswith(": ") else f"{key}.")
+    if hint is None and value is not None:
+        raise ConfigError(f"{key} is {show(value)}, but is not built yet: leave it out.")
+    for option in options(hint):
+        try:
+            return _scalar(option, value)
+        except (TypeError, ValueError, OverflowError):
+            continue
+    raise ConfigError(f"{key} is {show(value)}: give {_describe(hint)}.")
+
+
+def _item_key(key: str, items: Sequence[Any], index: int) -> str:
+    """Name one of several sections, by its name where it has one."""
+    if len(items) == 1:
+        return key
+    item = items[index]
+    name = item.get("name", index) if isinstance(item, Mapping) else index
+    return f"{key} {name}: "
+
+
+def _scalar(hint: object, value: object) -> object:
+    """Convert to one scalar type or range, or raise an error that `convert` puts in words."""
+    if typing.get_origin(hint) is Literal:
+        if isinstance(value, str) and value in typing.get_args(hint):
+            return value
+    elif _is_range(hint):
+        if isinstance(value, list | tuple) and len(value) == 2:
+            return tuple(_number(typing.get_args(hint)[0], number) for number in value)
+    elif hint is int or hint is float:
+        return _number(hint, value)
+    elif isinstance(hint, type) and isinstance(value, hint) and value != "":
+        return value
+    raise TypeError
+
+
+def _number(kind: type[int] | type[float], value: object) -> int | float:
+    """Convert a number, or a string that is one; true and false are no numbers."""
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        raise TypeError
+    try:
+        number: int | float = int(value) if isinstance(value, str) else value
+    except ValueError:
+        number = float(value)
+    if isinstance(number, float) and not math.isfinite(number):
+        raise ValueError
+    if kind is int and number != int(number):
+        raise ValueError
+    return kind(number)
+
+
+# Words
+
+
+def _describe(hint: object, bounds: str = "") -> str:
+    """Put a field's type in words, and the bounds of its numbers if they are given."""
+    if _is_list(hint):
+        examples = {int: "[64,64]", str: "[s1,s2]"}
+        inner = typing.get_args(hint)[0]
+        return f"a list, as in {examples[inner]}{bounds}" if inner in examples else "a list"
+    words = []
+    for option in options(hint):
+        if typing.get_origin(option) is Literal:
+            words += typing.get_args(option)
+        elif _is_range(option):
+            whole = "whole " if typing.get_args(option)[0] is int else ""
+            words.append(f"a range [low,high] of {whole}numbers{bounds}")
+        else:
+            names = {int: f"a whole number{bounds}", float: f"a number{bounds}", str: "text"}
+            words.append((names | {bool: "true or false", types.NoneType: "null"})[option])
+    *most, last = words
+    return f"{', '.join(most)} or {last}" if most else last
+
+
+def show(value: object, quote: str = "'") -> str:
+    """Write a value as it would be typed, and short.
+
+    Args:
+        value: plain data.
+        quote: what stands around text.
+    """
+    if isinstance(value, str):
+        text = value.encode("unicode_escape").decode("ascii") if not value.isprintable() else value
+        text = f"{quote}{text}{quote}"
+    elif value is None or isinstance(value, bool):
+        text = {None: "null", True: "true", False: "false"}[value]
+    elif isinstance(value, list | tuple):
+        text = f"[{','.join(show(item, quote) for item in value)}]"
+    else:
+        text = f"{value:.10g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."

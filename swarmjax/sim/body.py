@@ -1,0 +1,130 @@
+"""What a body is to the rest of the simulation: the same commands and poses for either one.
+
+A body turns the speeds of its two wheels into controls, and positions of its joints into
+x, y and yaw. `planar.py` and `wheeled.py` are the two there are.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from swarmjax.config import RobotConfig
+
+Array = Any
+Changes = dict[str, tuple[Any, Array]]  # field of the model: rows, and their new numbers
+
+
+class Chassis(NamedTuple):
+    """What a robot's chassis is in an episode, where it is not what the config says.
+
+    Attributes:
+      wheel_radius: [R, 2] left and right, m, or None.
+      track: [R] between the points where the wheels grip the floor, m, or None.
+      mass: [R] kg, or None.
+      friction: [R] of wheel on floor, or None.
+    """
+
+    wheel_radius: Array | None = None
+    track: Array | None = None
+    mass: Array | None = None
+    friction: Array | None = None
+
+
+AS_BUILT = Chassis()
+
+
+class Rows(NamedTuple):
+    """Where the robots lie in the model's arrays.
+
+    Attributes:
+      bodies: [R, B] hull first.
+      dofs: [R, D].
+      actuators: [R, U].
+      wheel_geoms: [R, 2] left and right; [R, 0] of a body without wheels.
+      wheel_bodies: [R, 2] likewise.
+      grips: [R, 2] pairs of wheel and floor, likewise.
+    """
+
+    bodies: np.ndarray
+    dofs: np.ndarray
+    actuators: np.ndarray
+    wheel_geoms: np.ndarray
+    wheel_bodies: np.ndarray
+    grips: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Body:
+    """One kind of body, as functions.
+
+    Attributes:
+      add: adds a robot of this name to a spec, for a physics step (s); returns its contact geom.
+      qpos: positions of the joints [..., R * Q] of robots at rest at [..., R, 3] x (m), y (m),
+        yaw (rad).
+      pose: the inverse, [..., R, 3].
+      ctrl: controls [..., R * U] that hold wheel speeds [..., R, 2] (rad/s) of a chassis.
+      changes: what a chassis changes in the compiled model (the last argument is the model).
+    """
+
+    add: Callable[[mujoco.MjSpec, str, RobotConfig, float], str]
+    qpos: Callable[[Array, Any], Array]
+    pose: Callable[[Array, Any], Array]
+    ctrl: Callable[[Array, Chassis, RobotConfig, Any], Array]
+    changes: Callable[[Chassis, Rows, RobotConfig, mujoco.MjModel], Changes]
+
+
+def find_rows(model: mujoco.MjModel, robots: int) -> Rows:
+    """Looks the rows of the robots up by name.
+
+    Args:
+      model: compiled.
+      robots: R.
+
+    Returns:
+      The rows.
+    """
+    hulls = np.array([model.body(f"robot{i}").id for i in range(robots)], np.int32)
+    bodies = [np.flatnonzero(model.body_rootid == hull) for hull in hulls]
+    dofs = [np.flatnonzero(np.isin(model.dof_bodyid, mine)) for mine in bodies]
+    acts = [np.arange(model.nu).reshape(robots, -1)[i] for i in range(robots)]
+    wheels = [[f"robot{i}_{side}" for side in ("left", "right")] for i in range(robots)]
+    has_wheels = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, wheels[0][0]) >= 0
+    geoms = [[model.geom(name).id for name in pair if has_wheels] for pair in wheels]
+    return Rows(
+        bodies=np.array(bodies, np.int32),
+        dofs=np.array(dofs, np.int32),
+        actuators=np.array(acts, np.int32),
+        wheel_geoms=np.array(geoms, np.int32),
+        wheel_bodies=np.array(model.geom_bodyid)[np.array(geoms, np.int32)],
+        grips=np.array([[_pair(model, geom) for geom in pair] for pair in geoms], np.int32),
+    )
+
+
+def scale_mass(ratio: Array, rows: Rows, model: mujoco.MjModel) -> Changes:
+    """Changes a robot's mass, and all its inertia in proportion.
+
+    Args:
+      ratio: [R] of the new mass to the one that is compiled in.
+      rows: of the robots.
+      model: compiled.
+
+    Returns:
+      Changes of the bodies. The inverse weights, by which MuJoCo softens contacts and which MJX
+      does not work out anew, shrink as the mass grows: exactly, but for what wheels' motors add.
+    """
+    bodies, dofs = rows.bodies, rows.dofs
+    return {
+        "body_mass": (bodies, ratio[:, None] * model.body_mass[bodies]),
+        "body_subtreemass": (bodies, ratio[:, None] * model.body_subtreemass[bodies]),
+        "body_inertia": (bodies, ratio[:, None, None] * model.body_inertia[bodies]),
+        "body_invweight0": (bodies, model.body_invweight0[bodies] / ratio[:, None, None]),
+        "dof_invweight0": (dofs, model.dof_invweight0[dofs] / ratio[:, None]),
+    }
+
+
+def _pair(model: mujoco.MjModel, geom: int) -> int:
+    """The one pair that a wheel's geom is in."""
+    return int(np.flatnonzero((model.pair_geom1 == geom) | (model.pair_geom2 == geom))[0])

@@ -1,0 +1,71 @@
+"""Geoms that touch nothing but through an explicit pair."""
+
+from collections.abc import Sequence
+
+import mujoco
+
+from swarmjax import epuck
+
+HULL_GROUP = 3  # contact spheres, through which rays pass
+FLOOR_GROUP = 4  # wheels, skids and floor: likewise; wheels reach beyond the hull
+# Contacts are between a sphere at the height of the robot's centre of mass and upright faces: in
+# the plane that is exactly a disc of the hull's radius, at one contact point a pair instead of a
+# capsule's two, and a push neither tips the robot nor loads a skid more than the push itself.
+CONTACT_HEIGHT = epuck.COM_HEIGHT
+
+
+def add_geom(
+    body: mujoco.MjsBody,
+    name: str,
+    kind: mujoco.mjtGeom,
+    size: Sequence[float],
+    place: Sequence[float],
+    group: int = 0,
+) -> str:
+    """Adds a massless geom and returns its name.
+
+    Args:
+      body: whose it is.
+      name: of the geom.
+      kind: shape.
+      size: three numbers, m, as MuJoCo means them for the shape.
+      place: in the frame of the body, m.
+      group: which rays see it.
+
+    Returns:
+      `name`.
+    """
+    body.add_geom(
+        name=name, type=kind, size=size, pos=place, contype=0, conaffinity=0, mass=0.0, group=group
+    )
+    return name
+
+
+def add_hull(body: mujoco.MjsBody, name: str, radius: float) -> str:
+    """Adds the hull that touches things, and returns its name.
+
+    Args:
+      body: of the robot, its origin on the floor.
+      name: of the robot.
+      radius: m.
+
+    Returns:
+      The name of the geom.
+    """
+    sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+    place = [0.0, 0.0, CONTACT_HEIGHT]
+    return add_geom(body, f"{name}_hull", sphere, [radius, 0, 0], place, HULL_GROUP)
+
+
+def add_ray_hull(body: mujoco.MjsBody, name: str, radius: float) -> None:
+    """Adds the hull that rays see: a cylinder.
+
+    Args:
+      body: of the robot, its origin on the floor.
+      name: of the robot.
+      radius: m.
+    """
+    half = 0.5 * (epuck.HULL_TOP - epuck.HULL_BOTTOM)
+    middle = 0.5 * (epuck.HULL_TOP + epuck.HULL_BOTTOM)
+    cylinder = mujoco.mjtGeom.mjGEOM_CYLINDER
+    add_geom(body, f"{name}_body", cylinder, [radius, half, 0], [0.0, 0.0, middle])

@@ -1,0 +1,131 @@
+"""Random numbers by counting: a hash of where a number is used, and no state to carry along.
+
+The same seed, clock, stream and index give the same number in NumPy and in JAX, so that a level
+replays exactly with everything that is random about it. Not for secrets.
+"""
+
+import enum
+import math
+from typing import Any
+
+import numpy as np
+
+Array = Any
+
+MOST = math.sqrt(48.0 * math.log(2.0))  # 5.77; `normal` goes no further from 0
+
+
+class Stream(enum.IntEnum):
+    """What a random number is for; a value, once given out, stays, or old levels replay otherwise.
+
+    Those up to `OBSERVATION_LATENCY` are drawn once an episode, at clock 0, the others at each
+    control step.
+    """
+
+    WHEEL_RADIUS = 0
+    WHEEL_MISMATCH = 1
+    TRACK = 2
+    MAX_WHEEL_SPEED = 3
+    MASS = 4
+    FRICTION = 5
+    INFRARED_NOISE = 6
+    INFRARED_GAIN = 7
+    INFRARED_OFFSET = 8
+    INFRARED_YAW = 9
+    INFRARED_POSITION = 10
+    INFRARED_PERIOD = 11
+    DEAD_SENSOR = 12
+    REFLECTANCE_WALL = 13
+    REFLECTANCE_OBSTACLE = 14
+    REFLECTANCE_ROBOT = 15
+    ACTION_LATENCY = 16
+    OBSERVATION_LATENCY = 17
+    INFRARED = 32
+    SPEED_NOISE = 33
+    STALL = 34
+    STALL_TIME = 35
+    TARGET_DISTANCE = 36
+    TARGET_BEARING = 37
+
+
+def bits(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: Any) -> Array:
+    """Hashes (seed, clock, stream, index) to whole numbers, of which every bit is fair.
+
+    The four words are taken up one after the other, each mixed before it is joined and the result
+    mixed after: so no seed runs through the numbers of another, shifted by a clock or an index,
+    and none changes places with a clock. What an index gets does not depend on the shape, so
+    robots that are added leave the others' numbers alone.
+
+    Args:
+      seed: [...] uint32.
+      clock: [...] or [] control steps since the start, 0 or more.
+      stream: what the numbers are for, one of `Stream`.
+      shape: of the numbers for one seed; their index counts through it, the last axis fastest.
+      xp: `numpy` or `jax.numpy`; both give the same numbers.
+
+    Returns:
+      [..., *shape] uint32.
+    """
+    # A last axis throughout, because NumPy warns of an overflow of scalars only.
+    key = _mix(_mix(xp.asarray(seed, xp.uint32)[..., None]))  # once, it would commute with clock
+    index = np.arange(math.prod(shape), dtype=np.uint32)
+    for word in (xp.asarray(clock, xp.uint32)[..., None], np.full(1, stream, np.uint32), index):
+        key = _mix(key ^ _mix(word))
+    return key.reshape((*key.shape[:-1], *shape))
+
+
+def uniform(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: Any) -> Array:
+    """Draws uniform numbers, in steps of 2**-24.
+
+    Args:
+      seed: [...] uint32.
+      clock: [...] or [] control steps since the start, 0 or more.
+      stream: what the numbers are for, one of `Stream`.
+      shape: of the numbers for one seed.
+      xp: `numpy` or `jax.numpy`; both give the same numbers.
+
+    Returns:
+      [..., *shape] float32 in [0, 1).
+    """
+    # The most that a float32 holds: every step of 2**-24 below 1 is a number of its own.
+    whole = bits(seed, clock, stream, shape, xp) >> 8
+    return whole.astype(xp.float32) * np.float32(2.0**-24)
+
+
+def normal(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: Any) -> Array:
+    """Draws standard normal numbers, two from each two uniform ones.
+
+    Box and Muller, "A Note on the Generation of Random Normal Deviates", Annals of Mathematical
+    Statistics 29 (1958), pages 610-611, equation 1. The smallest uniform number bounds the result
+    by `MOST`.
+
+    Args:
+      seed: [...] uint32.
+      clock: [...] or [] control steps since the start, 0 or more.
+      stream: what the numbers are for, one of `Stream`.
+      shape: of the numbers for one seed.
+      xp: `numpy` or `jax.numpy`; both give the same numbers but for the rounding of log and cos.
+
+    Returns:
+      [..., *shape] float32.
+    """
+    count = math.prod(shape)
+    drawn = uniform(seed, clock, stream, ((count + 1) // 2, 2), xp)
+    radius = xp.sqrt(-2.0 * xp.log(1.0 - drawn[..., 0]))
+    angle = drawn[..., 1] * np.float32(2.0 * math.pi)
+    pairs = xp.stack([radius * xp.cos(angle), radius * xp.sin(angle)], axis=-1)
+    leading = pairs.shape[:-2]
+    return pairs.reshape((*leading, -1))[..., :count].reshape((*leading, *shape))
+
+
+def _mix(word: Array) -> Array:
+    """Scrambles uint32 one to one: flipping any bit flips each other bit with probability 1/2.
+
+    `triple32inc` of Chris Wellons, "Prospecting for Hash Functions" (2018) and the tables of
+    github.com/skeeto/hash-prospector: bias 0.0208, where a perfect one measures 0.021.
+    """
+    word = word + np.uint32(1)
+    word = (word ^ (word >> 17)) * np.uint32(0xED5AD4BB)
+    word = (word ^ (word >> 11)) * np.uint32(0xAC4C1B51)
+    word = (word ^ (word >> 15)) * np.uint32(0x31848BAB)
+    return word ^ (word >> 14)

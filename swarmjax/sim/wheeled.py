@@ -1,0 +1,166 @@
+"""The wheeled body: the whole e-puck, free in space, on two driven wheels and two skids.
+
+The motors are steppers behind a 50:1 gear: what is commanded is the speed of a wheel, and no load
+below the one at which steps are lost changes it (Webots gives its motors 10 N m, which comes to
+the same). Here that is a velocity servo on a large reflected inertia, deadbeat in one physics
+step: the floor, which passes mu m g r / 2 = 0.016 N m to each wheel, changes its speed by 0.2 %
+of its limit in 16 ms, and the next step undoes it. A motor with only the inertia of the wheel
+(1e-6 kg m^2) is no substitute: with a stable gain it lags by milliseconds that depend on the time
+step.
+
+The grip of wheel on floor is a contact that takes out half the penetration and all slip within
+one physics step, as far as friction allows. MuJoCo's default contact takes 10 to 30 ms for it,
+depending on the time step, in which the wheel creeps.
+"""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from swarmjax import epuck
+from swarmjax.config import RobotConfig
+from swarmjax.sim.body import Body, Changes, Chassis, Rows, scale_mass
+from swarmjax.sim.geom import FLOOR_GROUP, add_geom, add_hull
+from swarmjax.sim.planar import servo_share
+
+Array = Any
+FLOOR = "floor"
+ROTOR_INERTIA = 0.02  # kg m^2, reflected through the gear; chosen, see above
+SKID_RADIUS = 0.005  # m; half the height of the box under the Webots e-puck
+_QPOS = 9  # x, y, z, quaternion (w, x, y, z), left wheel, right wheel
+REST_DEPTH = 1e-5  # m; as deep as the wheels stand in the floor, at 16 ms: 9e-6
+_PENETRATION = 0.5  # share that one physics step takes out
+_IMPEDANCE = 0.999  # of the grip: a thousandth of the weight's acceleration is left to it
+# m; the frame of a wheel, whose tyre is 5 mm wide, so that its geom lies beside it: MuJoCo takes a
+# geom that is compiled into its body's frame to stay there, whatever `geom_pos` says later.
+_INNER_EDGE = epuck.AXLE_Y - 0.0025
+_SIDES = np.array([1.0, -1.0], np.float32)  # left, right
+_SPIN = 5e-3, 1e-4, 1e-4  # MuJoCo's own torsional and rolling friction: unused by condim 3
+
+
+def _add(spec: mujoco.MjSpec, name: str, robot: RobotConfig, timestep: float) -> str:
+    """Adds one robot; see `_QPOS` for its positions."""
+    body = spec.worldbody.add_body(name=name)
+    body.add_freejoint(name=name)
+    _set_inertia(body, robot)
+    _add_floor(spec)
+    for label, side in (("left", 1.0), ("right", -1.0)):
+        _add_wheel(spec, body, f"{name}_{label}", side, robot, timestep)
+    sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+    for label, x in (("front", epuck.SKID_X), ("back", -epuck.SKID_X)):
+        place = [x, 0.0, SKID_RADIUS + epuck.SKID_CLEARANCE]
+        skid = add_geom(body, f"{name}_{label}", sphere, [SKID_RADIUS, 0, 0], place, FLOOR_GROUP)
+        # condim 1: skids carry and do not brake, as Webots' smooth box is meant to.
+        spec.add_pair(geomname1=FLOOR, geomname2=skid, condim=1, **_grip(timestep))
+    return add_hull(body, name, robot.hull_radius)
+
+
+def _add_floor(spec: mujoco.MjSpec) -> None:
+    """Adds the floor with the first robot."""
+    if spec.geom(FLOOR) is None:
+        plane = mujoco.mjtGeom.mjGEOM_PLANE
+        add_geom(spec.worldbody, FLOOR, plane, [0, 0, 1], [0, 0, 0], FLOOR_GROUP)
+
+
+def _set_inertia(body: mujoco.MjsBody, robot: RobotConfig) -> None:
+    """Gives the body what of the robot's mass and inertia is not its wheels'."""
+    wheel = epuck.WHEEL_MASS
+    yaw = robot.yaw_inertia - 2.0 * (wheel * epuck.AXLE_Y**2 + epuck.WHEEL_INERTIA[0])
+    body.explicitinertial = True
+    body.mass = robot.mass - 2.0 * wheel
+    body.ipos = [0.0, 0.0, epuck.COM_HEIGHT]
+    body.inertia = [yaw / epuck.BODY_INERTIA[2] * part for part in epuck.BODY_INERTIA]
+
+
+def _add_wheel(
+    spec: mujoco.MjSpec,
+    body: mujoco.MjsBody,
+    name: str,
+    side: float,
+    robot: RobotConfig,
+    timestep: float,
+) -> None:
+    """Adds a wheel, its motor, and its grip on the floor; `side` is 1 left and -1 right.
+
+    Its geom is a sphere around the point on the axle above which the tyre meets the floor: it
+    rolls as a wheel of the same radius does, and always grips at the same distance from the other.
+    """
+    wheel = body.add_body(name=name, pos=[0.0, side * _INNER_EDGE, robot.wheel_radius])
+    wheel.explicitinertial = True
+    wheel.mass = epuck.WHEEL_MASS
+    wheel.ipos = [0.0, side * (epuck.AXLE_Y - _INNER_EDGE), 0.0]
+    wheel.inertia = epuck.WHEEL_INERTIA
+    hinge = mujoco.mjtJoint.mjJNT_HINGE
+    wheel.add_joint(name=name, type=hinge, axis=[0, 1, 0], armature=ROTOR_INERTIA)
+    place = [0.0, side * (0.5 * robot.effective_track - _INNER_EDGE), 0.0]
+    sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+    add_geom(wheel, name, sphere, [robot.wheel_radius, 0, 0], place, FLOOR_GROUP)
+    friction = [robot.friction, robot.friction, *_SPIN]
+    spec.add_pair(geomname1=FLOOR, geomname2=name, condim=3, friction=friction, **_grip(timestep))
+    motor = spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
+    inertia = ROTOR_INERTIA + epuck.WHEEL_INERTIA[1]
+    motor.set_to_velocity(servo_share(robot.motor_lag, timestep) * inertia / timestep)
+
+
+def _grip(timestep: float) -> dict[str, list[float]]:
+    """A contact with the floor by stiffness and damping (negative `solref`) per unit of mass."""
+    return {
+        "solref": [-_PENETRATION / timestep**2, -1.0 / timestep],
+        "solimp": [_IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0],
+    }
+
+
+def _qpos(pose: Array, xp: Any) -> Array:
+    x, y, half = pose[..., 0], pose[..., 1], 0.5 * pose[..., 2]
+    zero = 0.0 * x
+    place = [x, y, zero - REST_DEPTH]
+    turn = [xp.cos(half), zero, zero, xp.sin(half)]
+    qpos = xp.stack([*place, *turn, zero, zero], axis=-1)
+    return qpos.reshape(*qpos.shape[:-2], -1)
+
+
+def _pose(qpos: Array, xp: Any) -> Array:
+    robot = qpos.reshape(*qpos.shape[:-1], -1, _QPOS)
+    w, x, y, z = (robot[..., i] for i in range(3, 7))
+    yaw = xp.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return xp.stack([robot[..., 0], robot[..., 1], yaw], axis=-1)
+
+
+def _ctrl(wheels: Array, chassis: Chassis, robot: RobotConfig, xp: Any) -> Array:
+    return wheels.reshape(*wheels.shape[:-2], -1)
+
+
+def encoders(qpos: Array, xp: Any) -> Array:
+    """Angles that the wheels' encoders report.
+
+    Args:
+      qpos: [..., R * 9] of wheeled robots.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [..., R, 2] left and right since the start, rad, in whole steps of 0.00628 (Webots E-puck,
+      1000 steps a turn), rounded down.
+    """
+    angle = qpos.reshape(*qpos.shape[:-1], -1, _QPOS)[..., 7:]
+    return xp.floor(angle / epuck.ENCODER_STEP) * epuck.ENCODER_STEP
+
+
+def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjModel) -> Changes:
+    """Wheels of another size carry their axle at another height, so that the skids stay clear."""
+    changes: Changes = {}
+    if chassis.mass is not None:
+        changes |= scale_mass(chassis.mass / robot.mass, rows, model)
+    if chassis.friction is not None:
+        both = chassis.friction[:, None, None].repeat(2, axis=1).repeat(2, axis=2)
+        changes["pair_friction"] = ((rows.grips[..., None], [0, 1]), both)
+    if chassis.wheel_radius is not None:
+        changes["geom_size"] = ((rows.wheel_geoms, 0), chassis.wheel_radius)
+        changes["body_pos"] = ((rows.wheel_bodies, 2), chassis.wheel_radius)
+    if chassis.track is not None:
+        beyond = 0.5 * chassis.track[:, None] - _INNER_EDGE
+        changes["geom_pos"] = ((rows.wheel_geoms, 1), beyond * _SIDES)
+    return changes
+
+
+WHEELED = Body(add=_add, qpos=_qpos, pose=_pose, ctrl=_ctrl, changes=_changes)

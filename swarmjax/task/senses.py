@@ -1,0 +1,290 @@
+"""A robot's electronics: commands on their way to the wheels, sensors on their way to the policy.
+
+Between the policy and the world lie motors, sensors and messages; what realism makes of them is
+here, for training and for the judge alike. A factor that is off leaves no trace: with none on,
+a policy observes the rays as they are, and its wheels turn as commanded.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+from swarmjax import config as settings
+from swarmjax.config import RealismConfig, TaskConfig
+from swarmjax.sim import drive as sim_drive
+from swarmjax.sim import infrared, motor, noise, response
+from swarmjax.sim.drive import Drive
+from swarmjax.sim.motor import Motor
+from swarmjax.sim.noise import Stream
+from swarmjax.task import observation
+from swarmjax.task.factors import Factors
+
+Array = Any
+Encoding = Literal["metric", "webots"]
+_SLACK = 1e-4  # of a period: a sample that is due now is not put off by rounding
+
+
+@dataclass(frozen=True, kw_only=True)
+class Electronics:
+    """What is the same for every episode of a program.
+
+    Attributes:
+      realism: which factors are on.
+      encoding: what the policy observes.
+      sensor_range: beyond which it observes no infrared distance, m.
+      control_step: s.
+    """
+
+    realism: RealismConfig
+    encoding: Encoding
+    sensor_range: float
+    control_step: float
+
+    @property
+    def reach(self) -> float:
+        """How far rays are cast, m."""
+        curves = {self.realism.infrared, self.encoding}
+        return max([self.sensor_range, *(response.REACH.get(name, 0.0) for name in curves)])
+
+    @property
+    def latency(self) -> int:
+        """Largest latency of an observation, control steps."""
+        bounds = self.realism.observation_latency
+        return 0 if bounds is None else bounds[1]
+
+
+class Memory(NamedTuple):
+    """What the electronics carry from one control step to the next; None where nothing is.
+
+    Attributes:
+      motor: commands under way.
+      infrared: [..., R, K] the last sample, as the policy observes it.
+      seen: [..., D, R, O] observations under way, newest first.
+    """
+
+    motor: Motor | None
+    infrared: Array | None
+    seen: Array | None
+
+
+class Sight(NamedTuple):
+    """What there is to be sensed.
+
+    Attributes:
+      ray: [..., R, K] m, 0 to `Electronics.reach`.
+      reflectance: [..., R, K] of what each ray meets, or None for 1.
+      distance: [..., R] to the target, m.
+      bearing: [..., R] of the target, rad.
+    """
+
+    ray: Array
+    reflectance: Array | None
+    distance: Array
+    bearing: Array
+
+
+def load(task: TaskConfig, realism: RealismConfig, encoding: Encoding | None = None) -> Electronics:
+    """Puts the electronics together.
+
+    Args:
+      task: the task.
+      realism: the factors.
+      encoding: what a policy was trained to observe; None follows the task.
+
+    Returns:
+      The electronics.
+    """
+    return Electronics(
+        realism=realism,
+        encoding=settings.encoding(task, realism) if encoding is None else encoding,
+        sensor_range=task.sensor_range,
+        control_step=task.control_step,
+    )
+
+
+def mount(factors: Factors) -> infrared.Mount | None:
+    """How the sensors of an episode sit; None as they should."""
+    if factors.infrared_yaw is None and factors.infrared_position is None:
+        return None
+    return infrared.Mount(factors.infrared_yaw, factors.infrared_position)
+
+
+def reflectance(factors: Factors) -> infrared.Reflectance | None:
+    """How bright the things of an episode are; None where all have 1."""
+    found = infrared.Reflectance(
+        factors.reflectance_wall, factors.reflectance_obstacle, factors.reflectance_robot
+    )
+    return None if all(part is None for part in found) else found
+
+
+def begin(
+    electronics: Electronics, factors: Factors, sight: Sight, clock: Array, xp: Any
+) -> tuple[Memory, Array]:
+    """Starts an episode: nothing is under way, and what is seen first has been seen all along.
+
+    Args:
+      electronics: of the program.
+      factors: of the episode.
+      sight: where the robots start.
+      clock: [...] or [] zero.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      The memory, and the first observation [..., R, O].
+    """
+    robots = sight.ray.shape[-2]
+    fresh = _observe(electronics, None, factors, sight, clock, xp)
+    seen = None
+    if electronics.latency:
+        seen = xp.stack([fresh] * electronics.latency, axis=-3)
+    held = fresh[..., : observation.SENSORS] if factors.infrared_period is not None else None
+    queue = motor.init(electronics.realism, robots, xp)
+    leading = sight.distance.shape[:-1]
+    if queue is not None:
+        parts = (p if p is None else xp.broadcast_to(p, (*leading, *p.shape)) for p in queue)
+        queue = Motor(*parts)
+    return Memory(queue, held, seen), fresh
+
+
+def drive(
+    electronics: Electronics,
+    memory: Memory,
+    factors: Factors,
+    command: Array,
+    motors: Drive,
+    clock: Array,
+    xp: Any,
+) -> tuple[Memory, Array]:
+    """Sends commands to the wheels.
+
+    Args:
+      electronics: of the program.
+      memory: before.
+      factors: of the episode.
+      command: [..., R, 2] forward speed (m/s) and turn rate (rad/s).
+      motors: the drive as the robot's firmware knows it.
+      clock: [...] or [] control steps since the start.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      The memory after, and the speeds [..., R, 2] (rad/s) at which the wheels are driven.
+    """
+    realism = electronics.realism
+    queue, command = motor.deliver(
+        memory.motor,
+        command,
+        factors.action_latency,
+        realism,
+        factors.seed,
+        clock,
+        electronics.control_step,
+        xp,
+    )
+    if factors.max_wheel_speed is not None:
+        motors = motors._replace(max_wheel_speed=factors.max_wheel_speed[..., None])
+    wheels = sim_drive.wheel_speeds(command, motors, xp)
+    wheels = motor.disturb(wheels, realism, factors.seed, clock, xp)
+    return memory._replace(motor=queue), wheels
+
+
+def sense(
+    electronics: Electronics,
+    memory: Memory,
+    factors: Factors,
+    sight: Sight,
+    clock: Array,
+    xp: Any,
+) -> tuple[Memory, Array]:
+    """Senses what there is, and lets the policy see what has arrived of it.
+
+    Args:
+      electronics: of the program.
+      memory: before.
+      factors: of the episode.
+      sight: what there is.
+      clock: [...] or [] control steps since the start, the one just done included.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      The memory after, and the observation [..., R, O].
+    """
+    fresh = _observe(electronics, memory.infrared, factors, sight, clock, xp)
+    if memory.infrared is not None:
+        memory = memory._replace(infrared=fresh[..., : observation.SENSORS])
+    if memory.seen is None or factors.observation_latency is None:
+        return memory, fresh
+    seen = xp.concatenate([fresh[..., None, :, :], memory.seen], axis=-3)
+    late = factors.observation_latency[..., None, :, None]
+    found = xp.take_along_axis(seen, late, axis=-3)[..., 0, :, :]
+    return memory._replace(seen=seen[..., :-1, :, :]), found
+
+
+def _observe(
+    electronics: Electronics,
+    held: Array | None,
+    factors: Factors,
+    sight: Sight,
+    clock: Array,
+    xp: Any,
+) -> Array:
+    """Observes [..., R, O] what there is, infrared as of its last sample."""
+    sample = _read_infrared(electronics, factors, sight, clock, xp)
+    distance, bearing = _find_target(electronics.realism, factors, sight, clock, xp)
+    layout = observation.LAYOUTS[electronics.encoding]
+    seen = observation.observe(sample, distance, bearing, layout, xp)
+    if held is None:
+        return seen
+    due = _is_due(clock, factors.infrared_period, electronics.control_step, xp)
+    last = xp.where(due[..., None], seen[..., : observation.SENSORS], held)
+    return xp.concatenate([last, seen[..., observation.SENSORS :]], axis=-1)
+
+
+def _is_due(clock: Array, period: Array, control_step: float, xp: Any) -> Array:
+    """Tells [..., R] whether a sample fell into the control step that has just ended."""
+    clock = xp.asarray(clock, xp.float32)  # in NumPy too: both round alike, and sample at once
+    ended = clock[..., None] * control_step / period + _SLACK
+    return xp.floor(ended) > xp.floor(ended - control_step / period)
+
+
+def _read_infrared(
+    electronics: Electronics, factors: Factors, sight: Sight, clock: Array, xp: Any
+) -> Array:
+    """Samples the sensors: [..., R, K] metres or counts, as the encoding has it."""
+    kind, encoding = electronics.realism.infrared, electronics.encoding
+    if kind == "ideal":
+        ray = sight.ray
+        if factors.dead is not None:
+            ray = xp.where(factors.dead, electronics.reach, ray)
+        if encoding == "metric":
+            return xp.minimum(ray, electronics.sensor_range)
+        return response.expected("webots", ray, xp)
+    wear = response.Wear(
+        factors.infrared_noise, factors.infrared_gain, factors.infrared_offset, factors.dead
+    )
+    normal = None
+    if factors.infrared_noise is not None:
+        shape = sight.ray.shape[-2:]
+        normal = noise.normal(factors.seed, clock, Stream.INFRARED, shape, xp)
+    counts = response.read(kind, sight.ray, sight.reflectance, wear, normal, xp)
+    if kind == encoding:
+        return counts
+    # What the counts mean to a robot whose owner has calibrated it.
+    ray = response.distance(kind, counts, xp)
+    if encoding == "metric":
+        return xp.minimum(ray, electronics.sensor_range)
+    return response.expected("webots", ray, xp)
+
+
+def _find_target(
+    realism: RealismConfig, factors: Factors, sight: Sight, clock: Array, xp: Any
+) -> tuple[Array, Array]:
+    """Distance and bearing [..., R] of the targets, as an overhead camera sees them."""
+    distance, bearing = sight.distance, sight.bearing
+    robots = distance.shape[-1:]
+    if realism.target_distance_noise is not None:
+        drawn = noise.normal(factors.seed, clock, Stream.TARGET_DISTANCE, robots, xp)
+        distance = xp.maximum(distance + realism.target_distance_noise * drawn, 0.0)
+    if realism.target_bearing_noise is not None:
+        drawn = noise.normal(factors.seed, clock, Stream.TARGET_BEARING, robots, xp)
+        turned = bearing + realism.target_bearing_noise * drawn
+        bearing = xp.arctan2(xp.sin(turned), xp.cos(turned))
+    return distance, bearing

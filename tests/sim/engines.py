@@ -1,0 +1,157 @@
+"""The three engines behind one interface: MJX by `jax` and by `warp`, and MuJoCo C, either body."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from swarmjax.config import RobotConfig, SimConfig, StageConfig, TrainConfig, substeps
+from swarmjax.sim import drive, model, physics
+from swarmjax.sim.body import AS_BUILT, Chassis
+from swarmjax.task import env
+
+ARENAS, ROBOTS, OBSTACLES = 8, 3, 2
+STEP, RADIUS = 0.032, 0.037  # s, m
+BIGGEST_HALF = 0.15  # m, the bound that the model is compiled for
+FULL = 0.1256  # m/s
+AWAY = np.array([[-5.0, -5.0, 0.0, 0.05, 0.05], [-5.5, -5.0, 0.0, 0.05, 0.05]], np.float32)
+BodyName = Literal["planar", "wheeled"]
+
+
+class Path(NamedTuple):
+    """What came of driving, [T, A, R, ...]: x, y, yaw; velocities of the joints."""
+
+    pose: np.ndarray
+    rate: np.ndarray
+
+
+CHUNK = 20  # control steps of one call of `Engine.run`
+
+
+class Engine(NamedTuple):
+    """The physics of one implementation, and its compiled steps of all arenas.
+
+    `run` takes the model, data, side, obstacle, wheels [T, A, R, 2] and chassis, and returns the
+    data after, and qpos and qvel of every control step.
+    """
+
+    loaded: physics.Physics
+    run: Callable[..., Any]
+
+
+def settings(impl: Literal["jax", "warp"], body: BodyName) -> TrainConfig:
+    """Three robots and two obstacles."""
+    stage = StageConfig(
+        name="boxes", robots=ROBOTS, side=1.3, obstacles=OBSTACLES, obstacle_size=2 * BIGGEST_HALF
+    )
+    sim = SimConfig(impl=impl, max_robots=ROBOTS, max_obstacles=OBSTACLES)
+    robot = RobotConfig(body=body)
+    return TrainConfig(stage=(stage,), robot=robot, sim=sim, arenas=ARENAS, budget=10_000)
+
+
+def load(impl: Literal["jax", "warp"], body: BodyName) -> Engine:
+    """Compiles; the model is an argument of the step, so that its numbers may change."""
+    loaded = env.load(settings(impl, body)).physics
+
+    def run(model: Any, data: Any, side: Any, obstacle: Any, wheels: Any, chassis: Any) -> Any:
+        mine = dataclasses.replace(loaded, model=model)
+
+        def step(data: Any, now: Any) -> tuple[Any, Any]:
+            move = jax.vmap(lambda d, w: physics.step(mine, d, side, obstacle, w, chassis))
+            data = move(data, now)
+            return data, (data.qpos, data.qvel)
+
+        return jax.lax.scan(step, data, wheels)
+
+    return Engine(loaded, jax.jit(run))
+
+
+def start(engine: Engine, pose: np.ndarray) -> Any:
+    """Arenas [A] at rest at poses [A, R, 3] or [R, 3]."""
+    pose = np.broadcast_to(pose, (ARENAS, ROBOTS, 3)).astype(np.float32)
+    state = jax.vmap(lambda p: physics.rest(engine.loaded, p))(jnp.asarray(pose))
+    return jax.vmap(lambda s: physics.unpack(engine.loaded, s))(state)
+
+
+def wheels_of(velocity: np.ndarray) -> np.ndarray:
+    """Wheel speeds [..., 2] of forward speed and turn rate [..., 2], nothing clamped."""
+    free = drive.from_config(RobotConfig())._replace(max_wheel_speed=np.inf)
+    return drive.wheel_speeds(np.asarray(velocity, np.float64), free, np)
+
+
+def drive_all(
+    engine: Engine,
+    pose: np.ndarray,
+    wheels: np.ndarray,
+    obstacle: np.ndarray = AWAY,
+    *,
+    side: float = 0.6,
+    chassis: Chassis = AS_BUILT,
+    model: Any = None,
+) -> Path:
+    """Holds wheel speeds [T, A, R, 2] or [T, 2], from poses at rest."""
+    data, found, count = start(engine, pose), [], len(wheels)
+    if wheels.ndim == 2:
+        wheels = wheels[:, None, None]
+    wheels = np.broadcast_to(wheels, (count, ARENAS, ROBOTS, 2)).astype(np.float32)
+    # Whole chunks, so that one program serves all tests; what is driven beyond is dropped.
+    wheels = np.concatenate([wheels, np.repeat(wheels[-1:], -count % CHUNK, axis=0)])
+    model = engine.loaded.model if model is None else model
+    for now in wheels.reshape(-1, CHUNK, ARENAS, ROBOTS, 2):
+        arena = (jnp.float32(side), jnp.asarray(obstacle), jnp.asarray(now), chassis)
+        data, path = engine.run(model, data, *arena)
+        found.append(path)
+    qpos, rate = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
+    pose = np.asarray(engine.loaded.body.pose(jnp.asarray(qpos), jnp))
+    return Path(pose, rate.reshape(*pose.shape[:3], -1))
+
+
+def compile_in_c(robot: RobotConfig, obstacle: np.ndarray, steps: int) -> Any:
+    """The same model in MuJoCo C, in float64, its solver converged."""
+    size = model.ArenaSize(ROBOTS, OBSTACLES, BIGGEST_HALF)
+    spec = model.build(robot, size, STEP / steps)
+    spec.option.iterations, spec.option.tolerance = 100, 1e-14
+    spec.option.ls_iterations, spec.option.ls_tolerance = 100, 1e-6
+    built = spec.compile()
+    built.geom_size[model.ids(built, size).obstacle_geom, :2] = obstacle[:, 3:]
+    return built
+
+
+def drive_in_c(
+    robot: RobotConfig,
+    pose: np.ndarray,
+    wheels: np.ndarray,
+    obstacle: np.ndarray = AWAY,
+    *,
+    side: float = 0.6,
+    built: mujoco.MjModel | None = None,
+) -> Path:
+    """One arena [R, 3] by MuJoCo C; wheels [T, R, 2]; the path is [T, 1, R, ...]."""
+    count = substeps(robot, None)
+    built = compile_in_c(robot, obstacle, count) if built is None else built
+    data, body = mujoco.MjData(built), model.BODIES[robot.body]
+    ids = model.ids(built, model.ArenaSize(ROBOTS, OBSTACLES, BIGGEST_HALF))
+    place, turn = model.fixture_poses(side, obstacle, np)
+    data.mocap_pos[ids.fixture_mocap], data.mocap_quat[ids.fixture_mocap] = place, turn
+    data.qpos[:] = body.qpos(np.asarray(pose, np.float64), np)
+    found, rate = [], []
+    for now in np.broadcast_to(wheels, (len(wheels), ROBOTS, 2)).astype(np.float64):
+        data.ctrl[:] = body.ctrl(now, AS_BUILT, robot, np)
+        mujoco.mj_step(built, data, count)
+        found.append(np.array(body.pose(data.qpos, np)))
+        rate.append(data.qvel.reshape(ROBOTS, -1).copy())
+    return Path(np.array(found)[:, None], np.array(rate)[:, None])
+
+
+def turned(yaw: np.ndarray) -> np.ndarray:
+    """An angle [..] brought to -pi..pi."""
+    return (np.asarray(yaw) + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def alone(x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> np.ndarray:
+    """One robot at a pose [R, 3], the others far from it and from everything else."""
+    return np.array([[x, y, yaw], [5.0, 5.0, 0.0], [5.5, 5.0, 0.0]])

@@ -1,0 +1,122 @@
+"""Words of a command line and files of configs/ become settings."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from sentences import refusal
+
+from swarmjax import compose
+from swarmjax.config import StageConfig, TrainConfig, load_train
+
+ROOT = Path(compose.__file__).resolve().parent.parent
+
+
+@pytest.fixture
+def own_configs(tmp_path, monkeypatch):
+    """A copy of configs/ beside a project file, in which a test may write."""
+    shutil.copytree(ROOT / "configs", tmp_path / "configs")
+    (tmp_path / "pyproject.toml").touch()
+    monkeypatch.setattr(compose, "_PACKAGE", tmp_path / "swarmjax")
+    return tmp_path / "configs"
+
+
+# Words
+
+
+def test_groups_and_keys_in_any_order():
+    train = load_train(["stage.side=0.9", "robot=planar", "stage=s3", "algo=ppo", "algo.clip=0.1"])
+    (stage,) = train.stage
+    assert (stage.name, stage.side, stage.robots) == ("s3", 0.9, 3)
+    assert train.stage_name == "s3"
+    assert train.algo.clip == 0.1
+
+
+def test_of_a_key_given_twice_the_last_counts():
+    train = load_train(["stage=s1", "seed=1", "stage=s2", "seed=2"])
+    assert (train.stage_name, train.seed) == ("s2", 2)
+
+
+def test_keys_that_no_file_holds_can_be_given():
+    train = load_train(["task.reward.contact=-0.5", "sim.iterations=null", "run.tensorboard=false"])
+    assert train.task.reward.contact == -0.5
+    assert train.sim.iterations is None
+    assert train.run.tensorboard is False
+
+
+@pytest.mark.parametrize(
+    "path", ["runs/a=b", "a, b (1)", "it's", "~/é", "007", "1e3", "C:\\a\\", "[x]"]
+)
+def test_paths_are_taken_as_they_stand(path):
+    assert load_train([f"run.dir={path}"]).run.dir == path
+
+
+@pytest.mark.parametrize(("word", "made"), [("null", None), ("'null'", "null"), ('"a b"', "a b")])
+def test_null_and_quotes_keep_their_meaning_for_text(word, made):
+    assert load_train([f"run.dir={word}"]).run.dir == made
+
+
+def test_interpolation_reads_the_environment(monkeypatch):
+    monkeypatch.setenv("SCRATCH", "/scratch")
+    assert load_train(["run.dir=${oc.env:SCRATCH}/a"]).run.dir == "/scratch/a"
+
+
+def test_a_sequence_of_ones_own():
+    train = load_train(["stage.sequence=[s4,s2]"])
+    assert [stage.name for stage in train.stage] == ["s4", "s2"]
+    assert train.stage_name == "curriculum"
+
+
+def test_stage_name_of_a_configuration_made_by_hand():
+    one, two = StageConfig(name="a", robots=1, side=1.0), StageConfig(name="b", robots=1, side=1.0)
+    assert TrainConfig(stage=(one,), stage_name="other").stage_name == "a"
+    assert TrainConfig(stage=(one, two)).stage_name == "a-b"
+
+
+def test_a_hydra_of_the_caller_is_left_as_it_was():
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+
+    with initialize_config_dir(config_dir=str(ROOT / "configs"), version_base="1.3"):
+        outer = GlobalHydra.instance().hydra
+        assert load_train(["stage=s1"]).stage_name == "s1"
+        assert GlobalHydra.instance().hydra is outer
+    assert load_train(["stage=s2"]).stage_name == "s2"
+    assert not GlobalHydra.instance().is_initialized()
+
+
+# Files
+
+
+def test_a_stage_is_one_file(own_configs):
+    (own_configs / "stage" / "mine.yaml").write_text("name: mine\nrobots: 4\nside: 1e0\n")
+    assert load_train(["stage=mine"]).stage == (StageConfig(name="mine", robots=4, side=1.0),)
+    train = load_train(["stage.sequence=[s1,mine]"])
+    assert [stage.robots for stage in train.stage] == [2, 4]
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("name: yours\nrobots: 4\nside: 1\n", "stage.name is 'yours' in mine.yaml"),
+        ("name: mine\nside: 1\n", "stage.robots is missing"),
+        ("", "stage.name is missing"),
+        ("name: mine\nrobot: 4\nside: 1\n", "stage.robot is not a key: did you mean stage.robots?"),
+        ("name: [\n", "mine.yaml"),
+        ("- a\n", "mine.yaml"),
+    ],
+)
+def test_an_unsound_stage_file_is_one_sentence(own_configs, text, part):
+    (own_configs / "stage" / "mine.yaml").write_text(text)
+    assert part in refusal(load_train, ["stage=mine"])
+
+
+def test_configs_of_an_installed_package(tmp_path, monkeypatch):
+    package = tmp_path / "site-packages" / "swarmjax"
+    shutil.copytree(ROOT / "configs", package / "configs")
+    # Another package's folder of that name, which must not be taken for ours.
+    (tmp_path / "site-packages" / "configs").mkdir()
+    monkeypatch.setattr(compose, "_PACKAGE", package)
+    assert load_train(["stage=s1"]).stage_name == "s1"
+    shutil.rmtree(package / "configs")
+    assert refusal(load_train, []).startswith("configs is missing: ")

@@ -1,0 +1,361 @@
+"""The presets of robot and realism, number by number, and what they refuse."""
+
+import dataclasses
+import json
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sentences import refusal
+
+from swarmjax import config
+from swarmjax.config import (
+    EvaluateConfig,
+    RealismConfig,
+    RobotConfig,
+    TaskConfig,
+    TrainConfig,
+    build,
+    help_text,
+    load_evaluate,
+    load_train,
+    to_dict,
+)
+
+OFF = {item.name: None for item in dataclasses.fields(RealismConfig)}
+IDEAL = OFF | {"name": "ideal", "infrared": "ideal", "stall_time": (0.1, 0.3)}
+WEBOTS = IDEAL | {
+    "name": "webots",
+    "infrared": "webots",
+    "infrared_noise": (1.0, 1.0),
+    # 0.2 + 0.8 * 0.3 * (1 - 0.5 * 0.5) = 0.2 + 0.8 * 0.225 = 0.38.
+    "reflectance_robot": (0.38, 0.38),
+    "track": (0.057, 0.057),  # 2 * (0.026 + 0.0025)
+}
+REAL = {
+    "name": "real",
+    "infrared": "real",
+    "infrared_noise": (0.5, 2.0),  # as Webots' s is varied
+    "infrared_gain": (0.7, 1.3),
+    "infrared_offset": 3.0,
+    "infrared_yaw": 0.0349,  # 2 degrees: 2 * 3.1416 / 180 = 0.03491
+    "infrared_position": 0.001,
+    "infrared_period": (0.01, 0.05),  # 100 Hz and 20 Hz
+    "reflectance_wall": (0.35, 1.0),
+    "reflectance_obstacle": (0.35, 1.0),
+    "reflectance_robot": (0.35, 1.0),
+    "dead_sensor": 0.02,
+    "wheel_radius": (0.0198, 0.0207),
+    "wheel_mismatch": 0.005,
+    "track": (0.052, 0.0575),
+    "max_wheel_speed": (6.0, 6.9),
+    "mass": (0.13, 0.20),
+    "friction": (0.6, 1.2),
+    "speed_noise": 0.05,
+    "speed_quantisation": "epuck2",
+    "action_latency": (0, 2),
+    "stall": 0.01,
+    "stall_time": (0.1, 0.3),
+    "observation_latency": (0, 1),
+    "target_distance_noise": 0.005,
+    "target_bearing_noise": 0.0524,  # 3 degrees: 3 * 3.1416 / 180 = 0.05236
+}
+FACTORS = sorted(REAL.keys() - {"name", "infrared", "stall_time"})
+LOADS = [load_train, lambda words: load_evaluate(["policy=p", *words])]
+
+
+# Presets
+
+
+@pytest.mark.parametrize("load", LOADS, ids=["train", "evaluate"])
+@pytest.mark.parametrize(
+    ("words", "numbers"),
+    [
+        ([], IDEAL),
+        (["realism=ideal"], IDEAL),
+        (["realism=webots"], WEBOTS),
+        (["realism=real"], REAL),
+    ],
+)
+def test_realism_presets_are_the_tables_of_the_plan(load, words, numbers):
+    assert dataclasses.asdict(load(words).realism) == numbers
+
+
+@pytest.mark.parametrize("load", LOADS, ids=["train", "evaluate"])
+@pytest.mark.parametrize(
+    ("name", "body", "mass", "wheel_speed", "speed"),
+    [
+        ("planar", "planar", 0.16, 6.28, 6.28 * 0.02),
+        ("wheeled", "wheeled", 0.16, 6.28, 6.28 * 0.02),
+        ("planar_v2", "planar", 0.14, 7.536, 0.15072),  # 7.536 * 0.02 = 0.15072
+        ("wheeled_v2", "wheeled", 0.14, 7.536, 0.15072),
+    ],
+)
+def test_robot_presets_are_the_two_versions(load, name, body, mass, wheel_speed, speed):
+    assert load([f"robot={name}"]).robot == RobotConfig(
+        body=body, mass=mass, max_wheel_speed=wheel_speed, max_speed=speed
+    )
+
+
+def test_tracks_and_motor_of_the_nominal_robot():
+    robot = RobotConfig()
+    assert (robot.track, robot.effective_track, robot.motor_lag) == (0.052, 0.052, 0.0)
+    assert load_train(["robot.effective_track=0.057"]).robot == dataclasses.replace(
+        robot, effective_track=0.057
+    )
+
+
+@pytest.mark.parametrize("factor", FACTORS)
+def test_each_factor_is_switched_off_alone(factor):
+    real = load_train(["realism=real", f"realism.{factor}=null"]).realism
+    assert dataclasses.asdict(real) == REAL | {factor: None}
+
+
+@pytest.mark.parametrize(
+    ("word", "value"),
+    [
+        ("mass=[0.13,0.2]", (0.13, 0.2)),
+        ("mass=[1,2]", (1.0, 2.0)),
+        ("action_latency=[1,1]", (1, 1)),
+        ("speed_quantisation=epuck1", "epuck1"),
+        ("dead_sensor=0.5", 0.5),
+        ("infrared=real", "real"),
+    ],
+)
+def test_each_factor_is_switched_on_alone(word, value):
+    made = getattr(load_train([f"realism.{word}"]).realism, word.partition("=")[0])
+    assert (made, repr(made)) == (value, repr(value))
+
+
+def test_ranges_replace_those_of_the_preset():
+    real = load_train(["realism.friction=[0.9,1]", "realism=real"]).realism
+    assert dataclasses.asdict(real) == REAL | {"friction": (0.9, 1.0)}
+
+
+def test_round_trip_keeps_ranges():
+    train = load_train(["realism=real", "robot=wheeled_v2", "task.encoding=webots"])
+    assert build(TrainConfig, json.loads(json.dumps(to_dict(train)))) == train
+    assert to_dict(train)["realism"]["mass"] == [0.13, 0.20]
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0.011, 1.0), st.floats(0.011, 1.0))
+def test_a_range_has_its_lower_number_first(first, second):
+    if first <= second:
+        assert build(RealismConfig, {"mass": [first, second]}).mass == (first, second)
+    else:
+        sentence = refusal(build, RealismConfig, {"mass": [first, second]}, "realism.")
+        assert sentence.startswith("realism.mass is [")
+        assert sentence.endswith("]: give the lower number first.")
+
+
+# What follows from them
+
+
+@pytest.mark.parametrize(
+    ("body", "given", "count"),
+    [
+        ("planar", None, 1),
+        ("wheeled", None, 2),
+        ("planar", 3, 3),
+        ("wheeled", 1, 1),
+    ],
+)
+def test_substeps_are_those_given_or_those_of_the_body(body, given, count):
+    assert config.substeps(RobotConfig(body=body), given) == count
+
+
+def test_substeps_are_not_given_by_default():
+    assert load_train([]).sim.substeps is None
+    assert load_evaluate(["policy=p"]).substeps is None
+
+
+@pytest.mark.parametrize(
+    ("encoding", "infrared", "resolved"),
+    [
+        ("auto", "ideal", "metric"),
+        ("auto", "real", "metric"),
+        ("auto", "webots", "webots"),
+        ("metric", "webots", "metric"),
+        ("webots", "ideal", "webots"),
+    ],
+)
+def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved):
+    task, realism = TaskConfig(encoding=encoding), RealismConfig(infrared=infrared)
+    assert config.encoding(task, realism) == resolved
+
+
+# Refusals
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        # Ranges.
+        (["realism.mass=0.2"], "realism.mass is 0.2: give a range [low,high] of numbers or null."),
+        (["realism.mass=[0.2]"], "realism.mass is [0.2]: give a range [low,high] of numbers or "
+         "null."),
+        (["realism.mass=[0.1,0.2,0.3]"], "realism.mass is [0.1,0.2,0.3]: give a range [low,high] "
+         "of numbers or null."),
+        (["realism.mass=[a,b]"], "realism.mass is ['a','b']: give a range [low,high] of numbers "
+         "or null."),
+        (["realism.mass=[null,0.2]"], "realism.mass is [null,0.2]: give a range [low,high] of "
+         "numbers or null."),
+        (["realism.action_latency=[0,1.5]"], "realism.action_latency is [0,1.5]: give a range "
+         "[low,high] of whole numbers or null."),
+        (["realism.stall_time=null"], "realism.stall_time is null: give a range [low,high] of "
+         "numbers."),
+        (["realism.mass=[0.2,0.13]"], "realism.mass is [0.2,0.13]: give the lower number first."),
+        # Words.
+        (["realism=null"], "realism is 'null': give one of ideal, real, webots."),
+        (["realism=reel"], "realism is 'reel': give one of ideal, real, webots (nearest: real)."),
+        (["realism.name=real"], "realism.name cannot be given: choose a file, as in "
+         "realism=webots."),
+        (["realism.infrared=counts"], "realism.infrared is 'counts': give ideal, webots or real."),
+        (["realism.speed_quantisation=epuck"], "realism.speed_quantisation is 'epuck': give "
+         "epuck1, epuck2 or null."),
+        (["task.encoding=counts"], "task.encoding is 'counts': give auto, metric or webots."),
+        (["realism.infrared_gian=[1,1]"], "realism.infrared_gian is not a key: did you mean "
+         "realism.infrared_gain?"),
+        (["dead_sensor=0"], "dead_sensor is not a key: did you mean realism.dead_sensor?"),
+        # Sensors that have no counts.
+        (["realism.infrared_gain=[0.7,1.3]"], "realism.infrared_gain is [0.7,1.3], but infrared "
+         "is ideal and has no counts: give null, or infrared=webots or infrared=real."),
+        (["realism.infrared_offset=3"], "realism.infrared_offset is 3, but infrared is ideal and "
+         "has no counts: give null, or infrared=webots or infrared=real."),
+        (["realism=webots", "realism.infrared=ideal"], "realism.infrared_noise is [1,1], but "
+         "infrared is ideal and has no counts: give null, or infrared=webots or infrared=real."),
+        # Impossible bodies.
+        (["robot.mass=-1"], "robot.mass is -1: give more than 0.01, at most 100."),
+        (["robot.mass=0.01"], "robot.mass is 0.01: give more than 0.01, at most 100."),
+        (["realism.mass=[-0.1,0.2]"], "realism.mass is [-0.1,0.2]: give more than 0.01, at most "
+         "100."),
+        (["robot.effective_track=0.074"], "robot.effective_track is 0.074, but hull_radius is "
+         "0.037 and the wheels lie inside the hull: give less than 0.074."),
+        (["robot.wheel_radius=0.04"], "robot.wheel_radius is 0.04, but hull_radius is 0.037 and "
+         "the wheels lie inside the hull: give less than 0.037."),
+        (["realism.track=[0.052,0.08]"], "realism.track is [0.052,0.08], but robot.hull_radius "
+         "is 0.037 and the wheels lie inside the hull: give less than 0.074."),
+        (["realism.wheel_radius=[0.02,0.03]"], "realism.wheel_radius is [0.02,0.03]: give more "
+         "than 0, less than 0.03."),
+        (["robot.hull_radius=0.029", "robot.wheel_radius=0.02",
+          "realism.wheel_radius=[0.02,0.0295]"], "realism.wheel_radius is [0.02,0.0295], but "
+         "robot.hull_radius is 0.029 and the wheels lie inside the hull: give less than 0.029."),
+        # 2 * (5.1e-7 + 0.005 * 0.026^2) = 2 * (5.1e-7 + 3.38e-6) = 7.78e-6 are the wheels'.
+        (["robot=wheeled", "robot.yaw_inertia=7e-6"], "robot.yaw_inertia is 7e-06, but body is "
+         "wheeled and its wheels alone have 7.78e-06: give more than 7.78e-06."),
+        (["robot.motor_lag=-0.1"], "robot.motor_lag is -0.1: give 0 to 1."),
+        # Impossible draws.
+        (["realism.friction=[0,1]"], "realism.friction is [0,1]: give more than 0."),
+        (["realism.max_wheel_speed=[0,6]"], "realism.max_wheel_speed is [0,6]: give more than 0."),
+        (["realism.speed_noise=-0.05"], "realism.speed_noise is -0.05: give 0 to 1."),
+        (["realism.wheel_mismatch=0.5"], "realism.wheel_mismatch is 0.5: give 0 to 0.1."),
+        (["realism.dead_sensor=1.1"], "realism.dead_sensor is 1.1: give 0 to 1."),
+        (["realism.stall=2"], "realism.stall is 2: give 0 to 1."),
+        (["realism.stall_time=[0,0.3]"], "realism.stall_time is [0,0.3]: give more than 0."),
+        (["realism.target_distance_noise=-1"], "realism.target_distance_noise is -1: give 0 or "
+         "more."),
+        (["realism=real", "realism.reflectance_wall=[0,1]"], "realism.reflectance_wall is [0,1]: "
+         "give more than 0, at most 1."),
+        # Longer than the episode: 500 control steps of 0.032 s are 16 s.
+        (["realism.action_latency=[0,500]"], "realism.action_latency is [0,500], but an episode "
+         "takes 500 control steps: give less than 500."),
+        (["realism.observation_latency=[0,600]"], "realism.observation_latency is [0,600], but "
+         "an episode takes 500 control steps: give less than 500."),
+        (["realism.action_latency=[-1,2]"], "realism.action_latency is [-1,2]: give 0 to "
+         "2147483647."),
+        (["realism.infrared_period=[0.01,16]"], "realism.infrared_period is [0.01,16], but an "
+         "episode takes 16 s: give less than 16."),
+        (["realism.stall=0.01", "realism.stall_time=[1,20]"], "realism.stall_time is [1,20], but "
+         "an episode takes 16 s: give less than 16."),
+    ],
+)  # fmt: skip
+def test_train_refuses(words, sentence):
+    assert refusal(load_train, words) == sentence
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["steps=2", "realism=real"], "realism.action_latency is [0,2], but an episode takes 2 "
+         "control steps: give less than 2."),
+        # 1500 * 0.032 = 48 s.
+        (["realism.infrared_period=[1,48]"], "realism.infrared_period is [1,48], but an episode "
+         "takes 48 s: give less than 48."),
+        (["realism.track=[0.05,0.09]"], "realism.track is [0.05,0.09], but robot.hull_radius is "
+         "0.037 and the wheels lie inside the hull: give less than 0.074."),
+        (["realism.name=real"], "realism.name cannot be given: choose a file, as in "
+         "realism=webots."),
+    ],
+)  # fmt: skip
+def test_evaluate_refuses(words, sentence):
+    assert refusal(load_evaluate, ["policy=p", *words]) == sentence
+
+
+@pytest.mark.parametrize("factor", FACTORS)
+def test_metres_know_neither_noise_nor_gain_nor_reflectance(factor):
+    counted = {
+        "infrared_noise",
+        "infrared_gain",
+        "infrared_offset",
+        "reflectance_wall",
+        "reflectance_obstacle",
+        "reflectance_robot",
+    }
+    realism = {factor: REAL[factor]}
+    if factor in counted:
+        sentence = refusal(build, RealismConfig, realism)
+        assert sentence.startswith(f"{factor} is ")
+        assert ", but infrared is ideal and has no counts" in sentence
+    else:
+        assert getattr(build(RealismConfig, realism), factor) == REAL[factor]
+
+
+@pytest.mark.parametrize("factor", sorted(set(FACTORS) - {"speed_quantisation"}))
+def test_no_factor_is_negative(factor):
+    value = [-1, 0] if isinstance(REAL[factor], tuple) else -1
+    sentence = refusal(build, RealismConfig, {"infrared": "real", factor: value}, "realism.")
+    assert sentence.startswith(f"realism.{factor} is {'[-1,0]' if value != -1 else -1}: give ")
+
+
+def test_what_is_off_is_not_held_to_the_episode():
+    # The default stall_time of up to 0.3 s is not drawn, and 3 control steps take 0.096 s.
+    assert load_train(["task.step_limit=3"]).realism.stall is None
+    sentence = refusal(load_train, ["task.step_limit=3", "realism.stall=0.1"])
+    assert sentence.startswith("realism.stall_time is [0.1,0.3], but an episode takes 0.096 s")
+
+
+def test_the_inertia_of_wheels_bounds_the_wheeled_body_only():
+    assert RobotConfig(yaw_inertia=7e-6).body == "planar"
+    assert RobotConfig(body="wheeled", yaw_inertia=8e-6).yaw_inertia == 8e-6
+
+
+def test_ranges_made_by_hand_are_held_to_the_same():
+    sentence = refusal(lambda: RealismConfig(mass=(0.1, 0.2, 0.3)))
+    assert sentence == "mass is [0.1,0.2,0.3]: give two numbers."
+    assert refusal(lambda: RealismConfig(track=(0.06, 0.05))) == (
+        "track is [0.06,0.05]: give the lower number first."
+    )
+
+
+# Help
+
+
+@pytest.mark.parametrize(("cls", "command"), [(TrainConfig, "train"), (EvaluateConfig, "evaluate")])
+def test_help_gives_range_unit_and_choices(cls, command):
+    lines = [" ".join(line.split()) for line in help_text(cls, command).splitlines()]
+    assert "realism=ideal (ideal, real, webots)" in lines
+    assert "robot=planar (planar, planar_v2, wheeled, wheeled_v2)" in lines
+    assert (
+        "realism.mass=null kg; a robot and episode "
+        "(a range [low,high] of numbers more than 0.01, at most 100 or null)" in lines
+    )
+    assert (
+        "realism.action_latency=null control steps; a robot and episode "
+        "(a range [low,high] of whole numbers 0 to 2147483647 or null)" in lines
+    )
+    assert (
+        "realism.stall_time=[0.1,0.3] for how long, s; a stall "
+        "(a range [low,high] of numbers more than 0)" in lines
+    )
+    assert not any(line.startswith("realism.name") for line in lines)

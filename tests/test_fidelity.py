@@ -1,0 +1,222 @@
+"""The table of benchmarks.fidelity: some of its rows against hand-worked numbers, and its form."""
+
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sentences import refusal
+
+from benchmarks import fidelity, fidelity_body, fidelity_infrared, fidelity_motion, rig
+from benchmarks.fidelity_row import Row, beside
+from benchmarks.rig import Rig
+from swarmjax import config, evaluate
+from swarmjax.config import RobotConfig
+
+BODIES = pytest.mark.parametrize("body", ["planar", "wheeled"])
+
+
+@pytest.fixture(scope="module", params=["planar", "wheeled"])
+def bench(request: pytest.FixtureRequest) -> Rig:
+    return rig.load(RobotConfig(body=request.param))
+
+
+@pytest.fixture(scope="module")
+def wheeled() -> Rig:
+    return rig.load(RobotConfig(body="wheeled"))
+
+
+@BODIES
+def test_the_rig_steps_as_the_judge_does(body: str) -> None:
+    settings = config.load_evaluate(["policy=none", f"robot={body}"])
+    assert rig.SUBSTEPS[body] == evaluate._substeps(settings)
+    assert settings.task.control_step == rig.CONTROL_STEP
+
+
+def test_mass_and_inertia_are_those_of_the_model(bench: Rig) -> None:
+    assert fidelity_body.mass(bench) == pytest.approx(0.16, abs=1e-12)  # float64's rounding
+    # 1.06e-4, the robot's setting; MuJoCo keeps it in float64.
+    assert fidelity_body.yaw_inertia(bench) == pytest.approx(1.06e-4, rel=1e-9)
+
+
+def test_another_mass_is_measured() -> None:
+    heavy = rig.load(RobotConfig(body="wheeled", mass=0.2))
+    assert fidelity_body.mass(heavy) == pytest.approx(0.2, abs=1e-12)  # float64's rounding
+    # (0.19 * 0.015 + 0.01 * 0.02) / 0.2, but for the 0.01 mm that it stands in the floor.
+    height = 0.01525 - 1e-5
+    assert fidelity_body.centre(heavy)[2] == pytest.approx(height, abs=1e-9)
+
+
+@pytest.mark.parametrize("radius", [0.037, 0.040])
+def test_the_hull_is_felt_and_seen_at_its_radius(radius: float) -> None:
+    bench = rig.load(RobotConfig(hull_radius=radius))
+    # Float32 holds the direction of the wall's face, 1e-7 of the 2.5 m along it.
+    assert fidelity_body.contact_radius(bench) == pytest.approx(radius, abs=1e-6)
+    seen = 0.2 - fidelity_body.cast(bench, (0.2, 0.0, 0.033), (-1, 0, 0))
+    assert seen == pytest.approx(radius, abs=1e-9)  # float64's rounding
+
+
+@pytest.mark.parametrize(
+    ("command", "realised"),
+    [
+        # Wheels at 2.168 and 10.332 rad/s, of which 6.28 remain: v = 0.01 (2.168 + 6.28),
+        # w = (6.28 - 2.168) 0.02 / 0.052.
+        ((0.125, 3.14), (0.08448, 1.58154)),
+        # 7.334 and 11.416: both at their limit.
+        ((0.1875, 1.57), (0.1256, 0.0)),
+    ],
+)
+def test_a_clamped_command(
+    bench: Rig, command: tuple[float, float], realised: tuple[float, float]
+) -> None:
+    # 1e-3: creep of the wheeled body on the floor.
+    found = rig.steady(bench, *command)
+    assert found == pytest.approx(realised, rel=1e-3, abs=1e-9)
+
+
+def test_speed_along_an_arc_is_not_that_of_its_chord() -> None:
+    # A quarter of a circle of radius 1 m in 2 control steps of 0.032 s.
+    angle = np.linspace(0.0, 0.5 * math.pi, 3)
+    pose = np.stack([np.sin(angle), 1.0 - np.cos(angle), angle], axis=-1)
+    track = rig.Track(pose, pose, pose, np.zeros(3))
+    expected = 0.5 * math.pi / 0.064
+    found = rig.velocity(rig.load(RobotConfig()), track)
+    assert found == pytest.approx((expected, expected), rel=1e-12)  # float64's rounding
+
+
+def test_ten_revolutions_show_the_track(bench: Rig) -> None:
+    share, track, drift = fidelity_motion.turned(bench, 0.057)
+    assert share == pytest.approx(0.052 / 0.057, rel=1e-3)  # creep on the floor
+    assert track == pytest.approx(0.057, rel=1e-3)  # likewise
+    assert drift < 1e-6  # nothing pushes it aside
+
+
+def test_speed_above_which_no_turn_is_left() -> None:
+    # The slower wheel too is at its limit: (v - 3.14 * 0.026) / 0.02 = 6.28. The bisection stops
+    # at 1e-5, and takes turns below 1e-3 rad/s, 2.6e-5 m/s of the slower rim, for none.
+    found = fidelity_motion.turning_ends(rig.load(RobotConfig()))
+    assert found == pytest.approx(0.1256 + 0.08164, abs=6e-5)
+
+
+def test_a_start_is_limited_by_friction() -> None:
+    for friction in (1.0, 0.5):
+        bench = rig.load(RobotConfig(friction=friction), timestep=1e-4)
+        expected = 0.1256 / (friction * 9.81)
+        # One of the steps of 0.1 ms.
+        assert fidelity_motion.reach_time(bench, (0.25, 0.0)) == pytest.approx(expected, abs=1e-4)
+
+
+def test_a_lagging_motor_follows_its_closed_form(bench: Rig) -> None:
+    assert fidelity_motion.lag_error(bench) < 2e-3  # creep of the wheeled body; the planar is exact
+
+
+def test_a_skid_takes_its_share_of_a_push(wheeled: Rig) -> None:
+    track = fidelity_motion.blocked(wheeled)
+    # The wall pushes 0.015 m above the floor, the skid carries 0.6 of that at 0.025 m, and the
+    # wheels pass on what is left: F = 1.5696 N - 0.6 F. 1 %: the mean of a robot that hops.
+    assert track.force[-100:].mean() == pytest.approx(0.981, rel=0.01)
+
+
+def test_pitch_before_a_skid_touches(wheeled: Rig) -> None:
+    # atan(0.0001 / 0.025); 0.01: the floor gives way by 1e-6 m under a load of 0.04 N.
+    assert fidelity_motion.pitch_play(wheeled) == pytest.approx(0.2292, abs=0.01)
+
+
+def test_rays_before_a_wall(bench: Rig) -> None:
+    rays = fidelity_infrared.see(bench, 0.010)
+    # From x = 0.030 and 0.022 m to 0.047 m, along yaws of 0.30081 and 0.80081 rad; 1e-6 m: the
+    # direction of the wall's face in float32, 2.5 m long.
+    assert rays[0] == pytest.approx(0.017 / math.cos(0.30081), abs=1e-6)
+    assert rays[1] == pytest.approx(0.025 / math.cos(0.80081), abs=1e-6)
+    assert rays[2] == pytest.approx(1.0 - 0.031, abs=1e-6)  # to the side, through its own wheel
+
+
+def test_where_a_falling_reading_passes_a_level() -> None:
+    found = fidelity_infrared.falls_to(lambda distance: 100.0 - 1000.0 * distance, 60.0)
+    assert found == pytest.approx(0.04, abs=1e-7)  # where the bisection stops
+
+
+def test_an_error_is_that_of_the_worse_body() -> None:
+    assert Row("", "", "", 2.0, "", 2.2, 1.9).error == pytest.approx(0.1)
+    assert Row("", "", "", -2.0, "", None, -1.0).error == 0.5
+    assert Row("", "", "", 0.0, "", 1.0, 1.0).error is None
+    assert Row("", "", "", None, "", 1.0, 1.0).error is None
+    assert Row("", "", "", 1.0, "", None, None).error is None
+
+
+def test_a_row_for_each_source() -> None:
+    rows = beside("S", "q", "m", {"a": 1.0, "b": None}, (None, 2))
+    assert rows == [
+        Row("S", "q", "m", 1.0, "a", None, 2.0),
+        Row("S", "q", "m", None, "b", None, 2.0),
+    ]
+
+
+ROWS = [
+    Row("One", "q", "m", 2.0, "a", 1.0, None),
+    Row("Two", "r", "1", None, "b", 1e-15, 12.3456789),
+]
+
+
+def test_the_table_in_markdown() -> None:
+    head = "| quantity | unit | theirs | source | planar | wheeled | error |"
+    rule = "|---|---|--:|---|--:|--:|--:|"
+    assert fidelity.markdown(ROWS).splitlines() == [
+        *("### One", "", head, rule, "| q | m | 2 | a | 1 |  | 50.00 % |", ""),
+        *("### Two", "", head, rule, "| r | 1 |  | b | 0 | 12.346 |  |"),
+    ]
+
+
+def test_the_table_replaces_what_stands_between_the_markers() -> None:
+    page = "a\n<!-- fidelity -->\nold\n<!-- /fidelity -->\nb\n"
+    assert fidelity.insert(page, "new\n") == (
+        "a\n<!-- fidelity -->\n\nnew\n\n<!-- /fidelity -->\nb\n"
+    )
+
+
+@pytest.mark.parametrize("page", ["", "<!-- fidelity -->", "<!-- /fidelity --><!-- fidelity -->"])
+def test_a_page_without_its_markers_is_refused(page: str) -> None:
+    assert "<!-- fidelity -->" in refusal(fidelity.insert, page, "new")
+
+
+def test_lines_of_json(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "rows.jsonl"
+    fidelity.write_lines(path, ROWS)
+    head, *lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert head["benchmark"] == "fidelity"
+    assert {"versions", "commit", "substeps"} <= head.keys()
+    assert lines[0] == {
+        **{"section": "One", "quantity": "q", "unit": "m", "theirs": 2.0, "source": "a"},
+        **{"planar": 1.0, "wheeled": None, "error": 0.5},
+    }
+
+
+def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    assert "out is" in refusal(fidelity.write_lines, tmp_path, ROWS)
+    assert "docs is" in refusal(fidelity.write_docs, tmp_path / "none", ROWS, [])
+
+
+def test_the_page_gets_its_table_and_the_plots_it_shows(tmp_path: Path) -> None:
+    page = Path(fidelity.__file__).parents[1] / "docs" / fidelity.PAGE
+    (tmp_path / fidelity.PAGE).write_text(page.read_text())
+    benches = [rig.load(RobotConfig(body=body)) for body in ("planar", "wheeled")]
+    fidelity.write_docs(tmp_path, ROWS, benches)
+    written = (tmp_path / fidelity.PAGE).read_text()
+    assert fidelity.markdown(ROWS) in written
+    drawn = {f"figures/{path.name}" for path in (tmp_path / "figures").iterdir()}
+    assert drawn == set(re.findall(r"!\[.*?\]\((.*?)\)", written))
+    # What a repository should carry for one plot.
+    assert max((tmp_path / name).stat().st_size for name in drawn) < 80_000
+
+
+@pytest.mark.parametrize(
+    ("word", "part"), [("dcs=x", "did you mean docs?"), ("out", "give key=value")]
+)
+def test_words_that_are_refused(word: str, part: str) -> None:
+    assert part in refusal(fidelity.load, [word])
+
+
+def test_a_path_may_look_like_a_number() -> None:
+    assert fidelity.load(["out=3"]) == fidelity.FidelityConfig(out="3")
