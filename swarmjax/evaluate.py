@@ -339,6 +339,8 @@ def _models(judge: Judge, factors: Factors, count: int) -> np.ndarray:
         changes = body.changes(mine, judge.ids.robots, judge.config.robot, judge.model)
         for name, (rows, values) in changes.items():
             getattr(models[i], name)[rows] = values
+        # What MuJoCo derives from them: it reads the inertia of a planar robot from there.
+        mujoco.mj_setConst(models[i], mujoco.MjData(models[i]))
     return models
 
 
@@ -595,11 +597,7 @@ def evaluate(
         PolicyError: If the policy does not fit the stage.
         ConfigError: If the physics breaks down.
     """
-    parts = []
-    for part in _simulate_all(config, trained):
-        parts.append(part)
-        report(len(part.clock))
-    outcome = Outcome(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+    outcome = outcomes(config, trained, report)
     return summarize(outcome, config.task.control_step) | {
         "episodes": config.episodes,
         "engine": config.engine,
@@ -612,6 +610,30 @@ def evaluate(
         "policy_digest": trained.digest,
         "versions": provenance.versions(),
     }
+
+
+def outcomes(
+    config: EvaluateConfig, trained: Policy, report: Callable[[int], None] = lambda _: None
+) -> Outcome:
+    """Runs all episodes of an evaluation.
+
+    Args:
+        config: Of the evaluation.
+        trained: The policy.
+        report: Told how many more episodes are over, now and then.
+
+    Returns:
+        What they came to, in their order.
+
+    Raises:
+        PolicyError: If the policy does not fit the stage.
+        ConfigError: If the physics breaks down.
+    """
+    parts = []
+    for part in _simulate_all(config, trained):
+        parts.append(part)
+        report(len(part.clock))
+    return Outcome(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
 
 
 def _simulate_all(config: EvaluateConfig, trained: Policy) -> Iterator[Outcome]:
@@ -650,8 +672,8 @@ def summarize(outcome: Outcome, control_step: float) -> dict[str, Any]:
         share of robot steps before arrival with anything in infrared range; mean times of an
         episode and of an arrival (s, null where none arrived).
     """
-    reached = outcome.arrived.mean(axis=-1)
-    complete = outcome.arrived.all(axis=-1)
+    level_by_level = per_level(outcome, control_step)
+    reached, complete = level_by_level["targets_reached"], level_by_level["all_reached"]
     contacts = outcome.contacts.mean(axis=(0, 1))
     arrivals = outcome.arrival[outcome.arrived]
     return {
@@ -662,8 +684,26 @@ def summarize(outcome: Outcome, control_step: float) -> dict[str, Any]:
         "contacts_per_robot": float(contacts.sum()),
         "contacts_per_robot_by_kind": dict(zip(gaps.KINDS, contacts.tolist(), strict=True)),
         "ir_steps_share": float(outcome.sensed.sum() / outcome.moving.sum()),
-        "episode_time_s": float(outcome.clock.mean() * control_step),
+        "episode_time_s": float(level_by_level["episode_time_s"].mean()),
         "arrival_time_s": float(arrivals.mean() * control_step) if len(arrivals) else None,
+    }
+
+
+def per_level(outcome: Outcome, control_step: float) -> dict[str, np.ndarray]:
+    """What each episode came to.
+
+    Args:
+        outcome: Of all episodes.
+        control_step: s.
+
+    Returns:
+        [A] each: share of targets reached, whether all were, contacts a robot, and time (s).
+    """
+    return {
+        "targets_reached": outcome.arrived.mean(axis=-1),
+        "all_reached": outcome.arrived.all(axis=-1).astype(float),
+        "contacts_per_robot": outcome.contacts.sum(axis=-1).mean(axis=-1),
+        "episode_time_s": outcome.clock * control_step,
     }
 
 
