@@ -4,8 +4,9 @@ import dataclasses
 import json
 import math
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +14,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from swarmjax import command, evaluate, policy
+from swarmjax import command, config, evaluate, policy
 from swarmjax.config import (
     ConfigError,
     EvaluateConfig,
+    RealismConfig,
+    RobotConfig,
     SimConfig,
     StageConfig,
     TaskConfig,
@@ -24,8 +27,10 @@ from swarmjax.config import (
 )
 from swarmjax.evaluate import Arenas, Judge, Outcome
 from swarmjax.policy import PolicyError
-from swarmjax.sim import gaps, physics
-from swarmjax.task import env, level, observation
+from swarmjax.sim import gaps, infrared, model, physics
+from swarmjax.task import env, observation, senses
+from swarmjax.task.env import EnvState, TimeStep, World
+from swarmjax.task.level import Level
 
 SPEED = 0.1256  # m/s, the largest command
 STEP = 0.032  # s, a control step
@@ -85,22 +90,27 @@ def _start(
     judge: Judge, pose: list, target: list | None = None, obstacle: list | None = None
 ) -> Arenas:
     """Starts one arena by hand; without a target it lies far ahead, out of reach."""
+    return evaluate.start(judge, [_level(judge, pose, target, obstacle)])
+
+
+def _level(
+    judge: Judge,
+    pose: list,
+    target: list | None = None,
+    obstacle: list | None = None,
+    seed: int = 0,
+) -> Level:
     start = np.array(pose, np.float32)
     ahead = np.stack([np.cos(start[:, 2]), np.sin(start[:, 2])], axis=-1)
     robots, obstacles = len(start), len(obstacle or [])
-    return evaluate.start(
-        judge,
-        [
-            level.Level(
-                side=judge.stage.side,
-                present=np.ones(robots, bool),
-                start=start,
-                target=start[:, :2] + 100 * ahead if target is None else np.array(target),
-                obstacle_present=np.ones(obstacles, bool),
-                obstacle=np.array(obstacle or np.zeros((0, 5)), np.float32),
-                seed=np.uint32(0),
-            )
-        ],
+    return Level(
+        side=judge.stage.side,
+        present=np.ones(robots, bool),
+        start=start,
+        target=start[:, :2] + 100 * ahead if target is None else np.array(target),
+        obstacle_present=np.ones(obstacles, bool),
+        obstacle=np.array(obstacle or np.zeros((0, 5)), np.float32),
+        seed=np.uint32(seed),
     )
 
 
@@ -275,6 +285,279 @@ def test_the_judge_counts_what_the_training_environment_counts(tmp_path: Path) -
     np.testing.assert_array_equal(state.episode.sensed, arenas.outcome.sensed[0])
     np.testing.assert_array_equal(state.episode.moving, arenas.outcome.moving[0])
     assert arenas.outcome.contacts.sum(axis=(0, 1))[:2].min() >= 2  # both kinds did occur
+
+
+# --- the same level in training
+
+
+class Engines(NamedTuple):
+    """The judge, and the training environment of the same words: one arena, compiled."""
+
+    judge: Judge
+    world: World
+    reset: Callable[[Level], EnvState]
+    step: Callable[[EnvState, jax.Array], tuple[EnvState, TimeStep]]
+
+
+@pytest.fixture(
+    scope="module",
+    params=[("wheeled", "ideal"), ("planar", "real"), ("wheeled", "real")],
+    ids="-".join,
+)
+def engines(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Engines:
+    """As they come of the YAML files, with the same physics steps."""
+    body, realism = request.param
+    path = _policy(tmp_path_factory.mktemp("engines") / "policy.npz")
+    arena = ["stage=s6", "stage.robots=3", "stage.side=0.7", "stage.obstacles=1"]
+    words = [*arena, f"robot={body}", f"realism={realism}"]
+    sim = ["sim.impl=jax", "sim.max_robots=3", "sim.max_obstacles=1"]
+    world = env.load(config.load_train([*words, *sim]))
+    steps = f"substeps={world.physics.substeps}"
+    judged = config.load_evaluate([f"policy={path}", steps, *words])
+    assert judged.realism.name == realism
+    zero = jnp.zeros((), jnp.int32)
+
+    def reset(drawn: Level) -> EnvState:
+        state = env.reset(world, drawn, zero, zero)
+        return dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
+
+    step = jax.jit(lambda state, action: env.step(world, state, action))
+    return Engines(evaluate.load(judged, policy.load(path)), world, jax.jit(reset), step)
+
+
+def _draw(engines: Engines) -> Level:
+    """An episode in which robots meet one another and the obstacle."""
+    return evaluate.draw_level(engines.judge.stage, engines.judge.spacing, 1, 65)
+
+
+def _train(engines: Engines, drawn: Level, steps: int) -> tuple[list[EnvState], list[np.ndarray]]:
+    """Drives by the policy; returns states and observations [R, O], the first ones included."""
+    states = [engines.reset(drawn)]
+    seen = [np.asarray(states[0].observation)]
+    for _ in range(steps):
+        action = policy.mean_action(engines.judge.policy, seen[-1])
+        state, came = engines.step(states[-1], jnp.asarray(action))
+        states.append(state)
+        seen.append(np.asarray(came.observation))
+    return states, seen
+
+
+def test_judge_and_training_see_the_same_and_count_the_same(engines: Engines) -> None:
+    drawn, steps = _draw(engines), 64
+    states, seen = _train(engines, drawn, steps)
+    arenas = evaluate.start(engines.judge, [drawn])
+    for theirs, mine in zip(states[0].factors, arenas.factors, strict=True):
+        assert (theirs is None) == (mine is None)
+        if theirs is not None and mine is not None:
+            # The rounding of low + u * (high - low), and of log and cos.
+            np.testing.assert_allclose(theirs, mine[0], rtol=2e-6, atol=1e-6)
+    touched = False
+    for state, found in zip(states, seen, strict=True):
+        off = np.abs(found - arenas.observation[0])
+        off[:, 9] = np.minimum(off[:, 9], 2 * math.pi - off[:, 9])
+        if touched:
+            # Two solvers push alike to about a millimetre; a robot that pushes slips and turns.
+            assert off[:, 8].max() < 1e-3
+        else:
+            # Float32 against double: 1e-7 m and, near a target, 1e-5 rad. Where speeds are
+            # quantised it may turn into 2 % of a wheel's for a step; in this episode it does not.
+            assert off.max() < 5e-5
+            np.testing.assert_array_equal(state.episode.sensed, arenas.outcome.sensed[0])
+        np.testing.assert_array_equal(state.episode.contacts, arenas.outcome.contacts[0])
+        np.testing.assert_array_equal(state.arrived, arenas.outcome.arrived[0])
+        touched = bool(arenas.outcome.contacts.any())
+        arenas = evaluate.step(engines.judge, arenas)
+    assert touched
+    assert (seen[-1][:, :8] < 0.04).any()
+
+
+def test_a_level_replays_exactly(engines: Engines) -> None:
+    drawn, steps = _draw(engines), 50
+    states, seen = _train(engines, drawn, steps)
+    again, seen_again = _train(engines, drawn, steps)
+    np.testing.assert_array_equal(seen, seen_again)
+    np.testing.assert_array_equal(states[-1].sim.qpos, again[-1].sim.qpos)
+    first, second = (
+        _run(engines.judge, evaluate.start(engines.judge, [drawn, drawn]), steps) for _ in range(2)
+    )
+    np.testing.assert_array_equal(first.observation, second.observation)
+    np.testing.assert_array_equal(first.observation[0], first.observation[1])
+    for one, other in zip(first.data, second.data, strict=True):
+        np.testing.assert_array_equal(one.qpos, other.qpos)
+    # What is random about it comes from its seed, and nothing else does.
+    other = drawn._replace(seed=drawn.seed ^ np.uint32(1))
+    _, elsewhere = _train(engines, other, steps)
+    judged = _run(engines.judge, evaluate.start(engines.judge, [other]), steps)
+    is_random = engines.world.config.realism.name == "real"
+    assert (np.array(elsewhere) != np.array(seen)).any() == is_random
+    assert (judged.observation[0] != first.observation[0]).any() == is_random
+
+
+# --- one factor at a time
+
+# Two robots that push each other, one beside the east wall, one before an obstacle; they drive
+# gently to the left, whatever they see.
+CROWD = [[-0.038, 0.0, 0.0], [0.038, 0.0, 3.0], [0.45, 0.0, 1.0], [0.0, -0.3, 0.0]]
+BOX = [[0.11, -0.3, 0.0, 0.05, 0.05]]
+CURVE = ((0.4, 0.2), (0.0, 0.0), (0.0, 0.0))
+PUSHING, ALL = [0, 1], [0, 1, 2, 3]
+BODIES = pytest.mark.parametrize("body", ["planar", "wheeled"])
+BodyName = Literal["planar", "wheeled"]
+
+
+def _tour(tmp_path: Path, body: BodyName, **realism: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Poses [T, R, 3] and observations [T + 1, R, O] of the crowd."""
+    stage, real = _stage(robots=4, obstacles=1), RealismConfig(infrared="real", **realism)
+    judge = _judge(tmp_path, stage, CURVE, robot=RobotConfig(body=body), realism=real)
+    arenas = _start(judge, CROWD, obstacle=BOX)
+    path, seen = [], [arenas.observation[0]]
+    for _ in range(12):
+        arenas = evaluate.step(judge, arenas)
+        path.append(model.BODIES[body].pose(arenas.data[0].qpos.copy(), np))
+        seen.append(arenas.observation[0])
+    return np.array(path), np.array(seen)
+
+
+def _robots_apart(one: np.ndarray, other: np.ndarray, least: float = 0.0) -> list[int]:
+    """Robots of which anything [T, R, ...] differs by more than the least."""
+    return np.flatnonzero((np.abs(one - other) > least).any(axis=(0, 2))).tolist()
+
+
+@BODIES
+@pytest.mark.parametrize(
+    ("factor", "value"),
+    [
+        ("mass", (0.13, 0.20)),
+        ("friction", (0.1, 0.1)),
+        ("wheel_radius", (0.0198, 0.0198)),
+        ("wheel_mismatch", 0.02),
+        ("track", (0.057, 0.057)),
+        ("max_wheel_speed", (2.0, 2.0)),
+        ("speed_noise", 0.05),
+        ("speed_quantisation", "epuck1"),
+        ("action_latency", (1, 2)),
+        ("stall", 1.0),
+    ],
+)
+def test_a_factor_of_the_drive_moves_the_robots_alone(
+    tmp_path: Path, body: BodyName, factor: str, value: Any
+) -> None:
+    path, seen = _tour(tmp_path, body)
+    moved, felt = _tour(tmp_path, body, **{factor: value})
+    np.testing.assert_array_equal(seen[0], felt[0])  # before anything moves
+    # Robots of any mass drive alike until they push: grip grows with the mass.
+    assert _robots_apart(path, moved, 1e-5) == (PUSHING if factor == "mass" else ALL)  # m, rad
+    if factor == "mass" and body == "planar":
+        # Servos for another mass: the ratio is rounded, 1e-16 of 1e-1 m twelve times.
+        assert _robots_apart(path, moved, 1e-12) == PUSHING
+    if factor == "stall":
+        # Float32 poses; and a wheeled robot's heading goes through a quaternion.
+        np.testing.assert_allclose(moved, np.broadcast_to(CROWD, moved.shape), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("factor", "value", "robots"),
+    [
+        ("infrared_noise", (1.0, 1.0), ALL),
+        ("infrared_gain", (0.7, 0.7), ALL),
+        ("infrared_offset", 3.0, ALL),
+        ("infrared_yaw", 0.0349, ALL),
+        ("infrared_position", 0.001, ALL),
+        ("infrared_period", (0.05, 0.05), ALL),
+        ("dead_sensor", 1.0, ALL),
+        ("reflectance_wall", (0.5, 0.5), [2]),
+        ("reflectance_obstacle", (0.5, 0.5), [3]),
+        ("reflectance_robot", (0.5, 0.5), PUSHING),
+    ],
+)
+def test_a_factor_of_the_sensors_changes_what_they_see_alone(
+    tmp_path: Path, factor: str, value: Any, robots: list[int]
+) -> None:
+    path, seen = _tour(tmp_path, "planar")
+    moved, felt = _tour(tmp_path, "planar", **{factor: value})
+    np.testing.assert_array_equal(path, moved)
+    np.testing.assert_array_equal(seen[..., 8:], felt[..., 8:])
+    assert _robots_apart(seen[..., :8], felt[..., :8]) == robots
+    if factor == "dead_sensor":
+        np.testing.assert_array_equal(felt[..., :8], np.float32(0.04))
+    if factor.startswith("reflectance"):
+        assert (felt[..., :8] >= seen[..., :8]).all()  # what is darker seems further away
+
+
+@pytest.mark.parametrize(
+    ("factor", "value", "entry"),
+    [("target_distance_noise", 0.005, 8), ("target_bearing_noise", 0.05, 9)],
+)
+def test_noise_of_the_target_is_of_its_entry_alone(
+    tmp_path: Path, factor: str, value: float, entry: int
+) -> None:
+    path, seen = _tour(tmp_path, "planar")
+    moved, felt = _tour(tmp_path, "planar", **{factor: value})
+    np.testing.assert_array_equal(path, moved)
+    others = np.arange(observation.SIZE) != entry
+    np.testing.assert_array_equal(seen[..., others], felt[..., others])
+    assert (seen[..., entry] != felt[..., entry]).all()
+
+
+def test_a_late_observation_is_that_of_the_step_before(tmp_path: Path) -> None:
+    path, seen = _tour(tmp_path, "planar")
+    moved, felt = _tour(tmp_path, "planar", observation_latency=(1, 1))
+    np.testing.assert_array_equal(path, moved)
+    np.testing.assert_array_equal(felt[1:], seen[:-1])
+    np.testing.assert_array_equal(felt[0], seen[0])
+
+
+def test_the_judge_sees_how_bright_each_thing_is(tmp_path: Path) -> None:
+    shade: Any = (0.3, 1.0)
+    real = RealismConfig(
+        infrared="real",
+        reflectance_wall=shade,
+        reflectance_obstacle=shade,
+        reflectance_robot=shade,
+    )
+    judge = _judge(tmp_path, _stage(robots=3, side=0.7, obstacles=2), realism=real)
+    levels = [evaluate.draw_level(judge.stage, judge.spacing, 1, n) for n in range(200)]
+    # Closer together than they would ever start.
+    levels = [drawn._replace(start=drawn.start * np.float32([1.0, 0.7, 1.0])) for drawn in levels]
+    arenas = evaluate.start(judge, levels)
+    pose, side, box = (
+        np.array([getattr(drawn, name) for drawn in levels], np.float64)
+        for name in ("start", "side", "obstacle")
+    )
+    args = (arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)
+    sight, shades = evaluate.look(judge, *args), senses.reflectance(arenas.factors)
+    assert shades is not None
+    assert sight.reflectance is not None
+    ray, bright = infrared.sights(pose, side, box, 0.037, 0.1, shades, None, np)
+    # Of what overlaps its origin a ray of MuJoCo's does not say which it is.
+    apart = (ray > 0.0) & (sight.ray > 0.0) & (ray < 0.1)
+    # 1e-6 m: float32 in the walls' quaternions. The shades are numbers of a table.
+    np.testing.assert_allclose(sight.ray[apart], ray[apart], atol=1e-6)
+    np.testing.assert_array_equal(sight.reflectance[apart], bright[apart])
+    for each in shades:
+        assert np.isin(bright[apart], each).mean() > 0.05  # every kind is seen
+
+
+@BODIES
+def test_each_arena_has_robots_of_its_own(tmp_path: Path, body: BodyName) -> None:
+    """The heavier robot has the better grip, and pushes the lighter one back."""
+    real = RealismConfig(mass=(0.05, 0.5))
+    judge = _judge(tmp_path, _stage(robots=2), AHEAD, robot=RobotConfig(body=body), realism=real)
+    levels = [
+        _level(judge, [[-0.04, 0.0, 0.0], [0.04, 0.0, math.pi]], seed=seed) for seed in range(6)
+    ]
+    arenas = evaluate.start(judge, levels)
+    mass = arenas.factors.mass
+    assert mass is not None
+    for one, found in zip(arenas.model, mass, strict=True):
+        rows = judge.ids.robots.bodies
+        np.testing.assert_allclose(one.body_mass[rows].sum(axis=1), found, rtol=1e-6)  # float32
+    np.testing.assert_allclose(judge.model.body_mass[judge.ids.robots.bodies].sum(axis=1), 0.16)
+    arenas = _run(judge, arenas, 30)
+    pose = np.stack([model.BODIES[body].pose(data.qpos, np) for data in arenas.data])
+    heavier = np.where(mass[:, 0] > mass[:, 1], 1.0, -1.0)
+    assert len(set(heavier)) == 2
+    assert (pose[..., 0].mean(axis=1) * heavier > 1e-3).all()
 
 
 def test_an_episode_does_not_depend_on_those_beside_it(tmp_path: Path) -> None:

@@ -10,8 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from swarmjax import config, rollout
 from swarmjax.sim import gaps, infrared, physics
 from swarmjax.task import env, observation
+from swarmjax.task import factors as task_factors
+from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, TimeStep, World
 from swarmjax.task.level import Level
 
@@ -375,3 +378,85 @@ def test_a_broken_arena_is_over_and_teaches_nothing(
     np.testing.assert_array_equal(state.distance[BUMPING], before)  # seen where it last was
     for total in state.episode:
         assert np.isfinite(total).all()
+
+
+# --- realism
+
+
+class Drawn(NamedTuple):
+    """Real robots: a program that moves and restarts arenas, and where it was traced."""
+
+    world: World
+    start: EnvState
+    step: ArenaStep
+    traces: list[Any]
+
+
+FEW, LIFE = 4, 40  # arenas, and control steps of an episode
+
+
+@pytest.fixture(scope="module")
+def real() -> Drawn:
+    """Two robots that drive about an obstacle, with all that realism makes of them."""
+    arena = ["stage=s2", "stage.obstacles=1", "sim.max_robots=3", "sim.max_obstacles=1"]
+    size = [f"arenas={FEW}", f"task.step_limit={LIFE}", "algo.minibatches=2", "budget=1000000"]
+    world = env.load(config.load_train([*arena, *size, "realism=real", "sim.impl=jax"]))
+    stages = task_stage.stack(world.config.stage)
+    draw = jax.jit(functools.partial(rollout.draw_starts, world, stages, np.zeros(FEW, np.int32)))
+    starts = [draw(jnp.int32(cohort), jax.random.key(cohort)) for cohort in range(2)]
+    traces = []
+
+    def step(state: EnvState, action: jax.Array) -> tuple[EnvState, TimeStep]:
+        traces.append(jax.tree.structure(state))
+        state, came = jax.vmap(functools.partial(env.step, world))(state, action)
+        return rollout.restart(state, starts[1], came.done), came
+
+    sim = jax.vmap(functools.partial(physics.unpack, world.physics))(starts[0].sim)
+    return Drawn(world, dataclasses.replace(starts[0], sim=sim), jax.jit(step), traces)
+
+
+def test_real_robots_drive_for_many_episodes(real: Drawn) -> None:
+    random, state, ended, cohorts = np.random.default_rng(0), real.start, [], []
+    before = jax.tree.structure(state)
+    kinds = jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), state)
+    for _ in range(200):
+        action = random.uniform(-1.0, 1.0, (FEW, 3, 2)).astype(np.float32)
+        state, came = real.step(state, jnp.asarray(action))
+        ended.append(np.asarray(came.done))
+        cohorts.append(np.asarray(state.cohort))
+        assert np.asarray(came.sound).all()
+        for leaf in jax.tree.leaves((_slim(state), came)):
+            assert np.isfinite(leaf).all()
+    # One trace: what is None stays None, and every array keeps its shape and kind.
+    assert real.traces == [before]
+    assert jax.tree.structure(state) == before
+    assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), state) == kinds
+    # Time runs out every 40 steps, or all arrive before.
+    assert (np.sum(ended, axis=0) >= 200 // LIFE).all()
+    assert (cohorts[0] == 0).all()
+    assert (cohorts[-1] == 1).all()
+
+
+def test_a_restarted_arena_has_the_robots_of_its_new_episode(real: Drawn) -> None:
+    state = dataclasses.replace(real.start, clock=jnp.array([0, LIFE - 1, 0, LIFE - 1], jnp.int32))
+    action = jnp.ones((FEW, 3, 2))
+    after, came = real.step(state, action)
+    assert came.done.tolist() == [False, True, False, True]
+    assert after.clock.tolist() == [1, 0, 1, 0]
+    new = np.asarray(came.done)
+    np.testing.assert_array_equal(after.level.seed != state.level.seed, new)
+    seeds, settings = np.asarray(after.level.seed), real.world.config
+    expected = task_factors.draw(seeds, settings.realism, settings.robot, 3, 1, np)
+    for found, mine in zip(after.factors, expected, strict=True):
+        assert found is not None
+        assert mine is not None
+        # The rounding of low + u * (high - low), and of log and cos.
+        np.testing.assert_allclose(found, mine, rtol=2e-6, atol=1e-6)
+    # Nothing of the old episode is under way: no command was sent, and all that has been seen is
+    # what is seen now.
+    motor, infrared, seen = jax.tree.map(np.asarray, after.memory)
+    assert motor.queue[~new, 0].all()
+    assert not motor.queue[new].any()
+    assert not motor.held[new].any()
+    np.testing.assert_array_equal(seen[new, 0], after.observation[new])
+    np.testing.assert_array_equal(infrared[new], after.observation[new][..., :8])

@@ -1,0 +1,546 @@
+"""Commands on their way to the wheels and sensors on theirs to the policy, by hand."""
+
+import math
+from types import ModuleType
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmjax import config
+from swarmjax.config import RealismConfig, RobotConfig, TaskConfig
+from swarmjax.sim import drive as sim_drive
+from swarmjax.sim import infrared, noise
+from swarmjax.sim.motor import Motor
+from swarmjax.sim.noise import Stream
+from swarmjax.task import factors as task_factors
+from swarmjax.task import observation, senses
+from swarmjax.task.factors import Factors
+from swarmjax.task.senses import Electronics, Memory, Sight
+
+MODULES = pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
+ENCODINGS = pytest.mark.parametrize("encoding", ["metric", "webots"])
+RESPONSES = pytest.mark.parametrize("kind", ["ideal", "webots", "real"])
+Encoding = Literal["metric", "webots"]
+Kind = Literal["ideal", "webots", "real"]
+ARENAS, ROBOTS, SENSORS = 2, 3, 8
+STEP, RANGE, RISE = 0.032, 0.04, math.cos(0.16)  # s, m, and of a ray that is 1 m long
+MOTORS = sim_drive.from_config(RobotConfig())
+SEED = np.array([11, 12], np.uint32)  # of each arena
+RATE = 2 * math.pi / 1000  # rad/s at one step of the motor per second
+# Float32 rounds counts of up to 4095 / 1023 by 2.4e-7, distances by less; the steepest slope of
+# the table, 380 / m, times 4e-9 m adds 1.5e-6.
+ROUNDING = 2e-6
+FREE = 67.19  # counts of Webots' sensor that sees nothing
+
+
+def _electronics(encoding: Encoding | None = None, **realism: Any) -> Electronics:
+    return senses.load(TaskConfig(), RealismConfig(**realism), encoding)
+
+
+def _factors(xp: ModuleType, **fields: Any) -> Factors:
+    """Factors of all arenas; whatever is given is broadcast to them."""
+    shapes = {"infrared_period": (ROBOTS,), "observation_latency": (ROBOTS,), "seed": ()}
+    shapes |= {"action_latency": (ROBOTS,), "max_wheel_speed": (ROBOTS,)}
+    full = {}
+    for name, value in fields.items():
+        kind = np.asarray(value).dtype
+        kind = np.float32 if kind == np.float64 else kind
+        shape = (ARENAS, *shapes.get(name, (ROBOTS, SENSORS)))
+        full[name] = xp.asarray(np.broadcast_to(np.asarray(value, kind), shape))
+    return Factors(**full)
+
+
+def _sight(
+    xp: ModuleType,
+    ray: Any = 1.0,
+    distance: Any = 0.3,
+    bearing: Any = math.pi / 2,
+    reflectance: Any = None,
+    arenas: int = ARENAS,
+) -> Sight:
+    """What all robots of all arenas see."""
+
+    def full(value: Any, *axes: int) -> Any:
+        return xp.asarray(np.broadcast_to(np.float32(value), (arenas, ROBOTS, *axes)))
+
+    bright = None if reflectance is None else full(reflectance, SENSORS)
+    return Sight(full(ray, SENSORS), bright, full(distance), full(bearing))
+
+
+def _clock(xp: ModuleType, clock: int) -> Any:
+    """As the judge counts: one for each arena."""
+    return xp.full(ARENAS, clock)
+
+
+def _first(electronics: Electronics, found: Factors, sight: Sight, xp: ModuleType) -> np.ndarray:
+    """The first observation [A, R, O]."""
+    return np.asarray(senses.begin(electronics, found, sight, _clock(xp, 0), xp)[1])
+
+
+# --- what is the same for every episode
+
+
+@pytest.mark.parametrize(
+    ("kind", "encoding", "sensor_range", "expected"),
+    [
+        ("ideal", "metric", 0.04, 0.04),
+        ("ideal", "webots", 0.04, 0.07 * RISE),  # the end of Webots' table, seen from above
+        ("webots", "metric", 0.04, 0.07 * RISE),
+        ("webots", "webots", 0.04, 0.07 * RISE),
+        ("real", "metric", 0.04, 0.10),
+        ("real", "webots", 0.04, 0.10),
+        ("ideal", "metric", 0.5, 0.5),
+        ("real", "metric", 0.5, 0.5),
+    ],
+)
+def test_reach(kind: Kind, encoding: Encoding, sensor_range: float, expected: float) -> None:
+    task = TaskConfig(sensor_range=sensor_range)
+    assert senses.load(task, RealismConfig(infrared=kind), encoding).reach == expected
+
+
+@pytest.mark.parametrize(("bounds", "expected"), [(None, 0), ((0, 0), 0), ((1, 3), 3)])
+def test_the_largest_latency_of_an_observation(bounds: Any, expected: int) -> None:
+    assert _electronics(observation_latency=bounds).latency == expected
+
+
+def test_a_policy_observes_what_it_was_trained_to() -> None:
+    assert _electronics(infrared="webots").encoding == "webots"
+    assert _electronics(infrared="real").encoding == "metric"
+    assert _electronics("metric", infrared="webots").encoding == "metric"
+    task = TaskConfig(encoding="webots", sensor_range=0.03, control_step=0.02)
+    found = senses.load(task, RealismConfig())
+    assert (found.encoding, found.sensor_range, found.control_step) == ("webots", 0.03, 0.02)
+
+
+@MODULES
+def test_mount_and_reflectance_are_there_if_any_part_of_them_is(xp: ModuleType) -> None:
+    off = Factors(mass=xp.ones((ARENAS, ROBOTS)))
+    assert senses.mount(off) is None
+    assert senses.reflectance(off) is None
+    yaw, place = xp.ones((2, 3, 8)), xp.ones((2, 3, 8, 2))
+    wall, box, robot = xp.ones(2), xp.ones((2, 4)), xp.ones((2, 3))
+    assert senses.mount(Factors(infrared_yaw=yaw)) == infrared.Mount(yaw, None)
+    assert senses.mount(Factors(infrared_position=place)) == infrared.Mount(None, place)
+    for name, shade in (("wall", wall), ("obstacle", box), ("robot", robot)):
+        found = senses.reflectance(Factors(**{f"reflectance_{name}": shade}))
+        assert found is not None
+        assert [part is shade for part in found] == [part == name for part in found._fields]
+
+
+# --- nothing is on
+
+
+@MODULES
+@ENCODINGS
+def test_with_all_factors_off_nothing_is_touched(xp: ModuleType, encoding: Encoding) -> None:
+    electronics, off = _electronics(encoding), Factors()
+    ray = np.random.default_rng(0).uniform(0.0, 0.069, (ARENAS, ROBOTS, SENSORS))
+    sight = _sight(xp, ray, 0.7, -3.0)
+    memory, seen = senses.begin(electronics, off, sight, _clock(xp, 0), xp)
+    assert memory == Memory(None, None, None)
+    command = xp.asarray(np.random.default_rng(1).uniform(-3, 3, (ARENAS, ROBOTS, 2)))
+    memory, wheels = senses.drive(electronics, memory, off, command, MOTORS, _clock(xp, 0), xp)
+    assert memory == Memory(None, None, None)
+    memory, again = senses.sense(electronics, memory, off, sight, _clock(xp, 1), xp)
+    assert memory == Memory(None, None, None)
+    np.testing.assert_array_equal(wheels, sim_drive.wheel_speeds(command, MOTORS, xp))
+    np.testing.assert_array_equal(seen, again)
+    assert seen.dtype == np.float32
+    if encoding == "metric":
+        np.testing.assert_array_equal(seen[..., :8], np.minimum(np.float32(ray), np.float32(0.04)))
+        np.testing.assert_array_equal(seen[..., 8], np.float32(0.7))
+        np.testing.assert_array_equal(seen[..., 9], np.float32(-3.0))
+
+
+# --- what is observed
+
+# Every sensor has something 12 mm ahead, of reflectance 0.5, but for ps0. Of the others, ps2 and
+# ps5 look straight out through 6 mm of the robot, so that the gap is 6 mm.
+#   Webots' table: 0.012 / cos 0.16 = 0.0121553 m, 1465.73 - 172854 * 0.0021553 = 1093.19 counts;
+#   with the reflectance 0.0243105 m, 383.84 - 14891 * 0.0043105 = 319.65 counts, as of a ray of
+#   0.024 m that meets something bright.
+#   The measured curve: 0.5 A / (gap + d)^2 is A / (sqrt 2 (gap + d))^2, so that something bright is
+#   taken to be sqrt 2 (gap + d) - d + 0.006 away: 0.0155736 and 0.0161450 m, which in Webots' table
+#   (0.0157751 and 0.0163539 m) make 601.46 - 43524 * 0.0007751 = 567.72 and 542.53 counts.
+PS2, PS5, NOTHING = 2, 5, 0
+OBSERVED = {
+    ("ideal", "metric"): (0.012, 0.012, 0.04),
+    ("ideal", "webots"): (1093.19 / 1023, 1093.19 / 1023, FREE / 1023),
+    ("webots", "metric"): (0.024, 0.024, 0.04),
+    ("webots", "webots"): (319.652 / 1023, 319.652 / 1023, FREE / 1023),
+    ("real", "metric"): (0.0155736, 0.0161450, 0.04),
+    ("real", "webots"): (567.72 / 1023, 542.53 / 1023, FREE / 1023),
+}
+
+
+@MODULES
+@RESPONSES
+@ENCODINGS
+def test_what_is_observed_of_a_thing_nearby(xp: ModuleType, kind: Kind, encoding: Encoding) -> None:
+    ray, bright = np.full(SENSORS, 0.012), np.full(SENSORS, 0.5)
+    ray[NOTHING], bright[NOTHING] = 1.0, 1.0
+    electronics = _electronics(encoding, infrared=kind)
+    seen = _first(electronics, Factors(), _sight(xp, ray, reflectance=bright), xp)
+    assert seen.shape == (ARENAS, ROBOTS, observation.SIZE)
+    assert seen.dtype == np.float32
+    ps2, ps5, nothing = OBSERVED[kind, encoding]
+    # The figures above are rounded: counts to 5e-3, lengths to 5e-8 m.
+    rounding = 5e-3 / 1023 + ROUNDING if encoding == "webots" else 1e-7
+    for sensor, expected in ((PS2, ps2), (PS5, ps5), (NOTHING, nothing)):
+        np.testing.assert_allclose(seen[..., sensor], expected, rtol=0, atol=rounding)
+    # 0.3 m, and a quarter turn to the left.
+    target = (0.3, math.pi / 2) if encoding == "metric" else (0.3 / 1.5, 0.75)
+    np.testing.assert_allclose(seen[..., 8:], np.broadcast_to(target, (ARENAS, ROBOTS, 2)))
+
+
+@MODULES
+@RESPONSES
+@ENCODINGS
+def test_a_dead_sensor_sees_nothing(xp: ModuleType, kind: Kind, encoding: Encoding) -> None:
+    dead = np.zeros((ARENAS, ROBOTS, SENSORS), bool)
+    dead[1, 2, PS5] = True
+    electronics, sight = _electronics(encoding, infrared=kind), _sight(xp, 0.012)
+    sound = _first(electronics, Factors(), sight, xp)
+    seen = _first(electronics, _factors(xp, dead=dead), sight, xp).copy()
+    nothing = 0.04 if encoding == "metric" else FREE / 1023
+    np.testing.assert_allclose(seen[1, 2, PS5], nothing, rtol=1e-6)  # float32
+    assert sound[1, 2, PS5] != seen[1, 2, PS5]
+    seen[1, 2, PS5] = sound[1, 2, PS5]
+    np.testing.assert_array_equal(seen, sound)
+
+
+@MODULES
+def test_wear_of_the_sensors(xp: ModuleType) -> None:
+    gain = np.linspace(0.7, 1.3, ARENAS * ROBOTS * SENSORS).reshape(ARENAS, ROBOTS, SENSORS)
+    electronics = _electronics("webots", infrared="webots")
+    # 0.0243105 m by the table, as above, of which 67.19 is not reflected.
+    sight = _sight(xp, 0.024)
+    seen = _first(electronics, _factors(xp, infrared_gain=gain), sight, xp)
+    expected = (FREE + gain * (319.652 - FREE)) / 1023
+    np.testing.assert_allclose(seen[..., :8], expected, rtol=0, atol=ROUNDING)
+    seen = _first(electronics, _factors(xp, infrared_offset=10 * gain), sight, xp)
+    expected = (319.652 + 10 * gain) / 1023
+    np.testing.assert_allclose(seen[..., :8], expected, rtol=0, atol=ROUNDING)
+
+
+@MODULES
+def test_noise_of_the_sensors_is_drawn_at_every_control_step(xp: ModuleType) -> None:
+    electronics = _electronics("webots", infrared="webots")
+    worn = _factors(xp, seed=SEED, infrared_noise=2.0)
+    sight, clock = _sight(xp), _clock(xp, 0)
+    memory, seen = senses.begin(electronics, worn, sight, clock, xp)
+    _, later = senses.sense(electronics, memory, worn, sight, clock + 7, xp)
+    for now, found in ((0, seen), (7, later)):
+        drawn = noise.normal(SEED, np.array(now), Stream.INFRARED, (ROBOTS, SENSORS), np)
+        # Free space has a deviation of 0.04897 of its counts, here twice that.
+        expected = FREE * (1.0 + 2 * 0.04897 * drawn) / 1023
+        # 1e-6 of it: float32, and the rounding of log and cos.
+        np.testing.assert_allclose(found[..., :8], expected, rtol=2e-6)
+
+
+# --- the sensors' period
+
+# Control step n ends at 32 n ms, and sees what was sampled at a multiple of the period: for 50 ms
+# 50 falls into step 2, 100 into 4, 150 into 5, 200 into 7, 250 into 8, 300 into 10, 350 into 11,
+# 400 into 13, 450 into 15 and 500 into 16 (480 to 512).
+DUE_50 = [2, 4, 5, 7, 8, 10, 11, 13, 15, 16]
+STEPS = 16
+
+
+@MODULES
+@ENCODINGS
+def test_a_sample_is_held_until_the_next(xp: ModuleType, encoding: Encoding) -> None:
+    electronics = _electronics(encoding, infrared_period=(0.01, 0.05))
+    # Whatever the arena: slow, fast, and in step with the control.
+    slow = _factors(xp, infrared_period=[0.05, 0.01, 0.032])
+    rays = 0.001 * np.arange(STEPS + 1) + 0.01
+    fresh = [_first(electronics, Factors(), _sight(xp, ray), xp)[0, 0, 3] for ray in rays]
+    memory, seen = senses.begin(electronics, slow, _sight(xp, rays[0]), _clock(xp, 0), xp)
+    found, bearing = [seen], [0.1 * n for n in range(STEPS + 1)]
+    for n in range(1, STEPS + 1):
+        sight = _sight(xp, rays[n], bearing=bearing[n])
+        memory, seen = senses.sense(electronics, memory, slow, sight, _clock(xp, n), xp)
+        found.append(seen)
+    ray = np.stack(found)[..., :8]  # [T, A, R, K]
+    last = [max([m for m in DUE_50 if m <= n], default=0) for n in range(STEPS + 1)]
+    held = np.array([fresh[n] for n in last])[:, None, None]
+    np.testing.assert_array_equal(ray[:, :, 0], np.broadcast_to(held, (STEPS + 1, ARENAS, SENSORS)))
+    at_once = np.array(fresh)[:, None, None, None]
+    np.testing.assert_array_equal(ray[:, :, 1:], np.broadcast_to(at_once, ray[:, :, 1:].shape))
+    # The target comes from elsewhere, and waits for no sample.
+    turned = np.array(bearing[1:])
+    turned = turned if encoding == "metric" else (turned + math.pi) / (2 * math.pi)
+    found = np.stack(found)[1:, :, 0, 9]
+    np.testing.assert_allclose(found, np.stack([turned] * ARENAS, axis=-1), rtol=1e-6)  # float32
+
+
+def _due(clock: Any, period: Any, xp: Any) -> Any:
+    """Tells [A, R] whether robots sample in control step [A], by what they see of it."""
+    count, robots = period.shape
+    electronics = _electronics(infrared_period=(0.01, 0.05))
+    none = xp.zeros((count, robots, SENSORS), xp.float32)
+    sight = Sight(none + 0.02, None, none[..., 0], none[..., 0])
+    found, memory = Factors(infrared_period=period), Memory(None, none, None)
+    return senses.sense(electronics, memory, found, sight, clock, xp)[1][..., 0] > 0.0
+
+
+@MODULES
+@pytest.mark.parametrize("share", [0.25, 0.5, 1.0, 2.0, 5.0])
+def test_a_period_in_step_with_the_control_never_slips(xp: ModuleType, share: float) -> None:
+    # 1500 control steps, Table 1's episode. A sample of a period that is a multiple of the step
+    # is due at each of its multiples, of a fraction at every step.
+    clock = np.arange(1, 1501, dtype=np.int32)
+    due = _due(xp.asarray(clock), xp.full((len(clock), 1), share * STEP, xp.float32), xp)
+    np.testing.assert_array_equal(due[:, 0], clock % max(share, 1.0) == 0)
+
+
+def test_numpy_and_jax_sample_in_the_same_control_steps() -> None:
+    period = np.random.default_rng(0).uniform(0.01, 0.05, (1, 20_000)).astype(np.float32)
+    due = jax.jit(lambda clock, period: _due(clock, period, jnp))
+    for n in range(100, 1500, 50):
+        mine = _due(np.array([n]), period, np)
+        np.testing.assert_array_equal(due(jnp.array([n]), period), mine)
+        assert mine[period <= np.float32(STEP)].all()
+        # One of 50 ms falls into 0.64 of the steps, in the mean over periods of 32 to 50 ms into
+        # 0.032 log(50 / 32) / 0.018 = 0.793; five standard errors.
+        slow = mine[period > np.float32(STEP)]
+        assert abs(slow.mean() - 0.793) < 5 * math.sqrt(0.793 * 0.207 / len(slow))
+
+
+# --- observations under way
+
+
+@MODULES
+def test_an_observation_arrives_after_its_latency(xp: ModuleType) -> None:
+    electronics = _electronics(observation_latency=(0, 2))
+    late = np.array([[0, 1, 2], [2, 2, 0]], np.int32)
+    found = _factors(xp, observation_latency=late)
+    memory, seen = senses.begin(electronics, found, _sight(xp, distance=1.0), _clock(xp, 0), xp)
+    np.testing.assert_array_equal(seen[..., 8], 1.0)
+    assert memory.seen is not None
+    assert memory.seen.shape == (ARENAS, 2, ROBOTS, observation.SIZE)
+    arrived = []
+    for n in range(1, 6):
+        sight = _sight(xp, distance=1.0 + n)
+        memory, seen = senses.sense(electronics, memory, found, sight, _clock(xp, n), xp)
+        assert seen.shape == (ARENAS, ROBOTS, observation.SIZE)
+        arrived.append(np.asarray(seen[..., 8]))
+    # Of distances 1, 2, .. 6; the first has been seen all along.
+    at_once, next_, second = [2, 3, 4, 5, 6], [1, 2, 3, 4, 5], [1, 1, 2, 3, 4]
+    expected = [[at_once, next_, second], [second, second, at_once]]
+    np.testing.assert_array_equal(np.moveaxis(arrived, 0, -1), expected)
+    assert memory.seen is not None
+    np.testing.assert_array_equal(memory.seen[..., 8], np.full((ARENAS, 2, ROBOTS), [[6], [5]]))
+
+
+@MODULES
+def test_a_latency_of_zero_keeps_nothing(xp: ModuleType) -> None:
+    electronics = _electronics(observation_latency=(0, 0), action_latency=(0, 0))
+    none = np.zeros(ROBOTS, np.int32)
+    found = _factors(xp, observation_latency=none, action_latency=none)
+    memory, _ = senses.begin(electronics, found, _sight(xp), _clock(xp, 0), xp)
+    assert memory == Memory(None, None, None)
+    _, seen = senses.sense(electronics, memory, found, _sight(xp, distance=2.0), _clock(xp, 1), xp)
+    np.testing.assert_array_equal(seen[..., 8], 2.0)
+
+
+@MODULES
+def test_a_late_sample_is_both_held_and_late(xp: ModuleType) -> None:
+    """A sample every second control step, which the policy sees one step later."""
+    electronics = _electronics(observation_latency=(1, 1), infrared_period=(0.064, 0.064))
+    found = _factors(xp, observation_latency=np.int32(1), infrared_period=0.064)
+    memory, _ = senses.begin(electronics, found, _sight(xp, 0.010), _clock(xp, 0), xp)
+    arrived = []
+    for n in range(1, 7):
+        sight = _sight(xp, 0.010 + 0.001 * n)
+        memory, seen = senses.sense(electronics, memory, found, sight, _clock(xp, n), xp)
+        arrived.append(round(1000 * float(seen[1, 2, 3])))
+    # Sampled in steps 0, 2, 4, 6.
+    assert arrived == [10, 10, 12, 12, 14, 14]
+
+
+# --- the target
+
+MANY = 20_000
+
+
+def _targets(xp: ModuleType, distance: float, bearing: float, **realism: Any) -> np.ndarray:
+    """Distances and bearings [MANY, R, 2] that as many seeds make of a target."""
+    found = Factors(seed=xp.arange(MANY, dtype=xp.uint32))
+    sight = _sight(xp, 1.0, distance, bearing, arenas=MANY)
+    clock = xp.zeros(MANY, xp.int32)
+    return np.asarray(senses.begin(_electronics(**realism), found, sight, clock, xp)[1])[..., 8:]
+
+
+@MODULES
+def test_noise_of_the_target(xp: ModuleType) -> None:
+    far, angle = 0.005, 0.0524
+    seen = _targets(xp, 0.5, 1.0, target_distance_noise=far, target_bearing_noise=angle)
+    # Five standard errors, sd / sqrt(n) and sd / sqrt(2 n); the seeds are fixed.
+    for i, (mean, sd) in enumerate(((0.5, far), (1.0, angle))):
+        drawn = seen[..., i].astype(float)
+        assert (abs(drawn.mean(axis=0) - mean) < 5 * sd / math.sqrt(MANY)).all()
+        assert (abs(drawn.std(axis=0) - sd) < 5 * sd / math.sqrt(2 * MANY)).all()
+    # Of one robot and the next, and of distance and bearing, nothing is shared.
+    shared = np.corrcoef(seen.reshape(MANY, -1).T) - np.eye(2 * ROBOTS)
+    assert abs(shared).max() < 5 / math.sqrt(MANY)
+
+
+@MODULES
+def test_noise_of_the_target_is_drawn_at_every_control_step(xp: ModuleType) -> None:
+    electronics = _electronics(target_distance_noise=0.01)
+    found, sight = _factors(xp, seed=SEED), _sight(xp)
+    memory, _ = senses.begin(electronics, found, sight, _clock(xp, 0), xp)
+    _, seen = senses.sense(electronics, memory, found, sight, _clock(xp, 9), xp)
+    drawn = noise.normal(SEED, np.array(9), Stream.TARGET_DISTANCE, (ROBOTS,), np)
+    # Float32, and the rounding of log and cos.
+    np.testing.assert_allclose(seen[..., 8], 0.3 + 0.01 * drawn, rtol=1e-6)
+    np.testing.assert_array_equal(seen[..., 9], np.float32(math.pi / 2))
+
+
+@MODULES
+def test_a_bearing_stays_an_angle(xp: ModuleType) -> None:
+    seen = _targets(xp, 0.5, math.pi, target_bearing_noise=0.5)[..., 1].astype(float)
+    assert abs(seen).max() <= np.float32(math.pi)
+    assert 0.45 < (seen < 0.0).mean() < 0.55  # half of them lie beyond, on the other side
+    beyond = seen % (2 * math.pi) - math.pi
+    # Five standard errors of the sd.
+    assert abs(beyond.std() - 0.5) < 5 * 0.5 / math.sqrt(2 * MANY * ROBOTS)
+    np.testing.assert_array_equal(_targets(xp, 0.5, 1.0)[..., 1], np.float32(1.0))
+
+
+@MODULES
+def test_a_distance_is_never_negative(xp: ModuleType) -> None:
+    seen = _targets(xp, 0.002, 0.0, target_distance_noise=0.004)[..., 0]
+    assert seen.min() == 0.0
+    # Half a deviation below the mean lie 30.85 % of a normal distribution; five standard errors.
+    spread = math.sqrt(0.3085 * 0.6915 / (MANY * ROBOTS))
+    assert abs((seen == 0.0).mean() - 0.3085) < 5 * spread
+
+
+# --- commands
+
+
+def _wheels(
+    xp: ModuleType, found: Factors, commands: list[Any], **realism: Any
+) -> tuple[np.ndarray, Memory]:
+    """Wheel speeds [T, A, R, 2] of commands that all robots get, and the last memory."""
+    electronics = _electronics(**realism)
+    memory, _ = senses.begin(electronics, found, _sight(xp), _clock(xp, 0), xp)
+    driven = []
+    for n, command in enumerate(commands):
+        every = xp.asarray(np.broadcast_to(np.float32(command), (ARENAS, ROBOTS, 2)))
+        clock = _clock(xp, n)
+        memory, wheels = senses.drive(electronics, memory, found, every, MOTORS, clock, xp)
+        driven.append(np.asarray(wheels))
+    return np.stack(driven), memory
+
+
+@MODULES
+def test_a_command_is_late(xp: ModuleType) -> None:
+    late = np.array([[0, 1, 2], [2, 0, 1]], np.int32)
+    found = _factors(xp, action_latency=late)
+    # 0.02 m/s is 1 rad/s.
+    commands = [(0.02 * n, 0.0) for n in range(1, 5)]
+    wheels, memory = _wheels(xp, found, commands, action_latency=(0, 2))
+    by_latency = np.array([[1, 2, 3, 4], [0, 1, 2, 3], [0, 0, 1, 2]])
+    expected = np.stack([by_latency[late]] * 2, axis=-1)  # [A, R, T, 2]
+    np.testing.assert_allclose(np.moveaxis(wheels, 0, 2), expected, rtol=1e-6)  # float32
+    assert isinstance(memory.motor, Motor)
+    assert memory.motor.queue is not None
+    assert memory.motor.queue.shape == (ARENAS, 2, ROBOTS, 2)
+
+
+@MODULES
+def test_each_robot_has_a_limit_of_its_own(xp: ModuleType) -> None:
+    limit = np.array([[3.0, 6.0, 6.9], [5.0, 4.0, 2.0]])
+    found = _factors(xp, max_wheel_speed=limit)
+    # 0.1 m/s and 1 rad/s are 5 +- 1.3 rad/s; and the same backward.
+    wheels, _ = _wheels(xp, found, [(0.1, 1.0), (-0.1, -1.0)])
+    ahead = np.stack([np.minimum(limit, 3.7), np.minimum(limit, 6.3)], axis=-1)
+    np.testing.assert_allclose(wheels, [ahead, -ahead], rtol=1e-6)  # float32
+
+
+@MODULES
+def test_limit_then_quantisation_then_noise(xp: ModuleType) -> None:
+    """A wheel that the firmware holds to 3 rad/s turns a little faster, and inexactly."""
+    found = _factors(xp, max_wheel_speed=3.0, seed=SEED)
+    clamped, _ = _wheels(xp, found, [(0.1, 0.0)], speed_quantisation="epuck2")
+    # 3 rad/s are 477.46 steps/s; 50000 // 477 = 104 ticks, which make 480.77 steps/s.
+    np.testing.assert_allclose(clamped, 50000 / 104 * RATE, rtol=1e-6)  # float32
+    both = {"speed_quantisation": "epuck2", "speed_noise": 0.05}
+    wheels, _ = _wheels(xp, found, [(0.1, 0.0)] * 3, **both)
+    for n in range(3):
+        drawn = noise.normal(SEED, np.array(n), Stream.SPEED_NOISE, (ROBOTS, 2), np)
+        expected = 50000 / 104 * RATE * (1.0 + 0.05 * drawn)
+        np.testing.assert_allclose(wheels[n], expected, rtol=2e-6)  # float32, log and cos
+
+
+@MODULES
+def test_a_stall_keeps_the_last_command(xp: ModuleType) -> None:
+    found, steps = _factors(xp, seed=SEED), 40
+    commands = [(0.001 * n, 0.0) for n in range(1, steps + 1)]  # 0.05 n rad/s
+    # 0.1 s are 3.1 control steps, which are 3.
+    wheels, memory = _wheels(xp, found, commands, stall=0.1, stall_time=(0.1, 0.1))
+    left, last = np.zeros((ARENAS, ROBOTS), int), np.zeros((ARENAS, ROBOTS))
+    for n in range(steps):
+        begins = noise.uniform(SEED, np.array(n), Stream.STALL, (ROBOTS,), np) < np.float32(0.1)
+        left = np.where((left == 0) & begins, 3, left)
+        last = np.where(left > 0, last, 0.05 * (n + 1))
+        left = np.maximum(left - 1, 0)
+        np.testing.assert_allclose(wheels[n, ..., 0], last, rtol=1e-6)  # float32
+    stalled = np.diff(wheels[..., 0], axis=0, prepend=0.0) == 0.0
+    assert (stalled.sum(axis=0) >= 3).all()  # it did occur to every robot
+    assert memory.motor is not None
+    assert memory.motor.queue is None
+    assert memory.infrared is None
+    assert memory.seen is None
+
+
+# --- all together, as training and the judge have them
+
+
+def _live(
+    electronics: Electronics, memory: Memory | None, found: Factors, clock: Any, xp: Any
+) -> tuple[Memory, Any]:
+    """One control step [...] of robots that pass a wall: observations and wheel speeds."""
+    nothing = xp.zeros((*clock.shape, ROBOTS), xp.float32)
+    n = clock[..., None] + nothing
+    ray = (0.025 + 0.01 * xp.sin(0.3 * n))[..., None] + xp.zeros(SENSORS, xp.float32)
+    sight = Sight(ray, 0.0 * ray + 0.6, 0.5 - 0.01 * n, 0.2 * n)
+    if memory is None:
+        memory, seen = senses.begin(electronics, found, sight, clock, xp)
+    else:
+        memory, seen = senses.sense(electronics, memory, found, sight, clock, xp)
+    command = xp.stack([nothing + 0.1, xp.sin(n)], axis=-1)
+    memory, wheels = senses.drive(electronics, memory, found, command, MOTORS, clock, xp)
+    return memory, xp.concatenate([seen, wheels], axis=-1)
+
+
+@ENCODINGS
+def test_a_real_robot_is_the_same_in_numpy_and_jax(encoding: Encoding) -> None:
+    """Many arenas along leading axes, as the judge has them, and mapped over, as training."""
+    realism = config.load_train(["realism=real"]).realism
+    electronics, seeds = (
+        senses.load(TaskConfig(), realism, encoding),
+        np.arange(16, dtype=np.uint32),
+    )
+    found = task_factors.draw(seeds, realism, RobotConfig(), ROBOTS, 2, np)
+    live = jax.jit(jax.vmap(lambda memory, found, n: _live(electronics, memory, found, n, jnp)))
+    judged, trained, rows = None, None, []
+    for n in range(40):
+        clock = np.full(16, n, np.int32)
+        judged, mine = _live(electronics, judged, found, clock, np)
+        trained, theirs = live(trained, found, clock)
+        # Wheel speeds and metres are rounded by float32; log and cos of the noise as well.
+        np.testing.assert_allclose(theirs, mine, rtol=2e-6, atol=2e-6)
+        rows.append(mine)
+    jax.tree.map(
+        lambda mine, theirs: np.testing.assert_equal(mine.shape, theirs.shape), judged, trained
+    )
+    rows = np.stack(rows)
+    assert (rows[..., :8] < rows[..., :8].max()).mean() > 0.5  # most see something
+    assert (rows[1:] != rows[:-1]).mean() > 0.5  # and something new
