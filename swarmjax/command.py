@@ -29,13 +29,21 @@ def run(
       The exit code: 2 for an error of the user's, which is printed in one sentence.
     """
     arguments = sys.argv[1:]
-    if {"-h", "--help"} & set(arguments):
-        sys.stdout.write(config.help_text(settings, name) + "\n")
-        return 0
+    module = _module(name)
     try:
+        if {"-h", "--help"} & set(arguments):
+            sys.stdout.write(config.help_text(settings, module) + "\n")
+            return 0
         return main(arguments)
     except KeyboardInterrupt:
         return INTERRUPTED
     except (ConfigError, PolicyError, *also) as error:
-        sys.stderr.write(f"swarmjax.{name}: error: {error}\n")
+        sys.stderr.write(f"{module}: error: {error}\n")
         return USER_ERROR
+
+
+def _module(name: str) -> str:
+    """The command as `python -m` names it: benchmarks are not part of the package."""
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    found = "" if spec is None else spec.name
+    return found if found.rpartition(".")[2] == name else f"swarmjax.{name}"

@@ -680,13 +680,14 @@ def help_text(cls: type[Section], command: str) -> str:
 
     Args:
         cls: the command's dataclass.
-        command: its name, `train` for `swarmjax.train`.
+        command: its module, such as `swarmjax.train`.
 
     Returns:
         Lines for a terminal, without a newline at the end.
     """
-    lines = [f"usage: python -m swarmjax.{command} key=value ..."]
-    groups = compose.describe_groups(command)
+    lines = [f"usage: python -m {command} key=value ..."]
+    files: dict[type[Section], str] = {TrainConfig: "train", EvaluateConfig: "evaluate"}
+    groups = compose.describe_groups(files[cls]) if cls in files else []
     if groups:
         lines += ["", "Groups, each a folder of configs/:", *groups]
     return "\n".join([*lines, "", "Keys, with their defaults:", *settings.describe_keys(cls)])

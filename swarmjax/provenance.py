@@ -31,17 +31,20 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str | None:
-    """Commit of the source tree, with `-dirty` if it was changed since.
+    """Commit of the source tree, with `-dirty` if it was changed since; None without git.
 
-    Without git it is what the environment variable `SWARMJAX_COMMIT` says, or None: for copies of
-    the tree that left their history behind.
+    The environment variable `SWARMJAX_COMMIT` wins: it is for copies of the tree that left their
+    history behind, or brought another one along.
     """
+    given = os.environ.get("SWARMJAX_COMMIT")
+    if given:
+        return given
     tree = Path(__file__).resolve().parent
     try:
         head = _git(tree, "rev-parse", "--short=12", "HEAD")
         changed = _git(tree, "status", "--porcelain", "--untracked-files=no")
     except (OSError, subprocess.CalledProcessError):
-        return os.environ.get("SWARMJAX_COMMIT")
+        return None
     return f"{head}-dirty" if changed else head
 
 

@@ -318,7 +318,7 @@ def test_resume_checks_keys_and_values():
 
 
 def test_help_lists_every_key_once():
-    text = help_text(TrainConfig, "train")
+    text = help_text(TrainConfig, "swarmjax.train")
     listed = [line.split("=")[0].strip() for line in text.splitlines() if "=" in line][1:]
 
     def leaves(mapping, where=""):
@@ -334,7 +334,9 @@ def test_help_lists_every_key_once():
 
 
 def test_help_gives_default_meaning_and_allowed_values():
-    lines = [" ".join(line.split()) for line in help_text(TrainConfig, "train").splitlines()]
+    lines = [
+        " ".join(line.split()) for line in help_text(TrainConfig, "swarmjax.train").splitlines()
+    ]
     assert lines[0] == "usage: python -m swarmjax.train key=value ..."
     assert f"stage=curriculum ({CHOICES})" in lines
     assert "stage.robots=<the stage> active robots (a whole number 1 to 100)" in lines
@@ -349,7 +351,7 @@ def test_help_gives_default_meaning_and_allowed_values():
 
 
 def test_help_of_the_other_commands():
-    assert "policy=<required>" in help_text(EvaluateConfig, "evaluate")
-    export = help_text(ExportConfig, "export")
+    assert "policy=<required>" in help_text(EvaluateConfig, "swarmjax.evaluate")
+    export = help_text(ExportConfig, "swarmjax.export")
     assert "run=<required>" in export
     assert "Groups" not in export

@@ -1,7 +1,10 @@
 """The planar body: three degrees of freedom, and a servo that stands for wheels on a floor.
 
-It trains ten times faster than the wheeled one. Its forces are limited by what the wheels could
-pass to the floor, so that it accelerates and pushes as they would.
+It trains five times faster than the wheeled one. Its forces are limited by what the wheels could
+pass to the floor, but a servo that is deadbeat over 32 ms seldom reaches that: it has its speed in
+one step where wheels take two thirds of one, and blocked it pushes with m v / dt = 0.6 N where
+wheels push with 1.0 N. It also turns freely while it is blocked, where two slipping wheels hardly
+turn: what policies that push things lose on the wheeled body (docs/robot.md).
 """
 
 import math

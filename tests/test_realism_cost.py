@@ -1,0 +1,26 @@
+"""Every factor of realism has an arm of its own."""
+
+import dataclasses
+
+import pytest
+
+from benchmarks import realism_cost
+from swarmjax.config import ConfigError, RealismConfig
+
+NAMES = {item.name for item in dataclasses.fields(RealismConfig)} - {"name", "stall_time"}
+
+
+def test_arms_are_the_presets_and_each_factor_alone() -> None:
+    arms = realism_cost.arms()
+    assert set(arms) == NAMES | {"real", "webots"}
+    ideal = RealismConfig()
+    for name in NAMES:
+        on = {key for key in NAMES if getattr(arms[name], key) != getattr(ideal, key)}
+        assert on - {"infrared"} == {name} - {"infrared"}
+        assert ("infrared" in on) == (name in {*realism_cost.COUNTED, "infrared"})
+        assert getattr(arms[name], name) == getattr(arms["real"], name)
+
+
+def test_an_unknown_arm_is_refused() -> None:
+    with pytest.raises(ConfigError, match="arms holds 'gravity': give any of real, webots"):
+        realism_cost.main(["arms=mass,gravity"])
