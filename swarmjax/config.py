@@ -495,6 +495,14 @@ class TrainConfig(Section):
     )
     realism: RealismConfig = field(default_factory=RealismConfig)
     resume: str | None = field(default=None, metadata=about("run directory to go on with"))
+    start: str | None = field(
+        default=None,
+        metadata=about("run directory whose networks and normaliser a new run begins with"),
+    )
+    start_std: Literal["keep", "reset"] = field(
+        default="keep",
+        metadata=about("exploration that start begins with: as learned, or algo.initial_std"),
+    )
     stage_name: str = field(
         default="",
         metadata=about("the one stage, or what the curriculum is called", derived=True),
@@ -620,7 +628,13 @@ def load_train(overrides: Sequence[str]) -> TrainConfig:
     """
     mapping, chosen = compose.compose(TrainConfig, "train", overrides)
     stages = compose.stages(mapping.get("stage", {}), chosen["stage"])
-    return build(TrainConfig, mapping | {"stage": stages, "stage_name": chosen["stage"]})
+    made = build(TrainConfig, mapping | {"stage": stages, "stage_name": chosen["stage"]})
+    if "start_std" in mapping and made.start is None:
+        raise ConfigError(
+            f"start_std is {made.start_std}, but there is no start: give start=DIR with it, "
+            "the directory of a run."
+        )
+    return made
 
 
 def load_evaluate(overrides: Sequence[str]) -> EvaluateConfig:

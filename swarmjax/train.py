@@ -13,13 +13,14 @@ from pathlib import Path
 
 import jax
 
-from swarmjax import checkpoint, command, config, export, loop, provenance
+from swarmjax import checkpoint, command, config, export, loop, provenance, start
 from swarmjax.checkpoint import CheckpointError
 from swarmjax.config import ConfigError, TrainConfig
 from swarmjax.curriculum import Schedule
 from swarmjax.display import Display
 from swarmjax.loop import Program, TrainState
 from swarmjax.sim import physics
+from swarmjax.start import Source
 from swarmjax.trainer import Stop, Tally, TrainingError, compile_chunk, train
 
 FAILED = 1
@@ -28,15 +29,20 @@ FAILED = 1
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings = _settings(arguments)
+    source = start.read(settings)
     program, schedule = loop.load(settings)
     template = jax.eval_shape(partial(loop.init, program), schedule)
     if settings.run.dry:
         return _dry_run(program, schedule, template)
-    state, skipped = _first_state(program, schedule, template)
+    state, skipped = _first_state(program, schedule, template, source)
     run = _open_run(settings)
     with Stop() as stop, Display(settings.updates) as display:
         for sentence in skipped:
             display.say(f"{sentence}: it was passed over.")
+        if source is not None:
+            display.say(
+                f"starting with what {source.run} had learned after {source.update} updates"
+            )
         display.say(f"{_opening(settings)}, into {run}; compiling")
         try:
             state, tally = train(run, program, schedule, state, display, stop)
@@ -61,13 +67,19 @@ def _settings(arguments: Sequence[str]) -> TrainConfig:
 
 
 def _first_state(
-    program: Program, schedule: Schedule, template: TrainState
+    program: Program, schedule: Schedule, template: TrainState, source: Source | None
 ) -> tuple[TrainState, list[str]]:
-    """Starts from the seed, or from the newest sound checkpoint of the run that is resumed."""
-    if program.config.resume is None:
-        return jax.jit(partial(loop.init, program))(schedule), []
+    """Starts from the seed, or from the newest sound checkpoint of the run that is resumed.
+
+    A start from the seed takes the networks and normalisers of `source`, if there is one.
+    """
     settings = program.config
-    leaves, update, skipped = checkpoint.restore(Path(program.config.resume))
+    if settings.resume is None:
+        state = jax.jit(partial(loop.init, program))(schedule)
+        if source is None:
+            return state, []
+        return start.carry(source, state, settings), source.skipped
+    leaves, update, skipped = checkpoint.restore(Path(settings.resume))
     if update > settings.updates:
         raise ConfigError(
             f"budget is {settings.budget}, but {settings.resume} has spent "

@@ -130,7 +130,7 @@ def test_import_needs_neither_jax_nor_hydra():
          "algo.actor_learning_rate?"),
         (["stage_name=x"], "stage_name is not a key: did you mean stage?"),
         (["hydra.verbose=1"], "hydra is not a key: give one of stage, robot, task, algo, "
-         "curriculum, sim, run, seed, seeds, arenas, budget, realism, resume."),
+         "curriculum, sim, run, seed, seeds, arenas, budget, realism, resume, start, start_std."),
         # What Hydra's grammar refuses.
         (["algo.hidden=[64"], "'algo.hidden=[64' cannot be read: quote a value with special "
          "characters, as in \"algo.hidden='a=b'\"."),

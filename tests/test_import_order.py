@@ -21,6 +21,7 @@ LAYERS = (
     {"provenance", "checkpoint", "recorder", "display"},
     {"command", "trainer"},
     {"export"},
+    {"start"},
     {"train", "evaluate"},
 )
 # These stand alone: the learner knows nothing of robots, a policy file needs only NumPy.

@@ -1,0 +1,118 @@
+"""`start=DIR`: a new run begins with what another one learned, its networks and its normaliser.
+
+Everything else begins afresh: optimiser, learning rate, curriculum, arenas, keys and counters.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from swarmjax import checkpoint, config, export
+from swarmjax.checkpoint import CheckpointError, Leaves
+from swarmjax.config import ConfigError, TrainConfig
+from swarmjax.loop import TrainState
+
+_CARRIED = ("params", "normalizer")  # of a learner
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """What is carried over.
+
+    Attributes:
+      run: directory of the run that it comes from.
+      update: of the checkpoint that it comes from.
+      leaves: of the learners' networks and normalisers, as `checkpoint.to_leaves` names them.
+      skipped: a sentence for each newer checkpoint that is damaged.
+    """
+
+    run: Path
+    update: int
+    leaves: Leaves
+    skipped: list[str]
+
+
+def read(settings: TrainConfig) -> Source | None:
+    """Reads the newest sound checkpoint of the run that a config starts from.
+
+    A run that is resumed has started already, and reads nothing.
+
+    Args:
+      settings: the config of the new run.
+
+    Returns:
+      What is carried over, or None if nothing is.
+
+    Raises:
+      ConfigError: if there is none, or its networks are not those of the config.
+    """
+    if settings.start is None or settings.resume is not None:
+        return None
+    run, stored = Path(settings.start), _read_config(settings.start)
+    _check_alike(settings.start, stored, settings)
+    try:
+        leaves, update, skipped = checkpoint.restore(run)
+    except CheckpointError as error:
+        raise _refused(settings.start, error) from None
+    prefixes = tuple(f"learners/{name}/" for name in _CARRIED)
+    carried = {name: leaf for name, leaf in leaves.items() if name.startswith(prefixes)}
+    return Source(run=run, update=update, leaves=carried, skipped=skipped)
+
+
+def carry(source: Source, state: TrainState, settings: TrainConfig) -> TrainState:
+    """Puts what was learned into the first state of a new run.
+
+    Args:
+      source: as `read` gave it.
+      state: as `loop.init` gave it.
+      settings: the config of the new run; `start_std` says whose exploration it begins with.
+
+    Returns:
+      The state, with the networks and normalisers of the source.
+
+    Raises:
+      ConfigError: if the checkpoint is not of the config beside it.
+    """
+    fresh = {name: getattr(state.learners, name) for name in _CARRIED}
+    try:
+        carried = checkpoint.from_leaves(source.leaves, {"learners": fresh})["learners"]
+    except CheckpointError as error:
+        raise _refused(str(source.run), error) from None
+    if settings.start_std == "reset":
+        log_std = state.learners.params["actor"]["log_std"]
+        actor = carried["params"]["actor"] | {"log_std": log_std}
+        carried["params"] = carried["params"] | {"actor": actor}
+    return replace(state, learners=replace(state.learners, **carried))
+
+
+def _read_config(start: str) -> TrainConfig:
+    try:
+        return config.build(TrainConfig, export.read_config(Path(start)), "stored ")
+    except ConfigError as error:
+        raise _refused(start, error) from None
+
+
+def _refused(start: str, error: Exception) -> ConfigError:
+    return ConfigError(
+        f"start is {config.show(start)}: it takes the directory of a run with a sound checkpoint, "
+        f"but {error}"
+    )
+
+
+def _check_alike(start: str, stored: TrainConfig, settings: TrainConfig) -> None:
+    """Refuses networks of another shape, and those that would misread what they are given."""
+    policy = f"algo.policy={stored.algo.policy}"
+    if stored.algo.policy == "independent":
+        policy += f" sim.max_robots={stored.sim.max_robots}"
+    hidden, activation = config.show(stored.algo.hidden), stored.algo.activation
+    seen, needed = (config.encoding(each.task, each.realism) for each in (stored, settings))
+    for name, held, wanted, remedy in (
+        ("number of learners", stored.learners, settings.learners, policy),
+        ("algo.hidden", hidden, config.show(settings.algo.hidden), f"algo.hidden={hidden}"),
+        ("algo.activation", activation, settings.algo.activation, f"algo.activation={activation}"),
+        ("encoding of observations", seen, needed, f"task.encoding={seen}"),
+    ):
+        if held != wanted:
+            raise ConfigError(
+                f"start is {config.show(start)}, whose {name} is {held}, but here it is {wanted}: "
+                f"give {remedy}, or another run."
+            )

@@ -1,0 +1,290 @@
+"""`start=DIR`: what a new run takes from another one, what it does not, and what is refused."""
+
+import gc
+import json
+import math
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from swarmjax import checkpoint, command, config, export, loop, start, train
+from swarmjax.checkpoint import CheckpointError, digest
+from swarmjax.config import TrainConfig
+from swarmjax.loop import TrainState
+from swarmjax.start import Source
+
+UPDATES = 3
+TINY = [
+    "stage=s1",
+    "sim.impl=jax",
+    "sim.max_robots=2",
+    "sim.max_obstacles=0",
+    "arenas=4",
+    "algo.rollout=4",
+    "algo.minibatches=2",
+    "algo.epochs=1",
+    "algo.hidden=[8]",
+    "task.step_limit=8",
+    f"budget={4 * 4 * UPDATES}",
+    "run.tensorboard=false",
+]
+# Another body, realism, arena and budget, all with the observations of TINY; an episode of real
+# realism must outlast its stalls of 0.3 s.
+OTHER = [
+    "robot=wheeled",
+    "realism=real",
+    "stage.side=1.5",
+    "task.step_limit=16",
+    "seed=7",
+    f"budget={4 * 4 * 50}",
+]
+CARRIED = ("learners/params/", "learners/normalizer/")
+LOG_STD = "learners/params/actor/log_std"
+
+# Where a restore fails, Orbax leaves an event loop that complains when it is collected.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+
+@pytest.fixture(autouse=True)
+def _collected() -> Iterator[None]:
+    yield
+    gc.collect()  # here, and not in some other test
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of three updates, with checkpoints after the second and the third."""
+    run = tmp_path_factory.mktemp("trained") / "run"
+    words = [f"run.dir={run}", "run.chunk=1", "run.checkpoint_minutes=0"]
+    assert train.main([*TINY, *words]) == 0
+    return run
+
+
+def _load(words: list[str]) -> tuple[Source, TrainState, TrainConfig]:
+    """What is carried over, the state of the same run without it, and the config."""
+    settings = config.load_train([*TINY, *words])
+    source = start.read(settings)
+    assert source is not None
+    return source, loop.init(*loop.load(settings)), settings
+
+
+def _rows(run: Path) -> list[dict]:
+    """Reads the metrics of a run, but for the wall clock."""
+    lines = (run / "metrics.jsonl").read_text().splitlines()
+    return [{k: v for k, v in json.loads(line).items() if k != "train_s"} for line in lines]
+
+
+def _refusal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *words: str
+) -> str:
+    """Runs a training that must be refused and returns its one sentence."""
+    monkeypatch.setattr(sys, "argv", ["train", *words])
+    capsys.readouterr()
+    assert command.run("train", train.main, TrainConfig, (CheckpointError,)) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.endswith("\n")
+    assert captured.err.count("\n") == 1
+    return captured.err.removeprefix("swarmjax.train: error: ").rstrip("\n")
+
+
+def _flip_one_bit(step: Path) -> None:
+    """Damages the largest file of a step, in the middle."""
+    largest = max((p for p in step.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
+    content = bytearray(largest.read_bytes())
+    content[len(content) // 2] ^= 1
+    largest.write_bytes(content)
+
+
+def test_networks_and_normaliser_are_carried_and_nothing_else(trained: Path) -> None:
+    source, state, settings = _load([*OTHER, f"start={trained}"])
+    found = checkpoint.to_leaves(start.carry(source, state, settings))
+    fresh = checkpoint.to_leaves(state)
+    learned = checkpoint.restore(trained)[0]
+    assert found.keys() == fresh.keys()
+    carried = {name for name in found if name.startswith(CARRIED)}
+    # A kernel and a bias for each of 2 x 2 layers, log_std; count, mean, variance.
+    assert len(carried) == 2 * 2 * 2 + 1 + 3
+    for name, leaf in found.items():
+        expected = learned[name] if name in carried else fresh[name]
+        np.testing.assert_array_equal(leaf, expected, err_msg=name, strict=True)
+    # What is compared differs: every carried leaf was trained, and so was the optimiser.
+    for name in carried | {name for name in found if "/mu/" in name}:
+        assert np.any(learned[name] != fresh[name]), name
+    counts = [name for name in found if name.endswith("/count") and "optimizer_state" in name]
+    assert counts
+    for name in counts:
+        assert learned[name].tolist() == [UPDATES * 2], name  # a step for each minibatch
+        assert found[name].tolist() == [0], name
+    assert (int(learned["update"]), int(found["update"])) == (UPDATES, 0)
+
+
+def test_exploration_is_reset_only_where_that_is_said(trained: Path) -> None:
+    words = [f"start={trained}", "algo.initial_std=0.25"]
+    source, state, keeping = _load(words)
+    kept = checkpoint.to_leaves(start.carry(source, state, keeping))
+    resetting = config.load_train([*TINY, *words, "start_std=reset"])
+    reset = checkpoint.to_leaves(start.carry(source, state, resetting))
+    learned = checkpoint.restore(trained)[0]
+    np.testing.assert_array_equal(kept[LOG_STD], learned[LOG_STD], strict=True)
+    expected = np.full((1, 2), math.log(0.25), np.float32)
+    np.testing.assert_array_equal(reset[LOG_STD], expected, strict=True)
+    for name in reset.keys() - {LOG_STD}:
+        np.testing.assert_array_equal(reset[name], kept[name], err_msg=name, strict=True)
+
+
+def test_a_damaged_checkpoint_is_passed_over_and_said(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    damaged, run = tmp_path / "damaged", tmp_path / "run"
+    shutil.copytree(trained, damaged)
+    _flip_one_bit(damaged / "checkpoints" / "3")
+    assert train.main([*TINY, f"start={damaged}", f"run.dir={run}", "run.stop_after=0"]) == 0
+    output = capsys.readouterr().out
+    assert f"checkpoint 3 of {damaged} is damaged" in output
+    assert f"what {damaged} had learned after 2 updates" in output
+    found, update, _ = checkpoint.restore(run)
+    assert update == 0
+    before = checkpoint.restore(trained, 2)[0]
+    for name in (name for name in found if name.startswith(CARRIED)):
+        np.testing.assert_array_equal(found[name], before[name], err_msg=name, strict=True)
+
+
+def test_a_started_run_resumes_without_the_run_it_started_from(
+    trained: Path, tmp_path: Path
+) -> None:
+    gone, whole, parts = tmp_path / "gone", tmp_path / "whole", tmp_path / "parts"
+    shutil.copytree(trained, gone)
+    words = [*TINY, f"start={gone}", "seed=1"]
+    assert train.main([*words, f"run.dir={whole}"]) == 0
+    assert train.main([*words, f"run.dir={parts}", "run.stop_after=1"]) == 0
+    shutil.rmtree(gone)
+    assert train.main([f"resume={parts}"]) == 0
+    for run in (whole, parts):
+        assert export.read_config(run)["start"] == str(gone)
+    assert digest(checkpoint.restore(parts)[0]) == digest(checkpoint.restore(whole)[0])
+    assert [row["update"] for row in _rows(parts)] == list(range(UPDATES))
+    assert _rows(parts) == _rows(whole)
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (
+            ["algo.policy=independent"],
+            "number of learners is 1, but here it is 2: give algo.policy=shared",
+        ),
+        (
+            ["algo.hidden=[8,8]"],
+            "algo.hidden is [8], but here it is [8,8]: give algo.hidden=[8]",
+        ),
+        (
+            ["algo.activation=relu"],
+            "algo.activation is tanh, but here it is relu: give algo.activation=tanh",
+        ),
+        (
+            ["realism=webots"],
+            "encoding of observations is metric, but here it is webots: give task.encoding=metric",
+        ),
+    ],
+)
+def test_other_networks_are_refused(
+    words: list[str],
+    what: str,
+    trained: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sentence = _refusal(capsys, monkeypatch, *TINY, *words, f"start={trained}", "run.dry=true")
+    assert sentence == f"start is '{trained}', whose {what}, or another run."
+
+
+def test_independent_learners_are_told_how_many_they_were(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stored = config.to_dict(config.load_train([*TINY, "algo.policy=independent"]))
+    (tmp_path / "config.json").write_text(json.dumps(stored))
+    monkeypatch.chdir(tmp_path)
+    assert _refusal(capsys, monkeypatch, *TINY, "start=.") == (
+        "start is '.', whose number of learners is 2, but here it is 1: give "
+        "algo.policy=independent sim.max_robots=2, or another run."
+    )
+
+
+def test_what_is_no_sound_run_is_refused(
+    trained: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = [*TINY, "start=bad", "run.dir=new"]
+    takes = "start is 'bad': it takes the directory of a run with a sound checkpoint, but "
+    sentence = _refusal(capsys, monkeypatch, *words)
+    assert sentence == f"{takes}bad is no run directory: it has no config.json."
+
+    shutil.copytree(trained, "bad", ignore=shutil.ignore_patterns("checkpoints"))
+    sentence = _refusal(capsys, monkeypatch, *words)
+    assert sentence == f"{takes}bad holds no checkpoints: give a run directory that has some."
+
+    shutil.copytree(trained / "checkpoints", "bad/checkpoints")
+    for step in (2, 3):
+        _flip_one_bit(Path(f"bad/checkpoints/{step}"))
+    sentence = _refusal(capsys, monkeypatch, *words)
+    assert sentence.startswith(f"{takes}bad has no sound checkpoint: checkpoint 3 of bad is dam")
+    assert not Path("new").exists()
+
+
+def test_a_checkpoint_that_its_config_belies_is_refused(
+    trained: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stored = export.read_config(trained)
+    stored["algo"]["hidden"] = [16]
+    (tmp_path / "config.json").write_text(json.dumps(stored))
+    (tmp_path / "checkpoints").symlink_to(trained / "checkpoints")
+    words = [f"start={tmp_path}", "algo.hidden=[16]", f"run.dir={tmp_path / 'new'}"]
+    sentence = _refusal(capsys, monkeypatch, *TINY, *words)
+    assert sentence.startswith(f"start is '{tmp_path}': it takes the directory of a run with")
+    # The output layer of the actor is the first that is looked at: [learners, width, U].
+    assert "but the checkpoint holds float32[1, 8, 2] for " in sentence
+    assert "this run's config needs float32[1, 16, 2]." in sentence
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            ["start=a", "resume={}"],
+            "start='a' cannot be given: resume keeps the rest of the stored run and takes "
+            "budget, resume, run.* only.",
+        ),
+        (
+            ["start_std=reset"],
+            "start_std is reset, but there is no start: give start=DIR with it, the directory "
+            "of a run.",
+        ),
+        (
+            ["start_std=keep", "start=null"],
+            "start_std is keep, but there is no start: give start=DIR with it, the directory "
+            "of a run.",
+        ),
+        (["start=a", "start_std=new"], "start_std is 'new': give keep or reset."),
+        (["start="], "start is '': give text or null."),
+    ],
+)
+def test_keys_that_do_not_fit_together_are_refused(
+    words: list[str],
+    sentence: str,
+    trained: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    words = [word.format(trained) for word in words]
+    assert _refusal(capsys, monkeypatch, *words, "run.dry=true") == sentence
