@@ -29,15 +29,6 @@ PAIRS = 10
 CALL_SECONDS = 0.5  # of the ideal program, about
 THREADS = 8  # programs that are compiled side by side
 PRESETS = ("real", "webots")
-# What acts on counts, and so has its cost on top of a response that has any.
-COUNTED = (
-    "infrared_noise",
-    "infrared_gain",
-    "infrared_offset",
-    "reflectance_wall",
-    "reflectance_obstacle",
-    "reflectance_robot",
-)
 _NO_FACTOR = ("name", "infrared", "stall_time")
 
 
@@ -68,7 +59,8 @@ def arms() -> dict[str, RealismConfig]:
     alone = {"infrared": RealismConfig(infrared=real.infrared)}
     for item in dataclasses.fields(RealismConfig):
         if item.name not in _NO_FACTOR:
-            base = alone["infrared"] if item.name in COUNTED else RealismConfig()
+            # What acts on counts costs what it does on top of a response that has any.
+            base = alone["infrared"] if item.name in config.COUNTED else RealismConfig()
             alone[item.name] = replace(base, **{item.name: getattr(real, item.name)})
     return presets | alone
 

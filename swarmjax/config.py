@@ -29,7 +29,7 @@ FILLING = 0.4  # boxes per square of a grid that random placing surely reaches
 # What may change when a run goes on; everything else fixes what it has computed so far.
 _RESUME_KEYS = ("budget", "resume", "run.*")
 # What is counted has no meaning for sensors that report metres.
-_COUNTED = (
+COUNTED = (
     "infrared_noise",
     "infrared_gain",
     "infrared_offset",
@@ -413,7 +413,7 @@ class RealismConfig(Section):
     def _check(self) -> None:
         if self.infrared != "ideal":
             return
-        for key in _COUNTED:
+        for key in COUNTED:
             value = getattr(self, key)
             if value is not None:
                 raise ConfigError(

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 
 from benchmarks import realism_cost
+from swarmjax import config
 from swarmjax.config import ConfigError, RealismConfig
 
 NAMES = {item.name for item in dataclasses.fields(RealismConfig)} - {"name", "stall_time"}
@@ -17,7 +18,7 @@ def test_arms_are_the_presets_and_each_factor_alone() -> None:
     for name in NAMES:
         on = {key for key in NAMES if getattr(arms[name], key) != getattr(ideal, key)}
         assert on - {"infrared"} == {name} - {"infrared"}
-        assert ("infrared" in on) == (name in {*realism_cost.COUNTED, "infrared"})
+        assert ("infrared" in on) == (name in {*config.COUNTED, "infrared"})
         assert getattr(arms[name], name) == getattr(arms["real"], name)
 
 
