@@ -35,7 +35,6 @@ from swarmjax.policy import Policy, PolicyError
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps, infrared
 from swarmjax.sim import model as sim_model
-from swarmjax.sim.body import Chassis
 from swarmjax.sim.geom import FLOOR_GROUP, HULL_GROUP
 from swarmjax.task import factors as task_factors
 from swarmjax.task import level, observation, senses
@@ -322,14 +321,10 @@ def _no_outcome(count: int, robots: int) -> Outcome:
     )
 
 
-def _chassis(factors: Factors) -> Chassis:
-    return Chassis(factors.wheel_radius, factors.track, factors.mass, factors.friction)
-
-
 def _models(judge: Judge, factors: Factors, count: int) -> np.ndarray:
     """Returns the models [A] of arenas, each with the robots that its episode has."""
     models = np.full(count, judge.model, object)
-    chassis = _chassis(factors)
+    chassis = senses.chassis(factors)
     if all(part is None for part in chassis):
         return models
     body = sim_model.BODIES[judge.config.robot.body]
@@ -416,7 +411,7 @@ def _drive(judge: Judge, arenas: Arenas, active: np.ndarray) -> tuple[Memory, np
     )
     wheels = np.where(active[..., None], wheels, 0.0)
     body, robot = sim_model.BODIES[judge.config.robot.body], judge.config.robot
-    ctrl = body.ctrl(wheels, _chassis(arenas.factors), robot, np)
+    ctrl = body.ctrl(wheels, senses.chassis(arenas.factors), robot, np)
     qpos = np.stack(
         [_advance(judge, *each) for each in zip(arenas.model, arenas.data, ctrl, strict=True)]
     )
@@ -539,11 +534,12 @@ def cast_rays(
 def _brightness(judge: Judge, shades: infrared.Reflectance, geom: np.ndarray) -> np.ndarray:
     """Reflectance [A, R, K] of the geoms that rays meet; 1 of nothing."""
     model, table = judge.model, np.ones((len(geom), judge.model.ngeom + 1))  # the last: nothing
-    walls = np.flatnonzero(model.body_mocapid[model.geom_bodyid] >= 0)
+    obstacles = judge.ids.obstacle_geom
+    fixtures = np.flatnonzero(model.body_mocapid[model.geom_bodyid] >= 0)
     if shades.wall is not None:
-        table[:, walls] = shades.wall[:, None]
-    if shades.obstacle is not None or shades.wall is not None:
-        table[:, judge.ids.obstacle_geom] = 1.0 if shades.obstacle is None else shades.obstacle
+        table[:, np.setdiff1d(fixtures, obstacles)] = shades.wall[:, None]
+    if shades.obstacle is not None:
+        table[:, obstacles] = shades.obstacle
     if shades.robot is not None:
         hulls = [model.geom(f"robot{i}_body").id for i in range(judge.spacing.robots)]
         table[:, hulls] = shades.robot

@@ -16,7 +16,6 @@ from swarmjax.config import TrainConfig, substeps
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps as sim_gaps
 from swarmjax.sim import infrared, model, physics
-from swarmjax.sim.body import Chassis
 from swarmjax.task import factors as task_factors
 from swarmjax.task import observation, reward, senses
 from swarmjax.task import stage as task_stage
@@ -269,7 +268,7 @@ def _move(
         world.electronics, state.memory, found, command, world.drive, state.clock, jnp
     )
     wheels = jnp.where(active[:, None], wheels, 0.0)
-    chassis = Chassis(found.wheel_radius, found.track, found.mass, found.friction)
+    chassis = senses.chassis(found)
     data = physics.step(world.physics, state.sim, level.side, level.obstacle, wheels, chassis)
     sound = physics.is_finite(data)
     # What follows stays finite: an arena that broke is seen where it last was, and reset.

@@ -12,6 +12,7 @@ from swarmjax import config as settings
 from swarmjax.config import RealismConfig, TaskConfig
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import infrared, motor, noise, response
+from swarmjax.sim.body import Chassis
 from swarmjax.sim.drive import Drive
 from swarmjax.sim.motor import Motor
 from swarmjax.sim.noise import Stream
@@ -99,6 +100,11 @@ def load(task: TaskConfig, realism: RealismConfig, encoding: Encoding | None = N
         sensor_range=task.sensor_range,
         control_step=task.control_step,
     )
+
+
+def chassis(factors: Factors) -> Chassis:
+    """What the robots' chassis are in an episode."""
+    return Chassis(factors.wheel_radius, factors.track, factors.mass, factors.friction)
 
 
 def mount(factors: Factors) -> infrared.Mount | None:
