@@ -3,9 +3,10 @@
 `python -m benchmarks.transfer policies=ideal:a.npz+b.npz,real:c.npz [key=value ...]` takes the keys
 of `swarmjax.evaluate` but `policy`, and judges every policy (`label:` files of several seeds, `+`
 between them) in MuJoCo C on the same levels in each world of `WORLDS`. It prints a JSON line for
-each label and world: means with 95 % intervals, and the paired difference to the label's first
-world. Intervals are percentiles of a bootstrap that draws seeds' levels anew within each seed: they
-hold for these policies on other levels; how far seeds differ is in `targets_reached_by_seed`.
+each label and world: means with 95 % intervals, and paired differences to the label's first world
+(`_change`) and to the same body's ideal one (`_realism_change`). Intervals are of a bootstrap that
+draws whole levels, for all seeds alike: they hold for these policies on other levels; how far seeds
+differ is in `targets_reached_by_seed`.
 """
 
 import json
@@ -16,11 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax import command, config, evaluate, policy, provenance
+from swarmjax import command, config, evaluate, policy, provenance, statistics
 from swarmjax.config import ConfigError, EvaluateConfig
 
 WORLDS = (("planar", "ideal"), ("wheeled", "ideal"), ("wheeled", "webots"), ("wheeled", "real"))
-RESAMPLES = 2000
 MEASURES = ("targets_reached", "all_reached", "contacts_per_robot", "episode_time_s")
 
 
@@ -42,31 +42,29 @@ def judge(settings: EvaluateConfig, files: Sequence[str]) -> dict[str, np.ndarra
     return {name: np.stack([row[name] for row in rows]) for name in MEASURES}
 
 
-def interval(values: np.ndarray) -> tuple[float, float]:
-    """95 % interval of the mean of [seeds, levels], levels drawn anew within each seed.
+def summarize(
+    found: dict[str, np.ndarray], first: dict[str, np.ndarray], ideal: dict[str, np.ndarray]
+) -> dict[str, Any]:
+    """Means with intervals, and paired differences, level by level.
 
     Args:
-      values: [seeds, levels].
+      found: [seeds, levels] of each measure in a world.
+      first: those of the label's first world.
+      ideal: those of the same body without realism.
 
     Returns:
-      The 2.5th and the 97.5th percentile of `RESAMPLES` means.
+      The figures of a line.
     """
-    random = np.random.default_rng(0)
-    drawn = random.integers(values.shape[1], size=(RESAMPLES, *values.shape))
-    means = np.take_along_axis(values[None], drawn, axis=2).mean(axis=(1, 2))
-    low, high = np.percentile(means, [2.5, 97.5])
-    return float(low), float(high)
-
-
-def summarize(found: dict[str, np.ndarray], first: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Means with intervals, and paired differences to the first world, level by level."""
     result: dict[str, Any] = {"targets_reached_by_seed": found["targets_reached"].mean(1).tolist()}
     for name in MEASURES:
-        change = found[name] - first[name]
-        result[name] = float(found[name].mean())
-        result[f"{name}_interval"] = interval(found[name])
-        result[f"{name}_change"] = float(change.mean())
-        result[f"{name}_change_interval"] = interval(change)
+        mine = found[name]
+        intervals = {
+            name: statistics.bootstrap(mine, np.mean, draw="tasks"),
+            f"{name}_change": statistics.paired(first[name], mine, np.mean, draw="tasks"),
+            f"{name}_realism_change": statistics.paired(ideal[name], mine, np.mean, draw="tasks"),
+        }
+        for key, (estimate, low, high) in intervals.items():
+            result |= {key: estimate, f"{key}_interval": [low, high]}
     return result
 
 
@@ -74,12 +72,11 @@ def results(words: Sequence[str], policies: dict[str, list[str]]) -> Iterator[di
     """Judges all labels in all worlds; yields a line each."""
     some = next(iter(policies.values()))[0]
     for label, files in policies.items():
-        first = None
+        worlds: dict[tuple[str, str], dict[str, np.ndarray]] = {}
         for body, realism in WORLDS:
             given = [f"policy={some}", *words, f"robot={body}", f"realism={realism}"]
             settings = config.load_evaluate(given)
-            found = judge(settings, files)
-            first = found if first is None else first
+            worlds[body, realism] = judge(settings, files)
             yield {
                 "benchmark": "transfer",
                 "trained": label,
@@ -88,7 +85,7 @@ def results(words: Sequence[str], policies: dict[str, list[str]]) -> Iterator[di
                 "stage": settings.stage.name,
                 "levels": settings.episodes,
                 "seeds": len(files),
-                **summarize(found, first),
+                **summarize(worlds[body, realism], worlds[WORLDS[0]], worlds[body, "ideal"]),
                 "digests": [policy.load(name).digest[:12] for name in files],
                 "device": provenance.device(),
                 "versions": provenance.versions(),

@@ -10,7 +10,7 @@ import swarmjax
 ROOT = Path(swarmjax.__file__).parent
 # A module imports from rows above its own, and a package from itself.
 LAYERS = (
-    {"epuck", "policy", "settings"},
+    {"epuck", "policy", "settings", "statistics"},
     {"compose"},
     {"config"},
     {"sim"},

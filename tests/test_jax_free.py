@@ -10,7 +10,7 @@ import numpy as np
 from swarmjax import policy
 from swarmjax.task import observation
 
-_ABSENT = ("jax", "jaxlib", "flax", "chex", "optax", "brax", "orbax", "warp")
+_ABSENT = ("jax", "jaxlib", "flax", "chex", "optax", "brax", "orbax", "scipy", "warp")
 
 
 def _write_policy(path: Path) -> None:
@@ -54,7 +54,7 @@ def test_policy_and_evaluate_run_without_jax(tmp_path: Path) -> None:
     code = (
         "import sys, runpy\n"
         "sys.modules['mujoco.mjx'] = None\n"
-        "import swarmjax.policy\n"
+        "import swarmjax.policy, swarmjax.statistics\n"
         f"sys.argv = ['evaluate', *{words}, 'out=result.json']\n"
         "runpy.run_module('swarmjax.evaluate', run_name='__main__', alter_sys=True)\n"
     )

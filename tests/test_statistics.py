@@ -1,0 +1,551 @@
+"""Statistics: worked out by hand, against SciPy, and by what an interval promises."""
+
+import math
+import tracemalloc
+from functools import partial
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+from scipy import stats
+
+from swarmjax import statistics
+from swarmjax.statistics import bootstrap, curve, cvar, iqm, paired, probability_of_improvement
+
+ROUNDING = 1e-12  # of sums of numbers up to 100 in double precision, some in another order
+FINITE = st.floats(-100, 100, width=32)
+LISTS = arrays(np.float64, st.integers(1, 40), elements=FINITE)
+TABLES = arrays(np.float64, st.tuples(st.integers(3, 6), st.integers(1, 3)), elements=FINITE)
+DRAWS = ("runs_per_task", "runs", "tasks_per_run", "tasks", "runs_then_tasks", "runs_and_tasks")
+few = settings(max_examples=30, deadline=None)
+
+
+def _refusal(function, *arguments, **options) -> str:
+    """Return the sentence with which a call is refused, and hold it to being one."""
+    with pytest.raises(ValueError, match=r"^[^\n]*\.$") as caught:
+        function(*arguments, **options)
+    return str(caught.value)
+
+
+def _end_error(resamples: int, sd: float) -> float:
+    """Four standard errors of an end of a 95 % interval over normal resamples.
+
+    The 2.5th percentile of n draws has the sd sqrt(0.025 * 0.975 / n) / density, and the normal
+    density there is 0.0584 / sd.
+    """
+    return float(4 * math.sqrt(0.025 * 0.975 / resamples) / stats.norm.pdf(1.96) * sd)
+
+
+def test_iqm_by_hand() -> None:
+    # Eight values: two off either end, (3 + 4 + 5 + 6) / 4.
+    assert iqm([8.0, 1.0, 100.0, 3.0, 4.0, 5.0, 6.0, 2.0]) == 4.5
+    # Seven: a quarter is 1.75, rounded down to one off either end, (2 + 3 + 4 + 5 + 6) / 5.
+    assert iqm([7.0, 1.0, 6.0, 2.0, 5.0, 3.0, 4.0]) == 4.0
+    # Three: nothing is off.
+    assert iqm([0.0, 0.0, 9.0]) == 3.0
+    assert iqm([True, True, False, False, True]) == pytest.approx(2 / 3, abs=ROUNDING)
+
+
+@few
+@given(arrays(np.float64, array_shapes(min_dims=2, max_dims=2, max_side=13), elements=FINITE))
+def test_iqm_is_the_trimmed_mean_of_scipy(x: np.ndarray) -> None:
+    for axis in (None, 0, 1):
+        expected = stats.trim_mean(x, 0.25, axis=axis)
+        np.testing.assert_allclose(iqm(x, axis=axis), expected, rtol=0, atol=ROUNDING)
+    stack = np.stack([x, 2 * x])
+    both = [stats.trim_mean(x, 0.25, axis=None), stats.trim_mean(2 * x, 0.25, axis=None)]
+    np.testing.assert_allclose(iqm(stack, axis=(1, 2)), both, rtol=0, atol=ROUNDING)
+
+
+@few
+@given(LISTS, st.randoms(use_true_random=False))
+def test_order_does_not_matter(x: np.ndarray, random) -> None:
+    mixed = np.array(random.sample(x.tolist(), len(x)))
+    assert iqm(mixed) == pytest.approx(iqm(x), abs=ROUNDING)
+    assert cvar(mixed, 0.3) == pytest.approx(cvar(x, 0.3), abs=ROUNDING)
+
+
+@pytest.mark.parametrize(
+    ("infinite", "expected"),
+    # Of eight values two come off either end: 3, 4, 5, 6 are left of those with two infinite ones.
+    [(2, 4.5), (3, math.inf), (8, math.inf)],
+)
+def test_iqm_is_infinite_with_more_than_a_quarter(infinite: int, expected: float) -> None:
+    assert iqm([*range(1, 9 - infinite), *[math.inf] * infinite]) == expected
+
+
+def test_cvar_by_hand() -> None:
+    x = np.array([[5.0, 1.0, 4.0, 2.0, 3.0], [10.0, 30.0, 20.0, 50.0, 40.0]])
+    np.testing.assert_array_equal(cvar(x, 0.4, axis=1), [1.5, 15.0])
+    np.testing.assert_array_equal(cvar(x, 0.4, axis=1, lowest=False), [4.5, 45.0])
+    # 0.41 * 5 = 2.05, rounded up to three of five; 0.05 * 5 = 0.25 to one.
+    np.testing.assert_array_equal(cvar(x, 0.41, axis=1), [2.0, 20.0])
+    np.testing.assert_array_equal(cvar(x, axis=1), [1.0, 10.0])
+    # Of all ten: 1, 2, 3, 4.
+    assert cvar(x, 0.4) == 2.5
+    assert cvar(x, 1.0) == x.mean()
+    # 0.07 * 100 is 7.000000000000001 in double precision: seven values, 0 to 6.
+    assert cvar(np.arange(100.0), 0.07) == 3.0
+    # However small the share, one value is left.
+    assert cvar(np.arange(1.0, 9.0), 1e-12) == 1.0
+
+
+def test_cvar_finds_the_worst_of_many() -> None:
+    x = np.random.default_rng(20).permutation(np.arange(10_000.0)).reshape(20, 500)
+    # The lowest 500 are 0, ..., 499, the highest 9500, ..., 9999.
+    assert cvar(x) == 249.5
+    assert cvar(x, lowest=False) == 9749.5
+
+
+def test_cvar_takes_infinity_as_the_largest() -> None:
+    x = [3.0, math.inf, 1.0, 2.0]
+    assert cvar(x, 0.75) == 2.0
+    assert cvar(x, 0.25, lowest=False) == math.inf
+
+
+@pytest.mark.parametrize("function", [iqm, cvar])
+def test_estimates_refuse(function) -> None:
+    assert "x is empty" in _refusal(function, [])
+    assert "x holds nan: 1 of 2 values" in _refusal(function, [math.nan, 1.0])
+    assert "x holds -inf" in _refusal(function, [-math.inf, 1.0])
+
+
+@pytest.mark.parametrize("share", [0.0, -0.1, 1.1, math.nan])
+def test_cvar_refuses_a_share_of_nothing(share: float) -> None:
+    assert f"share is {share}" in _refusal(cvar, [1.0, 2.0], share)
+
+
+def test_interval_of_one_column_is_that_of_scipy() -> None:
+    values = np.random.default_rng(1).exponential(size=40)
+    found = bootstrap(values[:, None], iqm, resamples=20_000)
+    expected = stats.bootstrap(
+        (values,),
+        partial(stats.trim_mean, proportiontocut=0.25),
+        n_resamples=20_000,
+        method="percentile",
+        rng=2,
+    )
+    # Both ends have their Monte Carlo error: sqrt(2) of one.
+    error = math.sqrt(2) * _end_error(20_000, expected.standard_error)
+    assert found.estimate == pytest.approx(stats.trim_mean(values, 0.25), abs=ROUNDING)
+    assert found.low == pytest.approx(expected.confidence_interval.low, abs=error)
+    assert found.high == pytest.approx(expected.confidence_interval.high, abs=error)
+    # The comparison means something: the error is a small part of the width.
+    assert 10 * error < found.high - found.low
+
+
+def test_interval_is_stratified_by_task() -> None:
+    # SciPy resamples several samples apart from each other: here the columns.
+    values = np.random.default_rng(3).normal(size=(12, 3)) * [1, 2, 3] + [0, 5, 1]
+
+    def pooled(*columns: np.ndarray, axis: int) -> np.ndarray:
+        return stats.trim_mean(np.concatenate(columns, axis=axis), 0.25, axis=axis)
+
+    found = bootstrap(values, iqm, resamples=20_000, confidence=0.95)
+    expected = stats.bootstrap(
+        tuple(values.T), pooled, n_resamples=20_000, method="percentile", rng=4, vectorized=True
+    )
+    error = math.sqrt(2) * _end_error(20_000, expected.standard_error)
+    assert found.low == pytest.approx(expected.confidence_interval.low, abs=error)
+    assert found.high == pytest.approx(expected.confidence_interval.high, abs=error)
+    assert 10 * error < found.high - found.low
+
+
+def _variance(values: np.ndarray, draw: str) -> float:
+    """Variance of the mean of a resample, worked out for each draw.
+
+    A mean of n draws from a set has the variance of the set by n. Runs, then tasks: that between
+    the runs' means, and the mean of that within. Runs and tasks: the weights of rows and columns
+    are independent, so what is neither of a row nor of a column is drawn as n m values.
+    """
+    runs, tasks = values.shape
+    by_run, by_task = values.mean(axis=1), values.mean(axis=0)
+    rest = values - by_run[:, None] - by_task + values.mean()
+    return {
+        "runs_per_task": values.var(axis=0).sum() / (runs * tasks**2),
+        "runs": by_run.var() / runs,
+        "tasks_per_run": values.var(axis=1).sum() / (tasks * runs**2),
+        "tasks": by_task.var() / tasks,
+        "runs_then_tasks": by_run.var() / runs + values.var(axis=1).mean() / (runs * tasks),
+        "runs_and_tasks": by_run.var() / runs + by_task.var() / tasks + rest.var() / values.size,
+    }[draw]
+
+
+@pytest.mark.parametrize("draw", DRAWS)
+def test_each_draw_spreads_as_worked_out(draw) -> None:
+    random = np.random.default_rng(5)
+    rows, columns, rest = (random.normal(size=size) for size in ((15, 1), 12, (15, 12)))
+    values = 1.2 * rows + columns + 3 * rest
+    found = bootstrap(values, np.mean, draw=draw, resamples=20_000)
+    sd = math.sqrt(_variance(values, draw))
+    # A width is off by 0.03 at most for 20,000 draws (0.076 sd at each end of 3.92 sd), and by 0.01
+    # since means of 12 draws or more are not quite normal. No two draws come nearer than 0.08.
+    expected = pytest.approx(2 * 1.96 * sd, rel=0.04)
+    assert found.high - found.low == expected
+    others = [2 * 1.96 * math.sqrt(_variance(values, other)) for other in DRAWS if other != draw]
+    assert not any(other == expected for other in others)
+
+
+@pytest.mark.parametrize(
+    ("draw", "by_runs", "by_tasks"),
+    [
+        ("runs_per_task", True, False),
+        ("runs", True, False),
+        ("tasks_per_run", False, True),
+        ("tasks", False, True),
+        ("runs_then_tasks", True, True),
+        ("runs_and_tasks", True, True),
+    ],
+)
+def test_what_is_kept_spreads_nothing(draw, by_runs: bool, by_tasks: bool) -> None:
+    runs = np.repeat([[0.0], [1.0], [2.0]], 4, axis=1)
+    assert (bootstrap(runs, np.mean, draw=draw)[1:] != (1.0, 1.0)) is by_runs
+    assert (bootstrap(runs.T, np.mean, draw=draw)[1:] != (1.0, 1.0)) is by_tasks
+
+
+def test_same_seed_same_interval() -> None:
+    values = np.random.default_rng(6).normal(size=(5, 2))
+    assert bootstrap(values, iqm, seed=3) == bootstrap(values, iqm, seed=3)
+    assert bootstrap(values, iqm, seed=3) != bootstrap(values, iqm, seed=4)
+
+
+def test_ends_are_the_outer_draws() -> None:
+    # 81 resamples, 95 %: percentiles at 0.025 * 80 = 2 of the sorted ones, and at 78. With 90 they
+    # are at 2.225 and 86.775: taken are 2 and 87. The statistic numbers the resamples.
+    def number(x: np.ndarray, *, axis: tuple[int, int]) -> np.ndarray:
+        return np.arange(len(x)) if x.ndim == 3 else np.mean(x, axis=axis)
+
+    values = np.zeros((3, 1))
+    assert bootstrap(values, number, resamples=81) == (0.0, 2.0, 78.0)
+    assert bootstrap(values, number, resamples=90) == (0.0, 2.0, 87.0)
+
+
+def test_interval_does_not_depend_on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.random.default_rng(7).normal(size=(6, 4))
+    whole = bootstrap(values, iqm, resamples=1000)
+    # Seven resamples at once, and six in the last block: the same draws, in other portions.
+    monkeypatch.setattr(statistics, "BLOCK", 7 * 24)
+    assert bootstrap(values, iqm, resamples=1000) == whole
+
+
+def test_memory_is_bounded() -> None:
+    values = np.random.default_rng(8).normal(size=(10, 1000))
+    tracemalloc.start()
+    try:
+        bootstrap(values, iqm, draw="runs_then_tasks")
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    # All 2000 resamples at once would be 160 MB, and twice that with their indices.
+    assert peak < 100e6
+
+
+def test_interval_covers_as_often_as_theory_says() -> None:
+    """The percentile interval of a mean is about mean +- 1.96 sd / sqrt(n), the sd without Bessel.
+
+    It thus covers where |t| of n - 1 degrees of freedom is below 1.96 sqrt((n - 1) / n).
+    """
+    random, runs, sets = np.random.default_rng(9), 10, 300
+    covered = 0
+    for seed in range(sets):
+        values = random.normal(loc=2.0, size=(runs, 1))
+        found = bootstrap(values, np.mean, resamples=500, seed=seed)
+        covered += found.low <= 2.0 <= found.high
+    share = 2 * stats.t.cdf(1.96 * math.sqrt((runs - 1) / runs), runs - 1) - 1
+    assert share == pytest.approx(0.904, abs=0.001)
+    # Between the ends that a binomial of 300 passes once in 10,000 times each.
+    low, high = stats.binom.ppf([1e-4, 1 - 1e-4], sets, share)
+    assert low <= covered <= high
+
+
+def test_shared_levels_take_draws_of_whole_tasks() -> None:
+    # Three runs that agree on every level know no more of the levels than one run does.
+    levels = np.random.default_rng(10).normal(size=400)
+    shared = bootstrap(np.tile(levels, (3, 1)), np.mean, draw="tasks")
+    alone = bootstrap(levels[None], np.mean, draw="tasks")
+    assert shared == pytest.approx(alone, abs=ROUNDING)
+    # Drawn apart they seem three times as many: narrower by sqrt(3).
+    apart = bootstrap(np.tile(levels, (3, 1)), np.mean, draw="tasks_per_run")
+    narrower = (alone.high - alone.low) / (apart.high - apart.low)
+    # Two widths of 3.92 sd, four ends that are each off by 0.24 sd at most: sqrt(4) * 0.24 / 3.92.
+    assert narrower == pytest.approx(math.sqrt(3), rel=0.125)
+
+
+@pytest.mark.parametrize("finite", [2, 7, 10])
+def test_interval_of_infinite_values(finite: int) -> None:
+    values = np.array([*range(1, 1 + finite), *[math.inf] * (10 - finite)])[:, None]
+    for statistic in (iqm, np.median, np.mean):
+        found = bootstrap(values, statistic)
+        assert not np.isnan(found).any()
+        assert found.low <= found.estimate <= found.high
+    found = bootstrap(values, iqm)
+    # Two of ten are cut off either end. With 2 finite ones the draw is finite with 8 or more of
+    # them, probability 8e-5; with 7 infinite with 3 or more of 3 in 10, probability 0.62.
+    assert math.isinf(found.low) is (finite == 2)
+    assert math.isinf(found.estimate) is (finite != 10)
+    assert math.isinf(found.high) is (finite != 10)
+
+
+@few
+@given(TABLES, st.sampled_from(["runs_per_task", "runs"]))
+def test_interval_moves_and_stretches_with_the_values(values: np.ndarray, draw) -> None:
+    found = np.array(bootstrap(values, iqm, draw=draw, resamples=200))
+    moved = bootstrap(2 * values + 3, iqm, draw=draw, resamples=200)
+    np.testing.assert_allclose(moved, 2 * found + 3, rtol=0, atol=10 * ROUNDING)
+    assert values.min() - ROUNDING <= found.min()
+    assert found.max() <= values.max() + ROUNDING
+
+
+@pytest.mark.parametrize(
+    ("shape", "options", "expected"),
+    [
+        ((5,), {}, "values has shape (5,): give [runs, tasks]"),
+        ((0, 3), {}, "values is empty"),
+        ((2, 9), {}, "values has 2 runs: an interval over runs takes 3 or more"),
+        ((2, 9), {"draw": "runs"}, "values has 2 runs"),
+        ((9, 2), {"draw": "tasks"}, "values has 2 tasks"),
+        ((9, 2), {"draw": "runs_then_tasks"}, "values has 2 tasks"),
+        ((9, 2), {"draw": "levels"}, "draw is 'levels': give one of runs_per_task"),
+        ((9, 2), {"confidence": 95}, "confidence is 95"),
+        ((9, 2), {"resamples": 39}, "resamples is 39: too few"),
+        ((9, 2), {"resamples": 19, "confidence": 0.9}, "resamples is 19: too few"),
+    ],
+)
+def test_bootstrap_refuses(shape, options, expected: str) -> None:
+    assert expected in _refusal(bootstrap, np.ones(shape), np.mean, **options)
+
+
+def test_bootstrap_takes_the_least_there_may_be() -> None:
+    assert bootstrap(np.ones((3, 1)), np.mean, resamples=40) == (1, 1, 1)
+    assert bootstrap(np.ones((1, 3)), np.mean, draw="tasks", resamples=40) == (1, 1, 1)
+    # 20 * (1 - 0.9) is 1.9999999999999996 in double precision, and means 2.
+    assert bootstrap(np.ones((3, 1)), np.mean, resamples=20, confidence=0.9) == (1, 1, 1)
+
+
+def test_bootstrap_refuses_nan_and_a_statistic_that_is_none() -> None:
+    values = np.ones((3, 2))
+    assert "values holds nan: 1 of 6" in _refusal(
+        bootstrap, [[1, 2], [3, math.nan], [5, 6]], np.mean
+    )
+    assert "has shape (2000, 2): give (2000,)" in _refusal(
+        bootstrap, values, lambda x, axis: x.mean(axis=-2)
+    )
+    assert "gives nan" in _refusal(bootstrap, values, lambda x, axis: x.mean(axis=axis) * math.nan)
+
+
+def test_paired_is_what_scipy_pairs() -> None:
+    random = np.random.default_rng(11)
+    a = random.normal(size=50)
+    b = a + random.exponential(0.3, size=50)
+
+    def difference(x: np.ndarray, y: np.ndarray, axis: int) -> np.ndarray:
+        return stats.trim_mean(y, 0.25, axis=axis) - stats.trim_mean(x, 0.25, axis=axis)
+
+    found = paired(a[:, None], b[:, None], iqm, resamples=20_000)
+    expected = stats.bootstrap(
+        (a, b),
+        difference,
+        paired=True,
+        vectorized=True,
+        n_resamples=20_000,
+        method="percentile",
+        rng=12,
+    )
+    error = math.sqrt(2) * _end_error(20_000, expected.standard_error)
+    assert found.estimate == pytest.approx(difference(a, b, 0), abs=ROUNDING)
+    assert found.low == pytest.approx(expected.confidence_interval.low, abs=error)
+    assert found.high == pytest.approx(expected.confidence_interval.high, abs=error)
+    assert 10 * error < found.high - found.low
+
+
+@pytest.mark.parametrize("draw", DRAWS)
+def test_pairs_share_their_draws(draw) -> None:
+    a = np.random.default_rng(13).normal(size=(4, 5))
+    # Every value gains a quarter, so that the difference has no spread, whatever is drawn.
+    assert paired(a, a + 0.25, iqm, draw=draw) == pytest.approx((0.25, 0.25, 0.25), abs=ROUNDING)
+
+
+def test_paired_refuses() -> None:
+    a, b = np.ones((3, 2)), np.ones((3, 2))
+    b[1, 1] = math.inf
+    assert "b holds inf" in _refusal(paired, a, b, iqm)
+    assert "a holds inf" in _refusal(paired, b, a, iqm)
+    assert "a is (3, 2) and b is (4, 2)" in _refusal(paired, a, np.ones((4, 2)), iqm)
+    assert "b has 2 runs" in _refusal(paired, a, a[:2], iqm)
+    assert "resamples is 1" in _refusal(paired, a, a, iqm, resamples=1)
+
+
+def test_improvement_by_hand() -> None:
+    a = np.array([[1.0, 5.0], [2.0, 5.0], [3.0, 5.0]])
+    b = np.array([[2.0, 4.0], [2.0, 5.0], [0.0, 6.0], [9.0, 6.0]])
+    # First task: 1 beats 0; 2 beats 0 and ties twice; 3 beats 2, 2, 0: (1 + 2 + 3) / 12. Second:
+    # each 5 beats 4 and ties once: 3 * 1.5 / 12.
+    found = probability_of_improvement(a, b)
+    assert found.estimate == pytest.approx((6 / 12 + 4.5 / 12) / 2, abs=ROUNDING)
+    assert 0 <= found.low < found.estimate < found.high <= 1
+
+
+def test_improvement_is_certain_where_all_are_better() -> None:
+    a, b = np.array([[4.0], [5.0], [6.0]]), np.array([[1.0], [2.0], [3.0]])
+    assert probability_of_improvement(a, b) == (1, 1, 1)
+    assert probability_of_improvement(b, a) == (0, 0, 0)
+    # Never reached is worse than any number of steps, and a tie with itself.
+    never = np.full((3, 1), math.inf)
+    assert probability_of_improvement(never, a) == (1, 1, 1)
+    assert probability_of_improvement(never, never) == (0.5, 0.5, 0.5)
+
+
+@few
+@given(
+    arrays(np.float64, st.tuples(st.integers(3, 6), st.just(2)), elements=st.integers(0, 5)),
+    arrays(np.float64, st.tuples(st.integers(3, 6), st.just(2)), elements=st.integers(0, 5)),
+)
+def test_improvement_is_the_u_of_mann_and_whitney(a: np.ndarray, b: np.ndarray) -> None:
+    found = probability_of_improvement(a, b, resamples=50).estimate
+    u = [stats.mannwhitneyu(a[:, i], b[:, i], method="asymptotic")[0] for i in range(2)]
+    assert found == pytest.approx(np.mean(u) / (len(a) * len(b)), abs=ROUNDING)
+    reverse = probability_of_improvement(b, a, resamples=50).estimate
+    assert found + reverse == pytest.approx(1, abs=ROUNDING)
+
+
+def test_improvement_interval_is_that_of_scipy() -> None:
+    random = np.random.default_rng(14)
+    a, b = random.normal(0.5, size=15), random.normal(size=20)
+
+    def improvement(x: np.ndarray, y: np.ndarray, axis: int) -> np.ndarray:
+        x, y = np.moveaxis(x, axis, -1), np.moveaxis(y, axis, -1)
+        return (x[..., :, None] > y[..., None, :]).mean(axis=(-2, -1))
+
+    found = probability_of_improvement(a[:, None], b[:, None], resamples=20_000)
+    # No value of a is one of b, so that resamples have no ties.
+    expected = stats.bootstrap(
+        (a, b), improvement, vectorized=True, n_resamples=20_000, method="percentile", rng=15
+    )
+    # Means of 15 * 20 pairs lie 1 / 300 apart, and an end falls on one of them.
+    error = math.sqrt(2) * _end_error(20_000, expected.standard_error) + 1 / 300
+    assert found.low == pytest.approx(expected.confidence_interval.low, abs=error)
+    assert found.high == pytest.approx(expected.confidence_interval.high, abs=error)
+    assert 10 * error < found.high - found.low
+
+
+def test_improvement_draws_runs_whole_or_by_task() -> None:
+    # Two tasks on which each run does the same: drawn whole, they are as one task.
+    random = np.random.default_rng(16)
+    a, b = random.normal(size=(8, 1)), random.normal(size=(9, 1))
+    one = probability_of_improvement(a, b, draw="runs")
+    twice = probability_of_improvement(a.repeat(4, axis=1), b.repeat(4, axis=1), draw="runs")
+    assert twice == pytest.approx(one, abs=ROUNDING)
+    # Drawn apart, four tasks seem to be independent: narrower by sqrt(4). Off by 0.12 at most for
+    # 2,000 draws (as above), and by 0.03 since those of one task lie 1 / 72 apart, the ends 0.5.
+    apart = probability_of_improvement(a.repeat(4, axis=1), b.repeat(4, axis=1))
+    narrower = (one.high - one.low) / (apart.high - apart.low)
+    assert narrower == pytest.approx(2, rel=0.15)
+
+
+def test_improvement_does_not_depend_on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    random = np.random.default_rng(17)
+    a, b = random.normal(size=(4, 2)), random.normal(size=(5, 2))
+    whole = probability_of_improvement(a, b)
+    monkeypatch.setattr(statistics, "BLOCK", 1)
+    one_by_one = probability_of_improvement(a, b)
+    assert one_by_one.estimate == whole.estimate
+    # The draws of a and b take turns, so that other blocks are other draws of the same: each end
+    # is off by its Monte Carlo error; the sd is a quarter of the width.
+    error = math.sqrt(2) * _end_error(2000, (whole.high - whole.low) / 4)
+    assert one_by_one[1:] == pytest.approx(whole[1:], abs=error + 1 / 40)
+
+
+def test_improvement_refuses() -> None:
+    three = np.ones((3, 2))
+    assert "b has 2 runs" in _refusal(probability_of_improvement, three, three[:2])
+    assert "a has 2 tasks and b has 1" in _refusal(probability_of_improvement, three, three[:, :1])
+    assert "draw is 'tasks'" in _refusal(probability_of_improvement, three, three, draw="tasks")
+    assert "a holds nan" in _refusal(probability_of_improvement, three * math.nan, three)
+    assert "resamples is 1" in _refusal(probability_of_improvement, three, three, resamples=1)
+
+
+def test_curve_is_an_interval_at_each_point() -> None:
+    values = np.random.default_rng(18).normal(size=(7, 4))
+    found = curve(values, np.mean, resamples=500, seed=2)
+    np.testing.assert_allclose(found.estimate, values.mean(axis=0), rtol=0, atol=ROUNDING)
+    for i in range(4):
+        alone = bootstrap(values[:, i : i + 1], np.mean, resamples=500, seed=2)
+        assert (found.low[i], found.high[i]) == (alone.low, alone.high)
+
+
+def test_curve_draws_runs_with_all_their_points() -> None:
+    # The second point is twice the first of every run, so that its band is, end by end.
+    values = np.random.default_rng(19).normal(size=(6, 1)) * [1.0, 2.0]
+    found = curve(values)
+    assert found.low[1] == pytest.approx(2 * found.low[0], abs=ROUNDING)
+    assert found.high[1] == pytest.approx(2 * found.high[0], abs=ROUNDING)
+    assert found.estimate[0] == pytest.approx(stats.trim_mean(values[:, 0], 0.25), abs=ROUNDING)
+
+
+def test_curve_refuses() -> None:
+    assert "values has shape (3,)" in _refusal(curve, np.ones(3))
+    assert "values has 2 runs" in _refusal(curve, np.ones((2, 5)))
+    assert "values is empty" in _refusal(curve, np.ones((5, 0)))
+
+
+def test_area_by_hand() -> None:
+    # From 0 to 10: 1 to 3 in 4 steps, area 8; 3 to 0 in 6 steps, area 9; together 17 over 10.
+    values = [[1.0, 3.0, 0.0], [2.0, 2.0, 2.0]]
+    np.testing.assert_allclose(
+        statistics.area_under([0, 4, 10], values), [1.7, 2.0], rtol=0, atol=ROUNDING
+    )
+    assert statistics.area_under([100, 104, 110], values[0]) == pytest.approx(1.7, abs=ROUNDING)
+
+
+def test_steps_to_by_hand() -> None:
+    curves = [
+        [0.0, 0.4, 0.8, 0.2],  # 0.6 half way from 0.4 to 0.8: 10 + 0.5 * 20; later left again
+        [0.0, 0.6, 0.6, 0.6],  # at the point itself
+        [0.7, 0.0, 0.0, 0.9],  # from the first step on
+        [0.0, 0.1, 0.2, 0.3],  # never
+        [0.5, 0.5, 0.5, 0.7],  # half way from 30 to 40
+    ]
+    found = statistics.steps_to([0, 10, 30, 40], curves, 0.6)
+    np.testing.assert_allclose(found, [20, 10, 0, math.inf, 35], rtol=0, atol=ROUNDING)
+    # Of 0, 10, 20, 35, inf one comes off either end: (10 + 20 + 35) / 3.
+    assert iqm(found) == pytest.approx(65 / 3, abs=ROUNDING)
+
+
+@few
+@given(arrays(np.float64, st.integers(2, 12), elements=FINITE), st.floats(-110, 110))
+def test_steps_to_is_where_the_curve_first_is_at_the_threshold(values, threshold: float) -> None:
+    steps = np.arange(len(values)) ** 2 + 5.0
+    found = float(statistics.steps_to(steps, values, threshold))
+    if found == math.inf:
+        assert values.max() < threshold
+    else:
+        assert (values[steps < found - ROUNDING * 100] < threshold).all()
+        # Steps go up to 126 and slopes to 200 a step: an error of 1e-14 of the steps, times 200.
+        height = np.interp(found, steps, values)
+        expected = max(threshold, values[0])
+        assert height == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("steps", "values", "expected"),
+    [
+        ([0], [1.0], "steps of shape (1,)"),
+        ([0, 0], [1.0, 2.0], "steps of shape (2,) must be two or more numbers that rise"),
+        ([[0, 1], [2, 3]], [[1.0, 2.0], [3.0, 4.0]], "steps of shape (2, 2)"),
+        ([0, 1], [1.0, 2.0, 3.0], "values has shape (3,): give [..., 2]"),
+        ([0, 1], 1.0, "values has shape (): give [..., 2]"),
+        ([0, 1], [math.nan, 1.0], "values holds nan"),
+        ([0, 1], [math.inf, 1.0], "values holds inf"),
+        ([0, math.inf], [1.0, 1.0], "steps holds inf"),
+    ],
+)
+def test_curves_are_refused(steps, values, expected: str) -> None:
+    assert expected in _refusal(statistics.area_under, steps, values)
+    assert expected in _refusal(statistics.steps_to, steps, values, 0.5)
+
+
+@pytest.mark.parametrize("threshold", [math.nan, math.inf])
+def test_steps_to_refuses_a_threshold_that_is_none(threshold: float) -> None:
+    assert "threshold is" in _refusal(statistics.steps_to, [0, 1], [0.0, 1.0], threshold)
