@@ -3,25 +3,20 @@
 `python -m benchmarks.realism_cost [arms=real,webots,...] [key=value ...]` takes the keys of
 `swarmjax.train` and trains pairs of programs in turn, one of them ideal: a call of each, `PAIRS`
 times, after one that is not counted. It prints a JSON line for each factor: the median ratio of
-its time to the ideal one's, with the interval between the second smallest and the second largest
-of the pairs, which holds the median with 97.9 % (10 pairs, binomial), whatever its distribution.
+its time to the ideal one's, with an interval that holds it whatever its distribution (at 10 pairs
+from the second smallest to the second largest, which does so with 97.9 %).
 """
 
 import dataclasses
 import json
-import statistics
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
-import jax
-import numpy as np
-
-from swarmjax import command, config, loop, provenance
+from benchmarks.pairs import Arm, median, time_in_turn
+from swarmjax import command, config, provenance
 from swarmjax.config import ConfigError, RealismConfig, TrainConfig
 from swarmjax.sim import physics
 
@@ -30,26 +25,6 @@ CALL_SECONDS = 0.5  # of the ideal program, about
 THREADS = 8  # programs that are compiled side by side
 PRESETS = ("real", "webots")
 _NO_FACTOR = ("name", "infrared", "stall_time")
-
-
-class Arm:
-    """One program with its state, that trains on with every call."""
-
-    def __init__(self, settings: TrainConfig) -> None:
-        program, schedule = loop.load(settings)
-        self.settings = settings
-        self._state = jax.jit(partial(loop.init, program))(schedule)
-        began = time.perf_counter()
-        train = jax.jit(partial(loop.train_chunk, program, schedule), donate_argnums=0)
-        self._train = train.lower(self._state, np.int32(1)).compile()
-        self.compile_s = time.perf_counter() - began
-
-    def time(self, updates: int) -> float:
-        """Trains for some updates and returns the seconds that took."""
-        began = time.perf_counter()
-        self._state, metrics = self._train(self._state, np.int32(updates))
-        jax.block_until_ready(metrics)
-        return time.perf_counter() - began
 
 
 def arms() -> dict[str, RealismConfig]:
@@ -71,19 +46,17 @@ def compare(ideal: Arm, arm: Arm, updates: int) -> dict[str, Any]:
     Returns:
       The median ratio of the arm's seconds to the ideal one's, its interval, and both medians.
     """
-    for each in (ideal, arm):
-        each.time(updates)
-    pairs = [(ideal.time(updates), arm.time(updates)) for _ in range(PAIRS)]
-    ratios = sorted(mine / theirs for theirs, mine in pairs)
-    steps = updates * ideal.settings.arenas * ideal.settings.algo.rollout
-    plain, mine = (statistics.median(times) for times in zip(*pairs, strict=True))
+    pairs = time_in_turn(ideal, arm, updates, PAIRS)
+    ratio, low, high = median([mine / theirs for theirs, mine in pairs])
+    settings = ideal.settings
+    steps = updates * settings.seeds * settings.arenas * settings.algo.rollout
     return {
-        "time_ratio": statistics.median(ratios),
-        "time_ratio_low": ratios[1],
-        "time_ratio_high": ratios[-2],
+        "time_ratio": ratio,
+        "time_ratio_low": low,
+        "time_ratio_high": high,
         "pairs": PAIRS,
-        "ideal_arena_steps_per_s": steps / plain,
-        "arena_steps_per_s": steps / mine,
+        "ideal_arena_steps_per_s": steps / median([theirs for theirs, _ in pairs])[0],
+        "arena_steps_per_s": steps / median([mine for _, mine in pairs])[0],
     }
 
 
@@ -103,6 +76,7 @@ def results(settings: TrainConfig, chosen: dict[str, RealismConfig]) -> Iterator
             "robot": settings.robot.body,
             "impl": physics.resolve_impl(settings.sim.impl),
             "arenas": settings.arenas,
+            "seeds": settings.seeds,
             "robots": settings.stage[-1].robots,
             "compile_s": arm.compile_s,
             "device": provenance.device(),

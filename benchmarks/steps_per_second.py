@@ -3,7 +3,7 @@
 `python -m benchmarks.steps_per_second [key=value ...]` takes the keys of `swarmjax.train` and
 prints a JSON line for each of the three, the median of `REPEATS` timed calls after one that is
 not counted; compile time is apart. All robots of the last stage act at random (physics and
-environment) or by the policy that is being trained.
+environment) or by the policy that is being trained. Speeds are those of all `seeds` together.
 """
 
 import json
@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from swarmjax import command, config, curriculum, loop, provenance, rollout
+from swarmjax import command, config, curriculum, loop, provenance, rollout, seeds
 from swarmjax.config import TrainConfig
 from swarmjax.loop import Program
 from swarmjax.sim import drive, physics
@@ -68,10 +68,9 @@ def physics_alone(program: Program, arenas: EnvState, key: Array) -> tuple[EnvSt
 
 
 def environment(
-    program: Program, arenas: EnvState, argument: tuple[Any, Array]
+    program: Program, schedule: curriculum.Schedule, arenas: EnvState, key: Array
 ) -> tuple[EnvState, Array]:
     """Steps all arenas with random actions, resets and all; returns them and the reward."""
-    schedule, key = argument
     world = program.world
     step = jax.vmap(partial(env.step, world))
     unpack = jax.vmap(partial(physics.unpack, world.physics))
@@ -116,7 +115,7 @@ def _line(
     """Puts a result together under the names of docs/interface.md."""
     settings = program.config
     compile_s, seconds = timing
-    arena_steps = control_steps * settings.arenas / seconds
+    arena_steps = control_steps * settings.seeds * settings.arenas / seconds
     robots = settings.stage[-1].robots
     substeps = config.substeps(settings.robot, settings.sim.substeps)
     return {
@@ -124,6 +123,7 @@ def _line(
         "robot": settings.robot.body,
         "impl": physics.resolve_impl(settings.sim.impl),
         "arenas": settings.arenas,
+        "seeds": settings.seeds,
         "robots": robots,
         "substeps": substeps,
         "arena_steps_per_s": arena_steps,
@@ -140,26 +140,37 @@ def _line(
 def results(settings: TrainConfig) -> list[dict]:
     """Runs the three benchmarks and returns their lines."""
     program, schedule = loop.load(settings)
-    start = jax.jit(partial(loop.init, program))
-    key = jax.random.key(settings.seed)
+    start = jax.jit(partial(seeds.init, program))
+    keys = jax.vmap(jax.random.key)(np.array(seeds.numbers(settings), np.uint32))
     lines = []
-    *timing, _ = measure(partial(physics_alone, program), start(schedule).arenas, key)
+    *timing, _ = measure(partial(_physics, program), start(schedule).arenas, keys)
     lines.append(_line(program, "physics", CONTROL_STEPS, timing, None))
     arenas = start(schedule).arenas
-    *timing, _ = measure(partial(environment, program), arenas, (schedule, key))
+    *timing, _ = measure(partial(_environments, program), arenas, (schedule, keys))
     steps = _rollouts(settings) * settings.algo.rollout
     lines.append(_line(program, "environment", steps, timing, None))
-    rate = lines[-1]["arena_steps_per_s"] / (settings.arenas * settings.algo.rollout)
+    per_update = settings.seeds * settings.arenas * settings.algo.rollout
+    rate = lines[-1]["arena_steps_per_s"] / per_update
     n = int(np.clip(TRAIN_SECONDS * rate / 2, 1, settings.updates))
-    train = partial(_trained, program, schedule)
+    train = partial(seeds.train_chunk, program, schedule)
     *timing, metrics = measure(train, start(schedule), np.int32(n))
-    transitions = float(np.sum(np.asarray(metrics["transitions"], np.float64)[:n]))
+    transitions = float(np.sum(np.asarray(metrics["transitions"], np.float64)[:, :n]))
     lines.append(_line(program, "training", n * settings.algo.rollout, timing, transitions))
     return lines
 
 
-def _trained(program: Program, schedule: curriculum.Schedule, state: Any, n: Array) -> Any:
-    return loop.train_chunk(program, schedule, state, n)
+def _physics(program: Program, arenas: EnvState, keys: Array) -> tuple[EnvState, Array]:
+    """`physics_alone` for all seeds."""
+    return seeds.each(program.config, lambda lane: physics_alone(program, *lane), (arenas, keys))
+
+
+def _environments(
+    program: Program, arenas: EnvState, argument: tuple[curriculum.Schedule, Array]
+) -> tuple[EnvState, Array]:
+    """`environment` for all seeds."""
+    schedule, keys = argument
+    step = partial(environment, program, schedule)
+    return seeds.each(program.config, lambda lane: step(*lane), (arenas, keys))
 
 
 def main(arguments: Sequence[str]) -> int:

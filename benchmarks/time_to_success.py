@@ -1,9 +1,10 @@
 """How many seconds of training until a swarm reaches its targets, and how fast was it trained?
 
 `python -m benchmarks.time_to_success RUN [SHARE]` reads a run directory that `swarmjax.train` left
-and prints a JSON line: the seconds after compilation at which the success of the last stage was
-first measured at SHARE (0.9) of the targets or more, over a whole cohort of training episodes.
-Seconds are those at the end of the call (`run.chunk`), so they are rounded up to it.
+and prints a JSON line for each seed: the seconds after compilation at which the success of the last
+stage was first measured at SHARE (0.9) of the targets or more, over a whole cohort of training
+episodes. Seconds are those at the end of the call (`run.chunk`), so they are rounded up to it;
+seeds of one run share them, and its speeds are those of all of them together.
 """
 
 import json
@@ -14,8 +15,19 @@ from pathlib import Path
 from swarmjax.config import TrainConfig, build, substeps
 from swarmjax.recorder import METRICS
 
+OF_THE_RUN = (
+    "impl",
+    "arena_steps_per_s",
+    "transitions_per_s",
+    "train_s",
+    "compile_s",
+    "device",
+    "versions",
+    "commit",
+)
 
-def line(run: Path, share: float) -> dict:
+
+def lines(run: Path, share: float) -> list[dict]:
     """Sums a run up.
 
     Args:
@@ -23,28 +35,35 @@ def line(run: Path, share: float) -> dict:
       share: of targets that counts as success, 0..1.
 
     Returns:
-      The JSON line; seconds and steps are None if the share was never measured.
+      A JSON line for each seed; seconds and steps are None if the share was never measured.
     """
-    config = json.loads((run / "config.json").read_text())
+    trained = build(TrainConfig, json.loads((run / "config.json").read_text()))
     summary = json.loads((run / "summary.json").read_text())
     rows = [json.loads(text) for text in (run / METRICS).read_text().splitlines()]
-    last, trained = config["stage"][-1], build(TrainConfig, config)
-    there = [r for r in rows if r["stage"] == last["name"] and (r["stage_success"] or 0.0) >= share]
-    return {
-        "benchmark": "time_to_success",
-        "stage": config["stage_name"],
-        "share": share,
-        "seconds": there[0]["train_s"] if there else None,
-        "arena_steps": there[0]["arena_steps"] if there else None,
-        "final_success": summary["targets_reached"].get(last["name"]),
-        "broken_arenas": sum(row["broken_arenas"] for row in rows),
-        "robot": config["robot"]["body"],
-        "arenas": config["arenas"],
-        "robots": last["robots"],
-        "substeps": substeps(trained.robot, trained.sim.substeps),
-        **{k: summary[k] for k in ("impl", "arena_steps_per_s", "transitions_per_s")},
-        **{k: summary[k] for k in ("train_s", "compile_s", "device", "versions", "commit")},
-    }
+    last = trained.stage[-1]
+    found = []
+    for seed, reached in zip(summary["seeds"], summary["targets_reached"], strict=True):
+        mine = [row for row in rows if row["seed"] == seed]
+        there = [row for row in mine if (row["success_by_stage"][-1] or 0.0) >= share]
+        found.append(
+            {
+                "benchmark": "time_to_success",
+                "stage": trained.stage_name,
+                "seed": seed,
+                "seeds": trained.seeds,
+                "share": share,
+                "seconds": there[0]["train_s"] if there else None,
+                "arena_steps": there[0]["arena_steps"] if there else None,
+                "final_success": reached.get(last.name),
+                "broken_arenas": sum(row["broken_arenas"] for row in mine),
+                "robot": trained.robot.body,
+                "arenas": trained.arenas,
+                "robots": last.robots,
+                "substeps": substeps(trained.robot, trained.sim.substeps),
+                **{key: summary[key] for key in OF_THE_RUN},
+            }
+        )
+    return found
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -53,7 +72,7 @@ def main(arguments: Sequence[str]) -> int:
         sys.stderr.write("usage: python -m benchmarks.time_to_success RUN [SHARE]\n")
         return 2
     run, share = Path(arguments[0]), float(arguments[1]) if len(arguments) > 1 else 0.9
-    sys.stdout.write(json.dumps(line(run, share)) + "\n")
+    sys.stdout.writelines(json.dumps(line) + "\n" for line in lines(run, share))
     return 0
 
 

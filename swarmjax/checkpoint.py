@@ -3,7 +3,8 @@
 Orbax writes and keeps the steps; what it lacks is added here: a digest that notices damage (one
 flipped bit restores silently otherwise), and going back to the newest step that is sound.
 A checkpoint is a flat dictionary from names such as `learners/params/actor/mean/kernel` to
-arrays, so that it can be read without the program that wrote it.
+arrays, so that it can be read without the program that wrote it. Those of a run have a leading
+axis of seeds.
 """
 
 import logging
@@ -105,6 +106,29 @@ def from_leaves(leaves: Leaves, template: Any) -> Any:
         return jax.random.wrap_key_data(array) if is_key else array
 
     return jax.tree_util.tree_map_with_path(fill, template)
+
+
+def of_seed(leaves: Leaves, lane: int, seeds: int) -> Leaves:
+    """Takes one seed out of a run's checkpoint.
+
+    Args:
+      leaves: of a run, [N, ...] each.
+      lane: of the seed, 0..N-1.
+      seeds: N, as the config says.
+
+    Returns:
+      The leaves of that seed, without the axis.
+
+    Raises:
+      CheckpointError: if the checkpoint has not that many seeds.
+    """
+    found = leaves["update"].shape
+    if found != (seeds,):
+        raise CheckpointError(
+            f"the checkpoint holds {found[0] if found else 'no axis of'} seeds, but the config "
+            f"says {seeds}: it is of another run."
+        )
+    return {name: leaf[lane] for name, leaf in leaves.items()}
 
 
 def restore(run: Path, update: int | None = None) -> tuple[Leaves, int, list[str]]:

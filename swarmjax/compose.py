@@ -66,12 +66,24 @@ def stages(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
     names = typing.cast(tuple[str, ...], names)
     if not names:
         raise ConfigError("stage.sequence is []: give at least one stage.")
-    for key in stage.keys() - {"sequence"}:
-        raise ConfigError(
-            f"stage.{key} cannot be given for {choice}, a curriculum: choose one stage, "
-            f"as in stage={names[-1]}."
-        )
+    _refuse_others(
+        stage, choice, "sequence", f"a curriculum: choose one stage, as in stage={names[-1]}"
+    )
     return [_member(name) for name in names]
+
+
+def grid(stage: dict[str, Any], choice: str) -> dict[str, Any]:
+    """Return the axes of a file of configs/stage/ that is a grid.
+
+    Args:
+        stage: what `compose` made of the group `stage`.
+        choice: the name of its file.
+
+    Raises:
+        ConfigError: other keys are given beside it.
+    """
+    _refuse_others(stage, choice, "grid", "a grid: give its axes, as in stage.grid.side=[0.7,1.0]")
+    return stage["grid"]
 
 
 def is_sequence(choice: str) -> bool:
@@ -79,11 +91,24 @@ def is_sequence(choice: str) -> bool:
     return "sequence" in _read_yaml(f"stage/{choice}")
 
 
+def is_grid(choice: str) -> bool:
+    """Tell whether a file of configs/stage/ is a grid of stages."""
+    return "grid" in _read_yaml(f"stage/{choice}")
+
+
+def _refuse_others(stage: dict[str, Any], choice: str, only: str, advice: str) -> None:
+    """Refuse keys of a single stage where a file stands for several."""
+    for key in stage.keys() - {only}:
+        raise ConfigError(f"stage.{key} cannot be given for {choice}, {advice}.")
+
+
 def _member(name: str) -> dict[str, Any]:
     """Read one stage of a curriculum."""
     _check_choice("stage", name, "stage.sequence")
     if is_sequence(name):
         raise ConfigError(f"stage.sequence names {name}, a curriculum itself: give single stages.")
+    if is_grid(name):
+        raise ConfigError(f"stage.sequence names {name}, a grid: give single stages.")
     return _named(_read_yaml(f"stage/{name}"), name)
 
 

@@ -7,9 +7,10 @@ comes out goes through `settings.build`, the one strict converter, and every mis
 files hold what tells robots, realism, algorithms and stages apart; each default stands here.
 """
 
+import itertools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -28,6 +29,20 @@ FILLING = 0.4  # boxes per square of a grid that random placing surely reaches
 
 # What may change when a run goes on; everything else fixes what it has computed so far.
 _RESUME_KEYS = ("budget", "resume", "run.*")
+# The options of a curriculum that not all modes take: those that do, and what null stands for.
+_STEPWISE = ("sequential", "mixed")
+_MODE_OPTIONS: dict[str, tuple[tuple[str, ...], float | str | None]] = {
+    "threshold": (_STEPWISE, 0.8),
+    "demotion": (_STEPWISE, None),
+    "budget_share": (_STEPWISE, 0.5),
+    "earlier_share": (("mixed",), 0.2),
+    "score": (("adaptive",), "learnability"),
+    "floor": (("adaptive",), 0.1),
+    "optimizer": (_STEPWISE, "keep"),
+    "normalizer": (_STEPWISE, "keep"),
+    "exploration": (_STEPWISE, "keep"),
+    "newcomers": (_STEPWISE, "copy"),
+}
 # What is counted has no meaning for sensors that report metres.
 COUNTED = (
     "infrared_noise",
@@ -39,13 +54,18 @@ COUNTED = (
 )
 
 
+_Cell = tuple[int, int, float | tuple[float, float]]  # robots, obstacles, side
+
+
 @dataclass(frozen=True, kw_only=True)
 class StageConfig(Section):
     """One stage: how many robots, how large an arena, which obstacles."""
 
     name: str = field(metadata=about("name of the stage, that of its file"))
     robots: int = field(metadata=about("active robots", 1, 100))
-    side: float = field(metadata=about("side of the square arena, m", 0.4, 4.0))
+    side: float | tuple[float, float] = field(
+        metadata=about("side of the square arena, m; a range: drawn anew for each level", 0.4, 4.0)
+    )
     obstacles: int = field(default=0, metadata=about("obstacles", 0, 32))
     obstacle_size: float = field(
         default=0.10, metadata=about("edge of the square boxes of a random level, m", 0.02, 0.3)
@@ -64,13 +84,20 @@ class StageConfig(Section):
             raise ConfigError(f"layout is fence, but level is {self.level}: give level=fixed.")
         if self.layout == "fence" and self.obstacles < 1:
             raise ConfigError("obstacles is 0, but layout is fence: give 1 or more.")
+        if self.level == "fixed" and isinstance(self.side, tuple):
+            raise ConfigError(f"side is {show(self.side)}, but level is fixed: give one number.")
         least = smallest_side(self)
-        if self.side < least:
+        if self.sides[0] < least:
             raise ConfigError(
                 f"side is {show(self.side)}, too small for robots={self.robots}, "
                 f"obstacles={self.obstacles}, obstacle_size={show(self.obstacle_size)}: "
                 f"give at least {math.ceil(100 * least) / 100}."
             )
+
+    @property
+    def sides(self) -> tuple[float, float]:
+        """The smallest and the largest side of the arena, m."""
+        return _ends(self.side)
 
 
 def smallest_side(stage: StageConfig) -> float:
@@ -88,11 +115,75 @@ def smallest_side(stage: StageConfig) -> float:
     Returns:
         The side, m.
     """
-    pitch = stage.obstacle_size * math.sqrt(2) + PASSAGE
-    area = stage.robots * 2 * DISC**2 + stage.obstacles * pitch**2
-    if stage.level == "random":
-        area = max(area, stage.obstacles * pitch**2 / FILLING)
+    random = stage.level == "random"
+    return _smallest_side(stage.robots, stage.obstacles, stage.obstacle_size, random=random)
+
+
+def _smallest_side(robots: int, obstacles: int, obstacle_size: float, *, random: bool) -> float:
+    pitch = obstacle_size * math.sqrt(2) + PASSAGE
+    area = robots * 2 * DISC**2 + obstacles * pitch**2
+    if random:
+        area = max(area, obstacles * pitch**2 / FILLING)
     return PASSAGE + math.sqrt(area)
+
+
+def _ends(side: float | tuple[float, float]) -> tuple[float, float]:
+    return side if isinstance(side, tuple) else (side, side)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridConfig(Section):
+    """Stages: every number of robots with every number of obstacles in every arena."""
+
+    robots: tuple[int, ...] = field(metadata=about("active robots", 1, 100))
+    obstacles: tuple[int, ...] = field(default=(0,), metadata=about("obstacles", 0, 32))
+    side: tuple[float | tuple[float, float], ...] = field(
+        metadata=about("sides of the square arena, m, or ranges that they are drawn from", 0.4, 4.0)
+    )
+    obstacle_size: float = field(
+        default=0.10, metadata=about("edge of the square boxes, m", 0.02, 0.3)
+    )
+
+    def _check(self) -> None:
+        for key in ("robots", "obstacles", "side"):
+            if not getattr(self, key):
+                raise ConfigError(f"{key} is []: give at least one number.")
+        if not self.stages():
+            least = min(self._least(cell) for cell in self._cells())
+            raise ConfigError(
+                f"side is {show(self.side)}, which leaves no cell: the smallest swarm with the "
+                f"fewest obstacles needs {math.ceil(100 * least) / 100}."
+            )
+
+    def stages(self) -> tuple[StageConfig, ...]:
+        """Make the stages, the side changing fastest and the robots slowest.
+
+        Cells whose arena is too small for what is in them are left out.
+        """
+        cells = [cell for cell in self._cells() if _ends(cell[2])[0] >= self._least(cell)]
+        return tuple(
+            StageConfig(
+                name=_cell_name(*cell),
+                robots=cell[0],
+                obstacles=cell[1],
+                side=cell[2],
+                obstacle_size=self.obstacle_size,
+            )
+            for cell in cells
+        )
+
+    def _cells(self) -> Iterator[_Cell]:
+        return itertools.product(self.robots, self.obstacles, self.side)
+
+    def _least(self, cell: _Cell) -> float:
+        return _smallest_side(cell[0], cell[1], self.obstacle_size, random=True)
+
+
+def _cell_name(robots: int, obstacles: int, side: float | tuple[float, float]) -> str:
+    """Name a cell of a grid by its numbers, lengths in cm, as r5-o3-s120 or r5-o3-s50-120."""
+    ends = side if isinstance(side, tuple) else (side,)
+    lengths = "-".join(f"{100 * length:.6g}".replace(".", "_") for length in ends)
+    return f"r{robots}-o{obstacles}-s{lengths}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,19 +338,106 @@ class AlgoConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class CurriculumConfig(Section):
-    """When the next stage begins."""
+    """Who trains on which stage, when that changes, and what a promotion does to the learners.
 
-    threshold: float = field(
-        default=0.8, metadata=about("share of targets reached that promotes", 0.0, 1.0)
-    )
-    budget_share: float = field(
-        default=0.5,
+    An option of some modes only, as its meaning says, is null in the others and may be null in
+    its own, where it then takes its default.
+    """
+
+    mode: Literal["sequential", "mixed", "adaptive"] = field(
+        default="sequential",
         metadata=about(
-            "share of the budget for all stages before the last, in equal parts",
+            "sequential: all on the newest stage; mixed: some on earlier ones; adaptive: on all "
+            "stages, most where most is learned"
+        ),
+    )
+    success: Literal["targets", "all"] = field(
+        default="targets",
+        metadata=about("what decides: share of targets, or of episodes in which all arrived"),
+    )
+    threshold: float | None = field(
+        default=None,
+        metadata=about("success that promotes; null: 0.8 [sequential, mixed]", 0.0, 1.0),
+    )
+    demotion: float | None = field(
+        default=None,
+        metadata=about(
+            "success below which the stage before returns; null: never [sequential, mixed]",
+            0.0,
+            1.0,
+        ),
+    )
+    budget_share: float | None = field(
+        default=None,
+        metadata=about(
+            "share of the budget for all stages before the last, in equal parts; null: 0.5 "
+            "[sequential, mixed]",
             above=0.0,
             below=1.0,
         ),
     )
+    earlier_share: float | None = field(
+        default=None,
+        metadata=about(
+            "share of the arenas on earlier stages; null: 0.2 [mixed]", above=0.0, below=1.0
+        ),
+    )
+    score: Literal["learnability", "progress"] | None = field(
+        default=None,
+        metadata=about(
+            "learnability: p (1 - p) of success p; progress: how fast it changes; null: "
+            "learnability [adaptive]"
+        ),
+    )
+    floor: float | None = field(
+        default=None,
+        metadata=about(
+            "share of the arenas spread evenly over all stages; null: 0.1 [adaptive]",
+            above=0.0,
+            high=1.0,
+        ),
+    )
+    optimizer: Literal["keep", "reset"] = field(
+        default="keep",
+        metadata=about("moments of Adam at a promotion; reset: to 0 [sequential, mixed]"),
+    )
+    normalizer: Literal["keep", "relearn"] = field(
+        default="keep",
+        metadata=about(
+            "at a promotion; relearn: from the next batch, without the past [sequential, mixed]"
+        ),
+    )
+    exploration: Literal["keep", "reset"] = field(
+        default="keep",
+        metadata=about("at a promotion; reset: to algo.initial_std [sequential, mixed]"),
+    )
+    newcomers: Literal["copy", "fresh"] = field(
+        default="copy",
+        metadata=about(
+            "independent policies of robots that a promotion adds; copy: of those that trained, "
+            "in turn [sequential, mixed]"
+        ),
+    )
+
+    def _check(self) -> None:
+        for key, (modes, default) in _MODE_OPTIONS.items():
+            value = getattr(self, key)
+            plain = getattr(CurriculumConfig, key)
+            if self.mode not in modes and value != plain:
+                raise ConfigError(
+                    f"{key} is {show(value, quote='')}, but mode is {self.mode}: {key} is an "
+                    f"option of {' and '.join(modes)}, so give {show(plain, quote='')} or "
+                    f"mode={modes[0]}."
+                )
+            if self.mode in modes and value is None:
+                object.__setattr__(self, key, default)
+        if self.demotion is None or self.threshold is None:
+            return
+        if self.demotion >= self.threshold:
+            raise ConfigError(
+                f"demotion is {show(self.demotion)}, but threshold is {show(self.threshold)}: "
+                f"give less than {show(self.threshold)}."
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -488,7 +666,13 @@ class TrainConfig(Section):
     sim: SimConfig = field(default_factory=SimConfig)
     run: RunConfig = field(default_factory=RunConfig)
     seed: int = field(default=0, metadata=about("random seed", 0, MAX_COUNT))
-    seeds: int = field(default=1, metadata=about("runs trained at once", 1, MAX_COUNT))
+    seeds: int = field(
+        default=1, metadata=about("runs trained at once, of seed, seed + 1, ...", 1, 4096)
+    )
+    seeds_by: Literal["vmap", "map"] = field(
+        default="vmap",
+        metadata=about("vmap: side by side; map: in turn, each as it would be alone, bit for bit"),
+    )
     arenas: int = field(default=128, metadata=about("arenas simulated at once", 1, 2**20))
     budget: int = field(
         default=3_000_000, metadata=about("control steps of all arenas together", 1, 10**15)
@@ -509,10 +693,6 @@ class TrainConfig(Section):
     )
 
     def _check(self) -> None:
-        if self.seeds > 1:
-            raise ConfigError(
-                f"seeds is {self.seeds}, but several seeds in one run are not built yet: give 1."
-            )
         self._check_stages()
         if self.arenas % self.algo.minibatches:
             raise ConfigError(
@@ -616,8 +796,19 @@ class ExportConfig(Section):
         default=None,
         metadata=about("update of the checkpoint; null: the newest sound one", 0, MAX_COUNT),
     )
+    seed: int | None = field(
+        default=None, metadata=about("of the policy; null: all of the run", 0, MAX_COUNT)
+    )
     out: str | None = field(default=None, metadata=about("file; null: <run>/policy.npz"))
     format: Literal["npz"] = field(default="npz", metadata=about("of the file"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportConfig(Section):
+    """Which run is drawn, and where to."""
+
+    run: str = field(metadata=about("run directory"))
+    out: str | None = field(default=None, metadata=about("directory; null: <run>/report"))
 
 
 def load_train(overrides: Sequence[str]) -> TrainConfig:
@@ -627,7 +818,7 @@ def load_train(overrides: Sequence[str]) -> TrainConfig:
         ConfigError: see the module.
     """
     mapping, chosen = compose.compose(TrainConfig, "train", overrides)
-    stages = compose.stages(mapping.get("stage", {}), chosen["stage"])
+    stages = _stages(mapping.get("stage", {}), chosen["stage"])
     made = build(TrainConfig, mapping | {"stage": stages, "stage_name": chosen["stage"]})
     if "start_std" in mapping and made.start is None:
         raise ConfigError(
@@ -635,6 +826,14 @@ def load_train(overrides: Sequence[str]) -> TrainConfig:
             "the directory of a run."
         )
     return made
+
+
+def _stages(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
+    """Return the stages that a choice of the group `stage` stands for, as plain data."""
+    if not compose.is_grid(choice):
+        return compose.stages(stage, choice)
+    grid = build(GridConfig, compose.grid(stage, choice), "stage.grid.")
+    return [to_dict(cell) for cell in grid.stages()]
 
 
 def load_evaluate(overrides: Sequence[str]) -> EvaluateConfig:
@@ -645,6 +844,8 @@ def load_evaluate(overrides: Sequence[str]) -> EvaluateConfig:
     """
     mapping, chosen = compose.compose(EvaluateConfig, "evaluate", overrides)
     stage = chosen["stage"]
+    if compose.is_grid(stage):
+        raise ConfigError(f"stage is {stage}, a grid: give one stage, as in stage=s6.")
     stages = compose.stages(mapping.get("stage", {}), stage)
     if compose.is_sequence(stage):
         raise ConfigError(
@@ -661,6 +862,16 @@ def load_export(overrides: Sequence[str]) -> ExportConfig:
     """
     mapping, _ = compose.compose(ExportConfig, "export", overrides)
     return build(ExportConfig, mapping)
+
+
+def load_report(overrides: Sequence[str]) -> ReportConfig:
+    """Make the configuration of `swarmjax.report` from its `key=value` words.
+
+    Raises:
+        ConfigError: see the module.
+    """
+    mapping, _ = compose.compose(ReportConfig, "report", overrides)
+    return build(ReportConfig, mapping)
 
 
 def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainConfig:

@@ -1,16 +1,19 @@
 """What a run shows while it trains: a live table on a terminal, plain lines elsewhere."""
 
 import time
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
-from rich.console import Console
+from rich import box
+from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 
 Row = Mapping[str, Any]
 
 LINE_SECONDS = 2.0  # least time between two plain lines
+MOST_STAGES = 8  # that the table shows one by one
+GOOD = 0.9  # share of targets above which a stage is counted
 _SPEEDS = (
     ("arena steps/s", "arena_steps_per_s"),
     ("robot steps/s", "robot_steps_per_s"),
@@ -19,36 +22,86 @@ _SPEEDS = (
 )
 
 
-def summarize(rows: Sequence[Row]) -> dict[str, Any]:
-    """Sums the rows of a call up: means over all episodes that ended on the newest stage.
+class Spread(NamedTuple):
+    """A figure over seeds: its mean, and the smallest and the largest."""
+
+    mean: float
+    low: float
+    high: float
+
+
+class StageState(NamedTuple):
+    """How a stage stands.
+
+    Attributes:
+      name: of the stage.
+      arenas: share of the arenas that are on it, mean over seeds.
+      success: share of targets by its newest verdict, over the seeds that have one; None without.
+    """
+
+    name: str
+    arenas: float
+    success: Spread | None
+
+
+def summarize(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
+    """Sums the rows of a call up: over the episodes that ended on the newest stage of each seed.
 
     Args:
-      rows: as `recorder.rows` makes them.
+      rows: of all seeds, as `recorder.rows` makes them, those of a seed in their order.
+      names: of the stages, in order.
 
     Returns:
-      `stage`, `update`, `targets_reached`, `all_reached`, `contacts_per_robot`, `return`,
-      `episodes` and `stage_success`; shares are None where no episode ended.
+      `stage`, the newest one, or the range of them over seeds; `update`; `episodes`; as `Spread`
+      over seeds `targets_reached`, `all_reached`, `contacts_per_robot`, `return`, `stage_success`,
+      `value_loss`, `policy_loss` and `std`, None where no episode ended; and `stages`, the
+      `StageState` of each.
     """
-    newest = rows[-1]["stage"]
-    mine = [row for row in rows if row["stage"] == newest]
+    by_seed: dict[int, list[Row]] = {}
+    for row in rows:
+        by_seed.setdefault(row["seed"], []).append(row)
+    each = [_of_seed(mine) for mine in by_seed.values()]
+    last = [mine[-1] for mine in by_seed.values()]
+    newest = sorted({names.index(row["stage"]) for row in last})
+    first, final = names[newest[0]], names[newest[-1]]
+    spread = {key: _spread([one[key] for one in each]) for key in each[0].keys() - {"episodes"}}
+    return spread | {
+        "stage": first if first == final else f"{first} to {final}",
+        "update": rows[-1]["update"] + 1,
+        "episodes": sum(one["episodes"] for one in each),
+        "stages": tuple(_stage(last, i, name) for i, name in enumerate(names)),
+    }
+
+
+def _of_seed(rows: Sequence[Row]) -> dict[str, Any]:
+    """Sums the rows of one seed up."""
+    newest = rows[-1]
+    mine = [row for row in rows if row["stage"] == newest["stage"]]
 
     def share(part: str, whole: str) -> float | None:
         total = sum(row[whole] for row in mine)
         return sum(row[part] for row in mine) / total if total else None
 
     return {
-        "stage": newest,
-        "update": rows[-1]["update"] + 1,
         "episodes": sum(row["episodes"] for row in mine),
         "targets_reached": share("reached", "targets"),
         "all_reached": share("complete", "episodes"),
         "return": share("reward", "targets"),
         "contacts_per_robot": share("contacts", "targets"),
-        "stage_success": rows[-1]["stage_success"],
-        "value_loss": rows[-1]["value_loss"],
-        "policy_loss": rows[-1]["policy_loss"],
-        "std": rows[-1]["std"],
+        **{key: newest[key] for key in ("stage_success", "value_loss", "policy_loss", "std")},
     }
+
+
+def _spread(values: Sequence[float | None]) -> Spread | None:
+    """Spread of those values that are there."""
+    there = [value for value in values if value is not None]
+    return Spread(sum(there) / len(there), min(there), max(there)) if there else None
+
+
+def _stage(last: Sequence[Row], index: int, name: str) -> StageState:
+    """How a stage stands by the last row of each seed."""
+    arenas = sum(row["mix"][index] / sum(row["mix"]) for row in last) / len(last)
+    return StageState(name, arenas, _spread([row["success_by_stage"][index] for row in last]))
 
 
 class Display:
@@ -87,8 +140,8 @@ class Display:
             self._live.stop()
 
 
-def _table(summary: Row, speeds: Row, updates: int, seconds_left: float) -> Table:
-    """Lays the live table out: how the swarm does beside how fast the run goes."""
+def _table(summary: Row, speeds: Row, updates: int, seconds_left: float) -> Group:
+    """Lays the live table out: how the swarm does beside how fast the run goes, then the stages."""
     table = Table(title=f"swarmjax: stage {summary['stage']}", title_justify="left")
     for heading in ("swarm", "run"):
         table.add_column(heading)
@@ -110,7 +163,38 @@ def _table(summary: Row, speeds: Row, updates: int, seconds_left: float) -> Tabl
     ]
     for a, b in zip(left, right, strict=True):
         table.add_row(*a, *b)
+    stages = summary["stages"]
+    return Group(table, _stage_table(stages)) if len(stages) > 1 else Group(table)
+
+
+def _stage_table(stages: Sequence[StageState]) -> Table:
+    """Lists the stages, or of many the one with most arenas, the best and the worst."""
+    table = Table(
+        caption=_counted(stages), caption_justify="left", box=box.SIMPLE_HEAD, show_edge=False
+    )
+    for heading in ("stage", "arenas", "targets reached"):
+        table.add_column(heading, justify="left" if heading == "stage" else "right")
+    shown = [("", stage) for stage in stages]
+    if len(stages) > MOST_STAGES:
+        shown = [("most arenas: ", max(stages, key=lambda stage: stage.arenas))]
+        measured = _measured(stages)
+        if measured:
+            shown += [("best: ", measured[-1]), ("worst: ", measured[0])]
+    for what, stage in shown:
+        table.add_row(f"{what}{stage.name}", f"{100 * stage.arenas:.0f} %", _percent(stage.success))
     return table
+
+
+def _measured(stages: Sequence[StageState]) -> list[StageState]:
+    """Stages that have a verdict, the worst first."""
+    found = [(stage.success.mean, i) for i, stage in enumerate(stages) if stage.success is not None]
+    return [stages[i] for _, i in sorted(found)]
+
+
+def _counted(stages: Sequence[StageState]) -> str:
+    """Says of how many stages the swarm reaches nearly all targets."""
+    good = sum(stage.success is not None and stage.success.mean > GOOD for stage in stages)
+    return f"{good} of {len(stages)} stages above {100 * GOOD:.0f} %"
 
 
 def _line(summary: Row, speeds: Row, updates: int, seconds_left: float) -> str:
@@ -119,6 +203,7 @@ def _line(summary: Row, speeds: Row, updates: int, seconds_left: float) -> str:
         f"update {summary['update']}/{updates}  stage {summary['stage']}  "
         f"targets {_percent(summary['targets_reached'])}  "
         f"success {_percent(summary['stage_success'])}  "
+        f"{_stages_in_line(summary['stages'])}"
         f"contacts {_number(summary['contacts_per_robot'])}  "
         f"return {_number(summary['return'])}  "
         f"arena steps/s {speeds['arena_steps_per_s']:,.0f}  "
@@ -128,12 +213,32 @@ def _line(summary: Row, speeds: Row, updates: int, seconds_left: float) -> str:
     )
 
 
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.1f} %"
+def _stages_in_line(stages: Sequence[StageState]) -> str:
+    """Says how the stages of a curriculum stand; of a single stage all else speaks already."""
+    if len(stages) == 1:
+        return ""
+    worst = "".join(
+        f", worst {stage.name} {_percent(stage.success)}" for stage in _measured(stages)[:1]
+    )
+    return f"{_counted(stages)}{worst}  "
 
 
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
+def _percent(share: Spread | None) -> str:
+    return _with_range(share, lambda value, digits: f"{100 * value:.{digits}f}", " %")
+
+
+def _number(value: Spread | None) -> str:
+    return _with_range(value, lambda number, digits: f"{number:.{2 + digits}g}", "")
+
+
+def _with_range(spread: Spread | None, write: Callable[[float, int], str], unit: str) -> str:
+    """Writes a mean, with the range of several seeds a digit shorter."""
+    if spread is None:
+        return "-"
+    text = f"{write(spread.mean, 1)}{unit}"
+    if spread.low == spread.high:
+        return text
+    return f"{text} ({write(spread.low, 0)} to {write(spread.high, 0)})"
 
 
 def _clock(seconds: float) -> str:

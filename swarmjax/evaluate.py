@@ -281,9 +281,9 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     Returns:
         The arenas at rest, observed.
     """
-    pose, target, obstacle, seed = (
+    pose, target, obstacle, seed, side = (
         np.stack([getattr(each, name) for each in levels])
-        for name in ("start", "target", "obstacle", "seed")
+        for name in ("start", "target", "obstacle", "seed", "side")
     )
     pose, target, obstacle = (x.astype(np.float64) for x in (pose, target, obstacle))
     factors = task_factors.draw(
@@ -291,7 +291,7 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     )
     model = _models(judge, factors, len(levels))
     data = np.empty(len(levels), object)
-    data[:] = [place(judge, *each) for each in zip(model, pose, obstacle, strict=True)]
+    data[:] = [place(judge, *each) for each in zip(model, pose, obstacle, side, strict=True)]
     outcome = _no_outcome(len(levels), judge.spacing.robots)
     sight = look(judge, data, factors, pose, target, obstacle)
     memory, seen = senses.begin(judge.electronics, factors, sight, outcome.clock, np)
@@ -340,7 +340,11 @@ def _models(judge: Judge, factors: Factors, count: int) -> np.ndarray:
 
 
 def place(
-    judge: Judge, model: mujoco.MjModel, pose: np.ndarray, obstacle: np.ndarray
+    judge: Judge,
+    model: mujoco.MjModel,
+    pose: np.ndarray,
+    obstacle: np.ndarray,
+    side: np.float32 | None = None,
 ) -> mujoco.MjData:
     """Sets an arena up, at rest.
 
@@ -349,13 +353,14 @@ def place(
         model: Of the arena.
         pose: [R, 3] x (m), y (m), yaw (rad).
         obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m; those the model was compiled for).
+        side: Of the arena, m; the stage's if there is none.
 
     Returns:
         The arena, its positions up to date.
     """
     data = mujoco.MjData(model)
-    side = np.float64(judge.stage.side)
-    where, turn = sim_model.fixture_poses(side, obstacle, np)
+    length = np.float64(judge.stage.side if side is None else side)
+    where, turn = sim_model.fixture_poses(length, obstacle, np)
     data.mocap_pos[judge.ids.fixture_mocap] = where
     data.mocap_quat[judge.ids.fixture_mocap] = turn
     data.qpos = sim_model.BODIES[judge.config.robot.body].qpos(pose, np)
@@ -549,7 +554,8 @@ def _brightness(judge: Judge, shades: infrared.Reflectance, geom: np.ndarray) ->
 def _near(judge: Judge, middle: np.ndarray, place: np.ndarray, obstacle: np.ndarray) -> np.ndarray:
     """Tells [A, R, K] whether a ray may meet anything, by circles about it and all things.
 
-    Casting a ray costs more than all else, and most have nothing to meet.
+    Casting a ray costs more than all else, and most have nothing to meet. The walls are taken to
+    stand where those of the stage's smallest arena do.
 
     Args:
         judge: What the arenas share.

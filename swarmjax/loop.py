@@ -13,9 +13,10 @@ from flax import struct
 from jax import Array
 
 from swarmjax import curriculum as curricula
-from swarmjax import rollout
+from swarmjax import promotion, rollout
 from swarmjax.config import TrainConfig
-from swarmjax.curriculum import Curriculum, Schedule
+from swarmjax.curriculum import Curriculum, Decision, Mode, Schedule
+from swarmjax.curriculum_modes import MODES
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.rollout import Ended
@@ -45,6 +46,11 @@ class Program:
         """Most updates of one call."""
         return min(self.config.updates, MAX_ROWS)
 
+    @property
+    def mode(self) -> Mode:
+        """How the curriculum decides."""
+        return MODES[self.config.curriculum.mode]
+
 
 @struct.dataclass
 class TrainState:
@@ -65,19 +71,21 @@ class TrainState:
     update: Array
 
 
-def init(program: Program, schedule: Schedule) -> TrainState:
-    """Starts a run from the config's seed.
+def init(program: Program, schedule: Schedule, seed: Array | None = None) -> TrainState:
+    """Starts a run.
 
     Args:
       program: the compiled side.
       schedule: the curriculum's numbers.
+      seed: [] of the run, int32; the config's if there is none.
 
     Returns:
       The state before the first update.
     """
     config = program.config
-    run_key, learner_key, level_key = jax.random.split(jax.random.key(config.seed), 3)
-    curriculum = curricula.init()
+    start_key = jax.random.key(config.seed if seed is None else seed)
+    run_key, learner_key, level_key = jax.random.split(start_key, 3)
+    curriculum = curricula.init(schedule, config.curriculum, program.mode)
     index = curricula.assign(curriculum, config.arenas)
     starts = rollout.draw_starts(
         program.world, schedule.stages, index, curriculum.cohort, level_key
@@ -145,14 +153,17 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     learners, learned = jax.vmap(
         lambda learner, b, k: ppo.update(learner, config.algo, b, k, config.updates)
     )(state.learners, batch, jax.random.split(learn_key, config.learners))
-    counted = curricula.count(state.curriculum, ended.cohort, ended.targets, ended.reached)
-    curriculum, decision = curricula.advance(counted, schedule, state.update)
+    counted = curricula.count(state.curriculum, ended)
+    curriculum, decision = curricula.advance(
+        counted, schedule, config.curriculum, program.mode, state.update
+    )
+    learners = promotion.carry_over(
+        learners, config, state.curriculum.met, curriculum.met, decision.promoted
+    )
     metrics = {
         "update": state.update,
         "stage": state.curriculum.stage,
-        "decision": decision.reason,
-        "decided_stage": decision.stage,
-        "stage_success": decision.success,
+        **_curriculum_metrics(state.curriculum, curriculum, decision, arenas.stage),
         "robots": jnp.sum(arenas.level.present),
         "transitions": jnp.sum(trajectory.valid),
         **_learner_metrics(learned, batch),
@@ -166,6 +177,32 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
         update=state.update + 1,
     )
     return new, metrics
+
+
+def _curriculum_metrics(
+    before: Curriculum, after: Curriculum, decision: Decision, stage: Array
+) -> Metrics:
+    """What was decided, the weights that were decided by it or held, and how each stage goes.
+
+    `mix` counts the arenas by the stages [A] that they are on.
+    """
+    stages = jnp.arange(before.weights.shape[0])
+    record = after.record
+    return {
+        "decision": decision.reason,
+        "decided_stage": decision.stage,
+        "next_stage": decision.next_stage,
+        "stage_success": decision.success,
+        "mix": jnp.sum(stage == stages[:, None], axis=-1, dtype=jnp.int32),
+        "weights": after.weights,
+        "episodes_by_stage": record.episodes,
+        "success_by_stage": record.success,
+        "complete_by_stage": record.complete,
+        "contacts_by_stage": record.contacts,
+        "return_by_stage": record.reward,
+        "estimate_by_stage": record.fast,
+        "progress_by_stage": record.progress,
+    }
 
 
 def _learner_metrics(learned: Metrics, batch: Batch) -> Metrics:

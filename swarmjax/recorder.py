@@ -17,21 +17,33 @@ Row = dict[str, Any]
 
 
 def rows(
-    metrics: dict[str, np.ndarray], n: int, stages: Sequence[str], control_steps: int
+    metrics: dict[str, np.ndarray],
+    n: int,
+    stages: Sequence[str],
+    seeds: Sequence[int],
+    control_steps: int,
 ) -> list[Row]:
-    """Turns the metrics of a call into a row an update.
+    """Turns the metrics of a call into a row an update and seed.
 
     Args:
-      metrics: as `loop.train_chunk` returns them; the first n entries hold an update each.
+      metrics: [N, rows, ...] as `seeds.train_chunk` returns them; of each seed the first n entries
+        hold an update each.
       n: updates of the call.
       stages: names.
-      control_steps: arena control steps of one update, over all arenas.
+      seeds: [N], the run's.
+      control_steps: arena control steps of one update and seed, over all arenas.
 
     Returns:
-      Rows of plain numbers: counts as they are, shares and means over the episodes that ended in
-      the update on its stage (None where none did).
+      Rows of plain numbers, those of an update together and in the order of the seeds: counts as
+      they are, shares and means over the episodes that ended in the update on its stage (None
+      where none did).
     """
-    columns = {name: np.asarray(column)[:n].tolist() for name, column in metrics.items()}
+    # [n, N] flattened: an update's seeds stand together.
+    columns = {
+        name: np.swapaxes(np.asarray(column)[:, :n], 0, 1).reshape(-1, *column.shape[2:]).tolist()
+        for name, column in metrics.items()
+    }
+    columns["seed"] = [*seeds] * n
     found = [
         dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)
     ]
@@ -53,10 +65,14 @@ def _row(raw: Row, stages: Sequence[str], control_steps: int) -> Row:
         "contacts_per_robot": _share(contacts, targets),
         "ir_steps_share": _share(raw["sensed"], raw["robot_steps"]),
     }
-    finite = {
-        k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in raw.items()
-    }
-    return finite | named
+    return {name: _finite(value) for name, value in raw.items()} | named
+
+
+def _finite(value: Any) -> Any:
+    """Puts None, which JSON has, in the place of numbers that are not finite."""
+    if isinstance(value, list):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _share(part: float, whole: float) -> float | None:
@@ -66,10 +82,19 @@ def _share(part: float, whole: float) -> float | None:
 class Recorder:
     """Appends to the files of a run directory. Use it with `with`."""
 
-    def __init__(self, run: Path, *, tensorboard: bool, update: int, arena_steps: int = 0) -> None:
+    def __init__(
+        self,
+        run: Path,
+        *,
+        seeds: Sequence[int],
+        tensorboard: bool,
+        update: int,
+        arena_steps: int = 0,
+    ) -> None:
         """Opens the files, dropping what a stopped run wrote after the checkpoint `update`.
 
-        `arena_steps` is where that checkpoint stands, on TensorBoard's axis.
+        `arena_steps` is where that checkpoint stands, on TensorBoard's axis. Several seeds have a
+        folder of TensorBoard each.
         """
         run.mkdir(parents=True, exist_ok=True)
         for name in (METRICS, DECISIONS):
@@ -77,19 +102,30 @@ class Recorder:
         self._metrics = (run / METRICS).open("a")
         self._decisions = (run / DECISIONS).open("a")
         purge = arena_steps + 1 if update else None  # TensorBoard hides what it has from here on
-        self._board = (
-            SummaryWriter(str(run / "tensorboard"), purge_step=purge) if tensorboard else None
-        )
+        folder = run / "tensorboard"
+        folders = {k: folder / f"seed{k}" if len(seeds) > 1 else folder for k in seeds}
+        self._boards = {
+            seed: SummaryWriter(str(path), purge_step=purge)
+            for seed, path in folders.items()
+            if tensorboard
+        }
 
     def write(self, found: Sequence[Row], decisions: Iterable[Row], speeds: Row) -> None:
-        """Writes the rows of a call; the speeds go to TensorBoard with the last of them."""
+        """Writes the rows of a call; the speeds, of all seeds together, to TensorBoard's first.
+
+        Of N seeds TensorBoard is given every N-th update, so that it costs no more time than one:
+        a row takes it a millisecond, as much as an update of a few arenas.
+        """
         self._metrics.writelines(json.dumps(row) + "\n" for row in found)
         self._decisions.writelines(json.dumps(row) + "\n" for row in decisions)
         self._metrics.flush()
         self._decisions.flush()
-        if self._board:
-            for row in [*found[:-1], found[-1] | speeds]:
-                _add_scalars(self._board, row)
+        boards = self._boards
+        if boards:
+            for row in found:
+                if row["update"] % len(boards) == 0:
+                    _add_scalars(boards[row["seed"]], row, row["arena_steps"])
+            _add_scalars(next(iter(boards.values())), speeds, found[-1]["arena_steps"])
 
     def __enter__(self) -> "Recorder":
         """Returns itself."""
@@ -99,19 +135,19 @@ class Recorder:
         """Closes the files."""
         self._metrics.close()
         self._decisions.close()
-        if self._board:
-            self._board.close()
+        for board in self._boards.values():
+            board.close()
 
 
-def _add_scalars(board: SummaryWriter, row: Row) -> None:
+def _add_scalars(board: SummaryWriter, row: Row, arena_steps: int) -> None:
     """Writes the numbers of a row to TensorBoard."""
     for name, value in row.items():
         if isinstance(value, int | float):
-            board.add_scalar(name, value, row["arena_steps"])
+            board.add_scalar(name, value, arena_steps)
 
 
 def history(run: Path, update: int) -> tuple[list[Row], list[Row]]:
-    """Reads what a run had written down before `update`: its metrics and its promotions."""
+    """Reads what a run had written down before `update`: its metrics and its decisions."""
     return _kept(run / METRICS, update), _kept(run / DECISIONS, update)
 
 

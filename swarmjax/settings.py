@@ -10,7 +10,7 @@ import difflib
 import math
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -75,15 +75,33 @@ class Section:
         for item in dataclasses.fields(self):
             value = getattr(self, item.name)
             bounds = item.metadata.get("bounds", Bounds())
-            for number in value if isinstance(value, tuple) else (value,):
+            for number in _leaves(value):
                 if isinstance(number, int | float) and not bounds.hold(number):
                     raise ConfigError(f"{item.name} is {show(value)}: give {bounds}.")
-            if isinstance(value, tuple) and any(map(_is_range, options(item.type))):
-                _check_range(item.name, value)
+            for ends in _ranges(item.type, value):
+                _check_range(item.name, ends)
         self._check()
 
     def _check(self) -> None:
         """Refuse what no single bound can say; keys are named from this section on."""
+
+
+def _leaves(value: object) -> Iterator[object]:
+    """Yield a value, or what stands in nested tuples."""
+    if isinstance(value, tuple):
+        for item in value:
+            yield from _leaves(item)
+    else:
+        yield value
+
+
+def _ranges(hint: object, value: object) -> Iterator[tuple[Any, ...]]:
+    """Yield the ranges that a value is or holds."""
+    if isinstance(value, tuple) and _is_list(hint):
+        for item in value:
+            yield from _ranges(typing.get_args(hint)[0], item)
+    elif isinstance(value, tuple) and any(map(_is_range, options(hint))):
+        yield value
 
 
 def _check_range(key: str, value: tuple[Any, ...]) -> None:
@@ -313,7 +331,7 @@ def _number(kind: type[int] | type[float], value: object) -> int | float:
 def _describe(hint: object, bounds: str = "") -> str:
     """Put a field's type in words, and the bounds of its numbers if they are given."""
     if _is_list(hint):
-        examples = {int: "[64,64]", str: "[s1,s2]"}
+        examples = {int: "[64,64]", str: "[s1,s2]", float | tuple[float, float]: "[0.7,[0.8,1.2]]"}
         inner = typing.get_args(hint)[0]
         return f"a list, as in {examples[inner]}{bounds}" if inner in examples else "a list"
     words = []

@@ -1,10 +1,13 @@
 """`start=DIR`: a new run begins with what another one learned, its networks and its normaliser.
 
 Everything else begins afresh: optimiser, learning rate, curriculum, arenas, keys and counters.
+Several seeds begin lane by lane with those of as many, or all with the one that there is.
 """
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from swarmjax import checkpoint, config, export
 from swarmjax.checkpoint import CheckpointError, Leaves
@@ -21,7 +24,8 @@ class Source:
     Attributes:
       run: directory of the run that it comes from.
       update: of the checkpoint that it comes from.
-      leaves: of the learners' networks and normalisers, as `checkpoint.to_leaves` names them.
+      leaves: of the learners' networks and normalisers, as `checkpoint.to_leaves` names them, a
+        lane for each seed of the new run.
       skipped: a sentence for each newer checkpoint that is damaged.
     """
 
@@ -54,7 +58,12 @@ def read(settings: TrainConfig) -> Source | None:
     except CheckpointError as error:
         raise _refused(settings.start, error) from None
     prefixes = tuple(f"learners/{name}/" for name in _CARRIED)
-    carried = {name: leaf for name, leaf in leaves.items() if name.startswith(prefixes)}
+    times = settings.seeds // stored.seeds
+    carried = {
+        name: np.repeat(leaf, times, axis=0)
+        for name, leaf in leaves.items()
+        if name.startswith(prefixes)
+    }
     return Source(run=run, update=update, leaves=carried, skipped=skipped)
 
 
@@ -63,7 +72,7 @@ def carry(source: Source, state: TrainState, settings: TrainConfig) -> TrainStat
 
     Args:
       source: as `read` gave it.
-      state: as `loop.init` gave it.
+      state: as `seeds.init` gave it.
       settings: the config of the new run; `start_std` says whose exploration it begins with.
 
     Returns:
@@ -99,7 +108,12 @@ def _refused(start: str, error: Exception) -> ConfigError:
 
 
 def _check_alike(start: str, stored: TrainConfig, settings: TrainConfig) -> None:
-    """Refuses networks of another shape, and those that would misread what they are given."""
+    """Refuses networks of another shape or number, and those that would misread what they see."""
+    if stored.seeds not in (1, settings.seeds):
+        raise ConfigError(
+            f"start is {config.show(start)}, a run of {stored.seeds} seeds, but seeds is "
+            f"{settings.seeds}: give seeds={stored.seeds}, or a run of one seed."
+        )
     policy = f"algo.policy={stored.algo.policy}"
     if stored.algo.policy == "independent":
         policy += f" sim.max_robots={stored.sim.max_robots}"

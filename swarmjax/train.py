@@ -13,7 +13,7 @@ from pathlib import Path
 
 import jax
 
-from swarmjax import checkpoint, command, config, export, loop, provenance, start
+from swarmjax import checkpoint, command, config, export, loop, provenance, seeds, start
 from swarmjax.checkpoint import CheckpointError
 from swarmjax.config import ConfigError, TrainConfig
 from swarmjax.curriculum import Schedule
@@ -31,7 +31,7 @@ def main(arguments: Sequence[str]) -> int:
     settings = _settings(arguments)
     source = start.read(settings)
     program, schedule = loop.load(settings)
-    template = jax.eval_shape(partial(loop.init, program), schedule)
+    template = jax.eval_shape(partial(seeds.init, program), schedule)
     if settings.run.dry:
         return _dry_run(program, schedule, template)
     state, skipped = _first_state(program, schedule, template, source)
@@ -75,7 +75,7 @@ def _first_state(
     """
     settings = program.config
     if settings.resume is None:
-        state = jax.jit(partial(loop.init, program))(schedule)
+        state = jax.jit(partial(seeds.init, program))(schedule)
         if source is None:
             return state, []
         return start.carry(source, state, settings), source.skipped
@@ -90,7 +90,9 @@ def _first_state(
 
 def _open_run(settings: TrainConfig) -> Path:
     """Makes the run directory and writes `config.json` into it."""
-    name = f"{datetime.now():%Y%m%d-%H%M%S}-{settings.stage_name}-seed{settings.seed}"
+    every = seeds.numbers(settings)
+    seed = f"seed{every[0]}" if len(every) == 1 else f"seeds{every[0]}-{every[-1]}"
+    name = f"{datetime.now():%Y%m%d-%H%M%S}-{settings.stage_name}-{seed}"
     run = Path(settings.run.dir) if settings.run.dir else Path("runs") / name
     resumed = settings.resume is not None and Path(settings.resume).resolve() == run.resolve()
     if (run / "config.json").exists() and not resumed:
@@ -122,33 +124,40 @@ def _dry_run(program: Program, schedule: Schedule, template: TrainState) -> int:
 def _opening(settings: TrainConfig) -> str:
     """Says what is about to be trained."""
     names = ", ".join(stage.name for stage in settings.stage)
-    steps = settings.arenas * settings.algo.rollout
+    steps, every = settings.arenas * settings.algo.rollout, seeds.numbers(settings)
+    how = {"vmap": "side by side", "map": "in turn"}[settings.seeds_by]
+    several = f", seeds {every[0]} to {every[-1]} {how}" if len(every) > 1 else ""
     return (
         f"swarmjax: {settings.stage_name} ({names}), {settings.updates:,} updates of {steps:,} "
-        f"arena control steps ({settings.arenas:,} arenas) on {provenance.device()}"
+        f"arena control steps ({settings.arenas:,} arenas){several} on {provenance.device()}"
     )
 
 
 def _write_results(run: Path, program: Program, state: TrainState, tally: Tally) -> None:
-    """Writes `policy.npz` and `summary.json`."""
-    settings = program.config
+    """Writes the policies and `summary.json`."""
+    settings, every = program.config, seeds.numbers(program.config)
     leaves = checkpoint.to_leaves(state)
-    export.write_policy(run / "policy.npz", leaves, settings, tally.update)
+    for seed in every:
+        file = export.policy_file(run / export.POLICY, settings, seed)
+        export.write_policy(file, leaves, settings, tally.update, seed)
     steps = tally.update * settings.arenas * settings.algo.rollout
-    train_s = tally.earlier_s + tally.seconds
+    train_s, transitions = tally.earlier_s + tally.seconds, tally.transitions
     summary = {
         "stage": settings.stage_name,
         "stages": [stage.name for stage in settings.stage],
+        "seeds": list(every),
         "updates": tally.update,
         "budget_spent": tally.update >= settings.updates,
         "arena_steps": steps,
-        "transitions": tally.transitions,
+        "transitions": [transitions[seed] for seed in every],
         "train_s": train_s,
         "compile_s": tally.compile_s,
-        "arena_steps_per_s": steps / train_s if train_s else None,
-        "transitions_per_s": tally.transitions / train_s if train_s else None,
-        "targets_reached": tally.success,
-        "promotions": tally.decisions,
+        "arena_steps_per_s": settings.seeds * steps / train_s if train_s else None,
+        "transitions_per_s": sum(transitions.values()) / train_s if train_s else None,
+        "targets_reached": [tally.targets_reached[seed] for seed in every],
+        "decisions": [
+            [entry for entry in tally.decisions if entry["seed"] == seed] for seed in every
+        ],
         "impl": physics.resolve_impl(settings.sim.impl),
         "device": provenance.device(),
         "versions": provenance.versions(),
@@ -164,9 +173,10 @@ def _closing(run: Path, settings: TrainConfig, tally: Tally) -> str:
             f"stopped after update {tally.update:,} of {settings.updates:,}, saved; go on with: "
             f"python -m swarmjax.train resume={run}"
         )
-    policy = run / "policy.npz"
+    policy = export.policy_file(run / export.POLICY, settings, settings.seed)
     stage = settings.stage[-1].name
-    return f"done; judge the policy with: python -m swarmjax.evaluate policy={policy} stage={stage}"
+    what = "the policy" if settings.seeds == 1 else f"each of {settings.seeds} policies"
+    return f"done; judge {what} with: python -m swarmjax.evaluate policy={policy} stage={stage}"
 
 
 if __name__ == "__main__":

@@ -12,12 +12,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from swarmjax import config, curriculum, loop, recorder
+from swarmjax import config, curriculum, recorder, seeds
 from swarmjax.checkpoint import Checkpoints
+from swarmjax.config import TrainConfig
 from swarmjax.curriculum import Schedule
 from swarmjax.display import Display, summarize
 from swarmjax.loop import Program, TrainState
-from swarmjax.recorder import Recorder
+from swarmjax.recorder import Recorder, Row
 from swarmjax.sim import physics
 
 CALL_SECONDS = 1.0  # what a call should take when run.chunk is auto: the display's pace
@@ -33,7 +34,7 @@ class Compiled:
     """The compiled chunk and what compiling it took.
 
     Attributes:
-      call: (schedule, state, n) -> (state, metrics); the state is donated.
+      call: (schedule, state [N], n) -> (state [N], metrics [N, rows]); the state is donated.
       seconds: that tracing and compiling took.
       state_bytes: of device memory for what changes in the run.
       work_bytes: that the program needs besides.
@@ -50,24 +51,24 @@ class Tally:
     """What the host adds up over the whole run, in integers that do not wrap.
 
     Attributes:
-      update: updates of the run that are done.
+      update: updates of every seed that are done.
       first: updates that were done when this process began.
-      transitions: robot steps that were trained on.
+      compile_s: spent compiling.
+      transitions: robot steps that each seed was trained on.
+      targets_reached: newest measured share of each stage's targets, by seed.
       earlier_s: spent training before this process began.
       seconds: spent training by this process, compilation apart.
-      compile_s: spent compiling.
-      decisions: promotions.
-      success: newest measured share of targets of each stage.
+      decisions: promotions and demotions.
     """
 
     update: int
     first: int
     compile_s: float
+    transitions: dict[int, int]
+    targets_reached: dict[int, dict[str, float]]
     earlier_s: float = 0.0
-    transitions: int = 0
     seconds: float = 0.0
     decisions: list[dict] = field(default_factory=list)
-    success: dict[str, float] = field(default_factory=dict)
 
 
 class Stop:
@@ -96,18 +97,18 @@ class Stop:
 
 
 def compile_chunk(program: Program, schedule: Schedule, state: Any) -> Compiled:
-    """Compiles `loop.train_chunk` ahead of time.
+    """Compiles `seeds.train_chunk` ahead of time.
 
     Args:
       program: the compiled side.
       schedule: the curriculum's numbers.
-      state: a state, or what `jax.eval_shape` gives of one.
+      state: [N] a state, or what `jax.eval_shape` gives of one.
 
     Returns:
       The program to call.
     """
     began = time.perf_counter()
-    chunk = jax.jit(partial(loop.train_chunk, program), donate_argnums=1)
+    chunk = jax.jit(partial(seeds.train_chunk, program), donate_argnums=1)
     call = chunk.lower(schedule, state, np.int32(1)).compile()
     memory = call.memory_analysis()
     assert memory is not None  # both CPU and GPU tell
@@ -130,7 +131,7 @@ def train(
       run: the run directory.
       program: the compiled side.
       schedule: the curriculum's numbers.
-      state: where to start; donated.
+      state: [N] where to start; donated.
       display: shows the run.
       stop: notices signals.
 
@@ -138,19 +139,16 @@ def train(
       The last state, which is saved, and what came of the run.
 
     Raises:
-      TrainingError: if a loss is no longer finite; the checkpoint before that is kept.
+      TrainingError: if a loss of any seed is no longer finite; the checkpoint before that is kept.
     """
     settings = program.config.run
     compiled = compile_chunk(program, schedule, state)
-    done = int(state.update)
+    done = int(state.update[0])
     compile_s = compiled.seconds + _build_kernels(program, state)
     tally = _tally(program, done, compile_s)
-    arena_steps = done * program.config.arenas * program.config.algo.rollout
     saved_at = time.monotonic()
     with (
-        Recorder(
-            run, tensorboard=settings.tensorboard, update=done, arena_steps=arena_steps
-        ) as record,
+        _recorder(run, program, done) as record,
         Checkpoints(run, settings.keep_checkpoints, done) as checkpoints,
     ):
         for n in _calls(program, tally, stop):
@@ -167,22 +165,50 @@ def train(
 
 def _tally(program: Program, done: int, compile_s: float) -> Tally:
     """Begins to add up, from what a resumed run had come to."""
-    tally = Tally(update=done, first=done, compile_s=compile_s)
+    numbers = seeds.numbers(program.config)
+    tally = Tally(
+        update=done,
+        first=done,
+        compile_s=compile_s,
+        transitions=dict.fromkeys(numbers, 0),
+        targets_reached={seed: {} for seed in numbers},
+    )
     if program.config.resume is None:
         return tally
-    rows, tally.decisions = recorder.history(Path(program.config.resume), done)
-    tally.transitions = sum(row["transitions"] for row in rows)
+    rows, decisions = recorder.history(Path(program.config.resume), done)
+    _add(program, tally, rows, decisions)
     tally.earlier_s = rows[-1]["train_s"] if rows else 0.0
-    measured = [row for row in rows if row["stage_success"] is not None]
-    tally.success = {row["stage"]: row["stage_success"] for row in measured}
     return tally
+
+
+def _add(program: Program, tally: Tally, rows: list[Row], decisions: list[Row]) -> None:
+    """Adds rows and decisions to the tally."""
+    names = [stage.name for stage in program.config.stage]
+    for row in rows:
+        tally.transitions[row["seed"]] += row["transitions"]
+    for row in rows[-program.config.seeds :]:
+        shares = zip(names, row["success_by_stage"], strict=True)
+        tally.targets_reached[row["seed"]] = {k: share for k, share in shares if share is not None}
+    tally.decisions += [entry for entry in decisions if "to" in entry]
+
+
+def _recorder(run: Path, program: Program, done: int) -> Recorder:
+    """Opens what the run writes, where `done` updates are done."""
+    settings = program.config
+    return Recorder(
+        run,
+        seeds=seeds.numbers(settings),
+        tensorboard=settings.run.tensorboard,
+        update=done,
+        arena_steps=done * settings.arenas * settings.algo.rollout,
+    )
 
 
 def _build_kernels(program: Program, state: TrainState) -> float:
     """Builds Warp's kernels before the clock of training starts; returns the seconds it took."""
     began = time.perf_counter()
     if physics.resolve_impl(program.config.sim.impl) == "warp":
-        physics.build_kernels(program.world.physics, state.arenas.sim)
+        physics.build_kernels(program.world.physics, seeds.stepped_together(program, state))
     return time.perf_counter() - began
 
 
@@ -220,37 +246,45 @@ def _report(
     control_steps = settings.arenas * settings.algo.rollout
     tally.update += n
     tally.seconds += seconds
-    rows = recorder.rows(metrics, n, names, control_steps)
-    rows: list[recorder.Row] = [row | {"train_s": tally.earlier_s + tally.seconds} for row in rows]
-    _check_finite(rows)
-    decisions = curriculum.log(rows, names)
+    rows = recorder.rows(metrics, n, names, seeds.numbers(settings), control_steps)
+    rows: list[Row] = [row | {"train_s": tally.earlier_s + tally.seconds} for row in rows]
+    _check_finite(settings, rows)
+    decisions = _decisions(settings, rows)
     speeds = _speeds(program, rows, seconds) | {"compile_s": tally.compile_s}
-    tally.transitions += sum(row["transitions"] for row in rows)
-    tally.decisions += decisions
-    measured = {
-        row["stage"]: row["stage_success"] for row in rows if row["stage_success"] is not None
-    }
-    tally.success |= measured
+    _add(program, tally, rows, decisions)
     record.write(rows, decisions, speeds)
     for entry in decisions:
-        display.say(_promotion(entry))
+        if "to" in entry:  # the rest is many, and stands in the log
+            display.say(_sentence(settings, entry))
     pace = tally.seconds / (tally.update - tally.first)
-    display.show(summarize(rows), speeds, pace * (settings.updates - tally.update))
+    display.show(summarize(rows, names), speeds, pace * (settings.updates - tally.update))
 
 
-def _check_finite(rows: list[dict]) -> None:
+def _decisions(settings: TrainConfig, rows: list[Row]) -> list[Row]:
+    """Says what the curricula of all seeds decided, in the order of the updates."""
+    names, several = [stage.name for stage in settings.stage], settings.seeds
+    found = [
+        entry
+        for lane, seed in enumerate(seeds.numbers(settings))
+        for entry in curriculum.log(rows[lane::several], names, seed)
+    ]
+    return sorted(found, key=lambda entry: entry["update"])
+
+
+def _check_finite(settings: TrainConfig, rows: list[Row]) -> None:
     """Stops a run whose networks have broken, before it is saved."""
     for row in rows:
+        where = f" of seed {row['seed']}" if settings.seeds > 1 else ""
         for name in ("policy_loss", "value_loss", "grad_norm"):
             if row[name] is None:
                 raise TrainingError(
-                    f"{name} is no longer finite at update {row['update']}: try lower "
+                    f"{name} is no longer finite at update {row['update']}{where}: try lower "
                     "algo.actor_learning_rate and algo.critic_learning_rate."
                 )
 
 
-def _speeds(program: Program, rows: list[dict], seconds: float) -> dict[str, float]:
-    """Speeds of a call: arena, robot and physics steps, and transitions, a second."""
+def _speeds(program: Program, rows: list[Row], seconds: float) -> dict[str, float]:
+    """Speeds of a call: arena, robot and physics steps, and transitions, of all seeds a second."""
     settings = program.config
     arena_steps = len(rows) * settings.arenas * settings.algo.rollout
     substeps = config.substeps(settings.robot, settings.sim.substeps)
@@ -262,11 +296,12 @@ def _speeds(program: Program, rows: list[dict], seconds: float) -> dict[str, flo
     }
 
 
-def _promotion(entry: dict) -> str:
+def _sentence(settings: TrainConfig, entry: Row) -> str:
     """Says in one line what the curriculum decided."""
+    seed = f"seed {entry['seed']}, " if settings.seeds > 1 else ""
     share = entry["targets_reached"]
     success = "not measured yet" if share is None else f"{100 * share:.1f} % of targets reached"
     return (
-        f"update {entry['update'] + 1}: {entry['from']} -> {entry['to']} by {entry['why']} "
+        f"{seed}update {entry['update'] + 1}: {entry['from']} -> {entry['to']} by {entry['why']} "
         f"({success})"
     )

@@ -95,6 +95,19 @@ def test_a_stage_is_one_file(own_configs):
     assert [stage.robots for stage in train.stage] == [2, 4]
 
 
+def test_a_grid_is_one_file(own_configs):
+    axes = "grid: {robots: [1, 2], obstacles: [1], side: [1, 2]}\n"
+    (own_configs / "stage" / "mine.yaml").write_text(axes)
+    train = load_train(["stage=mine"])
+    assert train.stage_name == "mine"
+    assert [(s.robots, s.obstacles, s.side) for s in train.stage] == [
+        (1, 1, 1.0),
+        (1, 1, 2.0),
+        (2, 1, 1.0),
+        (2, 1, 2.0),
+    ]
+
+
 @pytest.mark.parametrize(
     ("text", "part"),
     [
@@ -104,6 +117,9 @@ def test_a_stage_is_one_file(own_configs):
         ("name: mine\nrobot: 4\nside: 1\n", "stage.robot is not a key: did you mean stage.robots?"),
         ("name: [\n", "mine.yaml"),
         ("- a\n", "mine.yaml"),
+        ("grid: 3\n", "stage.grid is 3: give keys of its own, as stage.grid.robots"),
+        ("grid: {robots: [2]}\n", "stage.grid.side is missing"),
+        ("grid: {robots: [2], side: [1]}\nrobots: 3\n", "stage.robots cannot be given for mine"),
     ],
 )
 def test_an_unsound_stage_file_is_one_sentence(own_configs, text, part):

@@ -33,7 +33,7 @@ from swarmjax.config import (
 
 ROOT = Path(config.__file__).resolve().parent.parent
 STAGE = {"name": "s", "robots": 2, "side": 1.0}
-CHOICES = "curriculum, expanded, final, s1, s2, s3, s4, s5, s6"
+CHOICES = ", ".join(sorted(path.stem for path in (ROOT / "configs" / "stage").glob("*.yaml")))
 
 
 # Defaults and stages
@@ -54,8 +54,14 @@ def test_stages_are_the_table_of_the_plan():
         (stage,) = load_train([f"stage={name}"]).stage
         assert (stage.robots, stage.side, stage.obstacles) == numbers
         assert stage.name == name
+
+
+def test_every_stage_file_can_be_trained():
     files = {path.stem for path in (ROOT / "configs" / "stage").glob("*.yaml")}
-    assert files == table.keys() | {"curriculum"}
+    assert files >= {"curriculum", "grid", "final", "expanded"}
+    for name in files:
+        train = load_train([f"stage={name}", "sim.max_robots=100", "sim.max_obstacles=32"])
+        assert train.stage_name == name
 
 
 def test_train_defaults_to_the_whole_curriculum():
@@ -130,7 +136,8 @@ def test_import_needs_neither_jax_nor_hydra():
          "algo.actor_learning_rate?"),
         (["stage_name=x"], "stage_name is not a key: did you mean stage?"),
         (["hydra.verbose=1"], "hydra is not a key: give one of stage, robot, task, algo, "
-         "curriculum, sim, run, seed, seeds, arenas, budget, realism, resume, start, start_std."),
+         "curriculum, sim, run, seed, seeds, seeds_by, arenas, budget, realism, resume, start, "
+         "start_std."),
         # What Hydra's grammar refuses.
         (["algo.hidden=[64"], "'algo.hidden=[64' cannot be read: quote a value with special "
          "characters, as in \"algo.hidden='a=b'\"."),
@@ -178,7 +185,60 @@ def test_import_needs_neither_jax_nor_hydra():
          "0.045."),
         (["curriculum.budget_share=1"], "curriculum.budget_share is 1: give more than 0, less "
          "than 1."),
+        (["curriculum.threshold=1.5"], "curriculum.threshold is 1.5: give 0 to 1."),
+        (["curriculum.mode=greedy"], "curriculum.mode is 'greedy': give sequential, mixed or "
+         "adaptive."),
+        (["curriculum.mode=adaptive", "curriculum.floor=0"], "curriculum.floor is 0: give more "
+         "than 0, at most 1."),
+        (["curriculum.mode=mixed", "curriculum.earlier_share=1"], "curriculum.earlier_share is 1: "
+         "give more than 0, less than 1."),
         (["stage=s6", "stage.side=5"], "stage.side is 5: give 0.4 to 4."),
+        (["stage=s6", "stage.side=[0.8,5]"], "stage.side is [0.8,5]: give 0.4 to 4."),
+        (["stage=s6", "stage.side=[1.2,1]"], "stage.side is [1.2,1]: give the lower number first."),
+        (["stage=s6", "stage.side=[1,1.2,2]"], "stage.side is [1,1.2,2]: give a number or a range "
+         "[low,high] of numbers."),
+        (["stage=s2", "stage.level=fixed", "stage.side=[1,2]"], "stage.side is [1,2], but level is "
+         "fixed: give one number."),
+        # The smallest of the arenas must do; 0.77 as worked out below.
+        (["stage=s6", "stage.side=[0.7,1.2]"], "stage.side is [0.7,1.2], too small for robots=5, "
+         "obstacles=3, obstacle_size=0.1: give at least 0.77."),
+        # Options of a mode.
+        (["curriculum.score=learnability"], "curriculum.score is learnability, but mode is "
+         "sequential: score is an option of adaptive, so give null or mode=adaptive."),
+        (["curriculum.mode=mixed", "curriculum.floor=0.1"], "curriculum.floor is 0.1, but mode is "
+         "mixed: floor is an option of adaptive, so give null or mode=adaptive."),
+        (["curriculum.earlier_share=0.1"], "curriculum.earlier_share is 0.1, but mode is "
+         "sequential: earlier_share is an option of mixed, so give null or mode=mixed."),
+        (["curriculum.mode=adaptive", "curriculum.threshold=0.8"], "curriculum.threshold is 0.8, "
+         "but mode is adaptive: threshold is an option of sequential and mixed, so give null or "
+         "mode=sequential."),
+        (["curriculum.mode=adaptive", "curriculum.optimizer=reset"], "curriculum.optimizer is "
+         "reset, but mode is adaptive: optimizer is an option of sequential and mixed, so give "
+         "keep or mode=sequential."),
+        (["curriculum.demotion=0.8"], "curriculum.demotion is 0.8, but threshold is 0.8: give "
+         "less than 0.8."),
+        # Grids.
+        (["stage=grid", "stage.side=1"], "stage.side cannot be given for grid, a grid: give its "
+         "axes, as in stage.grid.side=[0.7,1.0]."),
+        (["stage=grid", "stage.grid.robots=[]"], "stage.grid.robots is []: give at least one "
+         "number."),
+        (["stage=grid", "stage.grid.robots=[2,6]"], "stage r6-o0-s70: robots is 6, but "
+         "sim.max_robots is 5: give 1 to 5."),
+        (["stage=grid", "stage.grid.robot=[2]"], "stage.grid.robot is not a key: did you mean "
+         "stage.grid.robots?"),
+        (["stage=grid", "stage.grid.side=1"], "stage.grid.side is 1: give a list, as in "
+         "[0.7,[0.8,1.2]]."),
+        (["stage=grid", "stage.grid.side=[[0.1,1]]"], "stage.grid.side is [[0.1,1]]: give 0.4 to "
+         "4."),
+        (["stage=grid", "stage.grid.side=[1,[1.2,1]]"], "stage.grid.side is [1.2,1]: give the "
+         "lower number first."),
+        (["stage=grid", "stage.grid.side=[1,1]"], "stage names r2-o0-s100 more than once: give "
+         "each stage once."),
+        # 0.10 + sqrt(5 * 2 * 0.15**2) = 0.10 + 0.4743.
+        (["stage=grid", "stage.grid.side=[0.4,0.5]", "stage.grid.robots=[5]"], "stage.grid.side "
+         "is [0.4,0.5], which leaves no cell: the smallest swarm with the fewest obstacles needs "
+         "0.58."),
+        (["stage.sequence=[s1,grid]"], "stage.sequence names grid, a grid: give single stages."),
         # Checks across keys.
         (["robot.track=0.08"], "robot.track is 0.08, but hull_radius is 0.037 and the wheels lie "
          "inside the hull: give less than 0.074."),
@@ -186,7 +246,8 @@ def test_import_needs_neither_jax_nor_hydra():
          "5."),
         (["sim.max_obstacles=2"], "stage s6: obstacles is 3, but sim.max_obstacles is 2: give 0 "
          "to 2."),
-        (["seeds=2"], "seeds is 2, but several seeds in one run are not built yet: give 1."),
+        (["seeds=0"], "seeds is 0: give 1 to 4096."),
+        (["seeds_by=pmap"], "seeds_by is 'pmap': give vmap or map."),
         (["arenas=100"], "arenas is 100, but algo.minibatches is 8: give a multiple of 8."),
         (["budget=4095"], "budget is 4095, but one update takes arenas x algo.rollout = 4096 "
          "control steps: give at least 4096."),
@@ -204,6 +265,7 @@ def test_train_refuses(words, sentence):
     [
         (["stage=curriculum"], "stage is curriculum, a curriculum: give one stage, as in "
          "stage=s6."),
+        (["stage=grid"], "stage is grid, a grid: give one stage, as in stage=s6."),
         (["suite=all"], "suite is 'all', but is not built yet: leave it out."),
         (["workers=0"], "workers is 0: give 1 to 1024."),
         (["engine=mjx"], "engine is 'mjx': give c."),
@@ -225,6 +287,72 @@ def test_a_budget_of_one_update_is_enough():
 
 def test_a_training_without_stages_is_refused():
     assert refusal(build, TrainConfig, {"stage": []}) == "stage is []: give at least one stage."
+
+
+# Curricula
+
+
+def test_options_hold_their_defaults_in_their_own_mode():
+    def options(*words):
+        made = load_train([f"curriculum.{word}" for word in words])
+        # A stored configuration is the same again.
+        assert build(TrainConfig, to_dict(made)) == made
+        return made.curriculum
+
+    names = ("threshold", "demotion", "budget_share", "earlier_share", "score", "floor")
+    expected = {
+        "sequential": (0.8, None, 0.5, None, None, None),
+        "mixed": (0.8, None, 0.5, 0.2, None, None),
+        "adaptive": (None, None, None, None, "learnability", 0.1),
+    }
+    for mode, values in expected.items():
+        found = options(f"mode={mode}")
+        assert tuple(getattr(found, name) for name in names) == values
+    assert options("threshold=null", "demotion=0.2").demotion == 0.2
+    assert options("mode=adaptive", "score=progress").score == "progress"
+
+
+def test_a_side_may_be_a_range():
+    (stage,) = load_train(["stage=s6", "stage.side=[0.8,1.2]"]).stage
+    assert (stage.side, stage.sides) == ((0.8, 1.2), (0.8, 1.2))
+    assert load_train(["stage=s6"]).stage[0].sides == (1.2, 1.2)
+    made = build(TrainConfig, {"stage": [to_dict(stage)]})
+    assert made.stage == (stage,)
+
+
+# Grids
+
+
+def test_grid():
+    train = load_train(["stage=grid"])
+    names = [stage.name for stage in train.stage]
+    assert train.stage_name == "grid"
+    assert names[:6] == [
+        "r2-o0-s50", "r2-o0-s70", "r2-o0-s100", "r2-o0-s120", "r2-o1-s50", "r2-o1-s70",
+    ]  # fmt: skip
+    # Too small are 0.5 m: for 5 robots (0.58), for an obstacle with 3 or 5 robots (0.54 and more:
+    # 0.10 + sqrt(3 * 0.045 + 0.0583)), for two obstacles (0.64) and three (0.76) with any; and
+    # 0.7 m for three. 48 - 1 - 2 - 3 - 6 are left.
+    assert len(names) == 36
+    assert not {"r5-o0-s50", "r3-o1-s50", "r2-o2-s50", "r2-o3-s70"} & set(names)
+    assert {"r3-o0-s50", "r2-o1-s50", "r5-o2-s70", "r2-o3-s100"} <= set(names)
+    (goal,) = load_train(["stage=s6"]).stage
+    assert train.stage[-1] == dataclasses.replace(goal, name="r5-o3-s120")
+    assert build(TrainConfig, to_dict(train)) == train
+
+
+def test_a_grid_of_ones_own():
+    words = ["robots=[3]", "obstacles=[1,0]", "side=[0.755,[0.8,1.25]]", "obstacle_size=0.2"]
+    train = load_train(["stage=grid", *(f"stage.grid.{word}" for word in words)])
+    # The order is that of the axes. A box of 0.2 m needs
+    # 0.10 + (0.2 sqrt(2) + 0.10) / sqrt(0.4) = 0.71.
+    assert [(stage.name, stage.side) for stage in train.stage] == [
+        ("r3-o1-s75_5", 0.755),
+        ("r3-o1-s80-125", (0.8, 1.25)),
+        ("r3-o0-s75_5", 0.755),
+        ("r3-o0-s80-125", (0.8, 1.25)),
+    ]
+    assert {stage.obstacle_size for stage in train.stage} == {0.2}
 
 
 # The room that a stage needs

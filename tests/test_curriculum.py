@@ -1,28 +1,63 @@
-"""The curriculum's decisions, worked out by hand."""
+"""The curriculum's bookkeeping and its decisions under `sequential`, worked out by hand."""
 
 import dataclasses
 import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from swarmjax import curriculum
 from swarmjax.config import CurriculumConfig, StageConfig, TaskConfig, TrainConfig
-from swarmjax.curriculum import BY_BUDGET, BY_THRESHOLD, STAYED, Curriculum, Schedule
+from swarmjax.curriculum import (
+    BY_BUDGET,
+    BY_DEMOTION,
+    BY_THRESHOLD,
+    NEVER,
+    REWEIGHED,
+    STAYED,
+    Curriculum,
+    Decision,
+    Schedule,
+    Tally,
+)
+from swarmjax.curriculum_modes import MODES
+from swarmjax.rollout import Ended
 
-LATE = np.iinfo(np.int32).max
+OPTIONS = CurriculumConfig()
+NOW, BEFORE = -1, -2  # the current cohort, and the one before
+
+
+class Episode(NamedTuple):
+    """Episodes that have ended: a negative cohort counts from the one that is current."""
+
+    cohort: int
+    targets: int = 10
+    reached: int = 10
+    stage: int | None = None  # the newest
+    episodes: int = 1
+    complete: int = 0
+    contacts: tuple[int, int, int] = (0, 0, 0)
+    reward: float = 0.0
 
 
 class Row(NamedTuple):
-    """What one update saw and decided."""
+    """What one update decided."""
 
     reason: int
     judged: int
     success: float
     stage: int
     cohort: int
+
+
+PERFECT = [Episode(NOW)]
+
+_jitted = jax.jit(curriculum.advance, static_argnums=(2, 3))
 
 
 def _config(base: TrainConfig, stages: int, **changes: object) -> TrainConfig:
@@ -39,22 +74,50 @@ def schedule(tiny_config: TrainConfig) -> Schedule:
 
 def _late(schedule: Schedule) -> Schedule:
     """The same without deadlines."""
-    return schedule._replace(deadline=np.full(len(schedule.deadline), LATE, np.int32))
+    return schedule._replace(deadline=np.full(len(schedule.deadline), NEVER, np.int32))
+
+
+def _start(schedule: Schedule, options: CurriculumConfig = OPTIONS) -> Curriculum:
+    return curriculum.init(schedule, options, MODES[options.mode])
+
+
+def _ended(state: Curriculum, episodes: list[Episode]) -> Ended:
+    """Lays episodes out as one step [1, N]."""
+    rows = []
+    for e in episodes:
+        cohort = e.cohort if e.cohort >= 0 else int(state.cohort) + e.cohort + 1
+        stage = int(state.stage) if e.stage is None else e.stage
+        rows.append(e._replace(cohort=cohort, stage=stage))
+    whole = Episode(*(jnp.array([column]) for column in zip(*rows, strict=True)))
+    none = jnp.zeros_like(whole.cohort)
+    return Ended(
+        episodes=whole.episodes,
+        stage=whole.stage,
+        cohort=whole.cohort,
+        targets=whole.targets,
+        reached=whole.reached,
+        all_reached=whole.complete,
+        steps=none,
+        robot_steps=none,
+        sensed=none,
+        contacts=whole.contacts,
+        reward=whole.reward,
+        broken=none,
+    )
 
 
 def _run(
-    schedule: Schedule, seen: list[list[tuple[int, int, int]]], first: int = 0
+    schedule: Schedule,
+    seen: list[list[Episode]],
+    first: int = 0,
+    options: CurriculumConfig = OPTIONS,
 ) -> tuple[Curriculum, list[Row]]:
-    """Updates that each see episodes of (cohort, targets, reached); a negative cohort counts
-    from the one that is current."""
-    state, rows = curriculum.init(), []
+    """Updates that each see some episodes end."""
+    state, rows = _start(schedule, options), []
     for update, episodes in enumerate(seen, first):
-        number = [c if c >= 0 else int(state.cohort) + c + 1 for c, _, _ in episodes]
-        cohort = jnp.array(number, jnp.int32)
-        targets = jnp.array([t for _, t, _ in episodes], jnp.int32)
-        reached = jnp.array([r for _, _, r in episodes], jnp.int32)
-        state = curriculum.count(state, cohort, targets, reached)
-        state, decision = curriculum.advance(state, schedule, jnp.int32(update))
+        if episodes:
+            state = curriculum.count(state, _ended(state, episodes))
+        state, decision = _advance(state, schedule, update, options)
         rows.append(
             Row(
                 int(decision.reason),
@@ -64,19 +127,28 @@ def _run(
                 int(state.cohort),
             )
         )
+        assert int(decision.next_stage) == int(state.stage)
     return state, rows
 
 
-NOW, BEFORE = -1, -2  # the current cohort, and the one before
-PERFECT = [(NOW, 10, 10)]
+def _advance(
+    state: Curriculum, schedule: Schedule, update: int, options: CurriculumConfig = OPTIONS
+) -> tuple[Curriculum, Decision]:
+    return _jitted(state, schedule, options, MODES[options.mode], jnp.int32(update))
+
+
+# --- numbers
 
 
 def test_schedule(tiny_config: TrainConfig) -> None:
     found = curriculum.schedule(_config(tiny_config, 3))
     assert found.stages.robots.tolist() == [1, 2, 3]
     # Half of 20 updates in two equal parts; the last stage has no end.
-    assert found.deadline.tolist() == [5, 10, LATE]
+    assert found.deadline.tolist() == [5, 10, NEVER]
     assert found.threshold == np.float32(0.8)
+    assert found.demotion == -1
+    assert math.isnan(found.earlier_share)
+    assert math.isnan(found.floor)
     assert found.cohort_updates == 2  # 16 steps, 8 an update
 
 
@@ -85,36 +157,231 @@ def test_schedule_rounds_up(tiny_config: TrainConfig) -> None:
         tiny_config,
         4,
         task=TaskConfig(step_limit=17),
-        curriculum=CurriculumConfig(budget_share=0.4, threshold=0.5),
+        curriculum=CurriculumConfig(budget_share=0.4, threshold=0.5, demotion=0.25),
     )
     found = curriculum.schedule(config)
     # 0.4 of 20 updates, 8, in three parts: 2.67, 5.33, 8.
-    assert found.deadline.tolist() == [3, 6, 8, LATE]
+    assert found.deadline.tolist() == [3, 6, 8, NEVER]
     assert found.cohort_updates == 3  # 17 steps take more than two updates of 8
-    assert found.threshold == 0.5
+    assert (found.threshold, found.demotion) == (0.5, 0.25)
+
+
+def test_schedule_of_the_other_modes(tiny_config: TrainConfig) -> None:
+    mixed = curriculum.schedule(
+        _config(tiny_config, 3, curriculum=CurriculumConfig(mode="mixed", earlier_share=0.25))
+    )
+    assert (mixed.earlier_share, mixed.deadline.tolist()) == (0.25, [5, 10, NEVER])
+    adaptive = curriculum.schedule(
+        _config(tiny_config, 3, curriculum=CurriculumConfig(mode="adaptive", floor=0.5))
+    )
+    assert adaptive.floor == 0.5
+    assert adaptive.deadline.tolist() == [NEVER] * 3
+    assert math.isnan(adaptive.threshold)
 
 
 def test_schedule_of_one_stage(tiny_config: TrainConfig) -> None:
-    assert curriculum.schedule(_config(tiny_config, 1)).deadline.tolist() == [LATE]
+    assert curriculum.schedule(_config(tiny_config, 1)).deadline.tolist() == [NEVER]
 
 
-def test_start_and_assignment() -> None:
-    state = curriculum.init()
-    assert (int(state.stage), int(state.cohort), int(state.age)) == (0, 0, 0)
-    assert math.isnan(float(state.success))
-    assert curriculum.assign(state, 3).tolist() == [0, 0, 0]
-    assert curriculum.assign(dataclasses.replace(state, stage=jnp.int32(2)), 2).tolist() == [2, 2]
+@pytest.mark.parametrize(
+    ("mode", "stage", "weights", "met"),
+    [
+        ("sequential", 0, [1.0, 0.0, 0.0], 1),
+        ("mixed", 0, [1.0, 0.0, 0.0], 1),
+        ("adaptive", 2, [1 / 3] * 3, 3),
+    ],
+)
+def test_start(
+    tiny_config: TrainConfig, mode: str, stage: int, weights: list[float], met: int
+) -> None:
+    options = CurriculumConfig(mode=mode)  # type: ignore[arg-type]  # one of the literals
+    schedule = curriculum.schedule(_config(tiny_config, 3, curriculum=options))
+    state = _start(schedule, options)
+    assert (int(state.stage), int(state.met)) == (stage, met)
+    assert (int(state.cohort), int(state.age), int(state.since)) == (0, 0, 0)
+    np.testing.assert_allclose(state.weights, weights, rtol=1e-6)  # rounding of float32
+    assert all(np.isnan(column).all() for column in state.record[1:])
+    assert not any(np.any(column) for column in (*state.current, *state.previous))
 
 
-def test_episodes_count_for_the_cohort_in_which_they_began() -> None:
-    state = dataclasses.replace(curriculum.init(), cohort=jnp.int32(5))
-    cohort = jnp.array([[5, 4, 3], [5, -1, 6]])
-    targets = jnp.array([[2, 3, 5], [2, 0, 7]])
-    reached = jnp.array([[1, 3, 5], [2, 0, 7]])
-    state = curriculum.count(state, cohort, targets, reached)
-    state = curriculum.count(state, cohort, targets, reached)
-    assert [int(x) for x in state.current] == [2 * (2 + 2), 2 * (1 + 2)]
-    assert [int(x) for x in state.previous] == [2 * 3, 2 * 3]
+# --- who begins where
+
+
+def _weighed(schedule: Schedule, weights: list[float], cohort: int = 0) -> Curriculum:
+    weights_ = jnp.array(weights, jnp.float32)
+    return dataclasses.replace(_start(schedule), weights=weights_, cohort=jnp.int32(cohort))
+
+
+@pytest.mark.parametrize("stage", [0, 1, 2])
+def test_all_weight_on_one_stage(schedule: Schedule, stage: int) -> None:
+    weights = np.eye(3)[stage].tolist()
+    for cohort in range(50):
+        found = curriculum.assign(_weighed(schedule, weights, cohort), 7)
+        assert found.tolist() == [stage] * 7
+
+
+def test_assign_by_hand(schedule: Schedule) -> None:
+    # Points (a + u) / 3 with u = 0.618, 0.236, 0.854; ends of the stages at 0.2 and 0.5.
+    for cohort, expected in ((1, [1, 2, 2]), (2, [0, 1, 2]), (3, [1, 2, 2])):
+        # 0.206, 0.539, 0.873; 0.079, 0.412, 0.745; 0.285, 0.618, 0.951.
+        found = curriculum.assign(_weighed(schedule, [0.2, 0.3, 0.5], cohort), 3)
+        assert found.tolist() == expected
+
+
+def test_a_point_on_the_border_is_of_the_stage_that_begins_there(schedule: Schedule) -> None:
+    # Points 0, 0.25, 0.5 and 0.75, exactly.
+    found = curriculum.assign(_weighed(schedule, [0.25, 0.5, 0.25]), 4)
+    assert found.tolist() == [0, 1, 1, 2]
+
+
+def test_many_arenas_stay_on_their_stage(schedule: Schedule) -> None:
+    weights = [0.2, 0.3, 0.5]
+    found = [curriculum.assign(_weighed(schedule, weights, cohort), 1000) for cohort in range(20)]
+    # Of 1000 points a thousandth apart only those beside the two borders can come to another.
+    assert (np.ptp(found, axis=0) > 0).sum() <= 2
+
+
+WEIGHTS = st.lists(st.floats(0.0, 1.0, allow_subnormal=False), min_size=1, max_size=48)
+
+
+@settings(max_examples=30)
+@given(
+    raw=WEIGHTS.filter(lambda raw: sum(raw) > 0.01),
+    arenas=st.sampled_from([1, 4, 128, 1000]),
+    cohort=st.integers(0, 10**6),
+)
+def test_the_share_of_arenas_is_the_weight(raw: list[float], arenas: int, cohort: int) -> None:
+    weights = np.array(raw, np.float32) / np.float32(sum(raw))
+    state = _many(len(raw), weights, cohort)
+    share = np.bincount(np.asarray(curriculum.assign(state, arenas)), minlength=len(raw)) / arenas
+    # Points of even distance on a circle: an arc holds its share of them, give or take one. 1e-5:
+    # the float32 sum of up to 48 weights.
+    assert (np.abs(share - weights) <= 1 / arenas + 1e-5).all()
+    assert not share[weights == 0.0].any()
+
+
+def _many(stages: int, weights: np.ndarray, cohort: int) -> Curriculum:
+    none = Tally(*[jnp.zeros(stages)] * 6)
+    zero = jnp.int32(0)
+    return Curriculum(
+        stage=zero,
+        weights=jnp.asarray(weights),
+        cohort=jnp.int32(cohort),
+        age=zero,
+        since=zero,
+        current=none,
+        previous=none,
+        record=curriculum.Record(*[jnp.zeros(stages)] * 7),
+        met=zero,
+    )
+
+
+def test_few_arenas_come_round_to_every_stage() -> None:
+    even = _many(36, np.full(36, 1 / 36, np.float32), 0)
+
+    @jax.jit
+    def assign(cohort: jax.Array) -> jax.Array:
+        return curriculum.assign(dataclasses.replace(even, cohort=cohort), 2)
+
+    turns = np.zeros(36, int)
+    for cohort in range(200):
+        turns += np.bincount(assign(jnp.int32(cohort)), minlength=36)
+    # 2 * 200 / 36 = 11.1 turns each. Multiples of the golden ratio miss the length of an arc by
+    # fewer than 2 of 200 points (Weyl sequences of bounded type: at most of order log 200).
+    assert turns.min() >= 9
+    assert turns.max() <= 13
+
+
+# --- what is counted
+
+
+def test_episodes_count_for_the_cohort_and_the_stage_in_which_they_began(
+    schedule: Schedule,
+) -> None:
+    state = dataclasses.replace(_start(schedule), cohort=jnp.int32(5))
+    ended = Ended(
+        episodes=jnp.array([[1, 1, 1], [1, 0, 1]]),
+        stage=jnp.array([[0, 2, 2], [2, 0, 1]]),
+        cohort=jnp.array([[5, 4, 3], [5, -1, 6]]),
+        targets=jnp.array([[2, 3, 5], [4, 0, 7]]),
+        reached=jnp.array([[1, 3, 5], [2, 0, 7]]),
+        all_reached=jnp.array([[0, 1, 1], [0, 0, 1]]),
+        steps=jnp.ones((2, 3), jnp.int32),
+        robot_steps=jnp.ones((2, 3), jnp.int32),
+        sensed=jnp.ones((2, 3), jnp.int32),
+        contacts=jnp.arange(18).reshape(2, 3, 3),
+        reward=jnp.array([[0.5, 1.5, 9.0], [-2.0, 0.0, 9.0]]),
+        broken=jnp.zeros((2, 3), jnp.int32),
+    )
+    state = curriculum.count(curriculum.count(state, ended), ended)  # all of it twice
+    current = [column.tolist() for column in state.current]
+    # Contacts of the first arena in the first step: 0 + 1 + 2; in the second: 9 + 10 + 11.
+    assert current == [[2, 0, 2], [4, 0, 8], [2, 0, 4], [0, 0, 0], [6, 0, 60], [1.0, 0.0, -4.0]]
+    previous = [column.tolist() for column in state.previous]
+    # Contacts of the second arena in the first step: 3 + 4 + 5.
+    assert previous == [[0, 0, 2], [0, 0, 6], [0, 0, 6], [0, 0, 2], [0, 0, 24], [0.0, 0.0, 3.0]]
+
+
+def test_record_of_a_cohort(schedule: Schedule) -> None:
+    seen = [
+        [
+            Episode(NOW, 4, 1, complete=0, contacts=(1, 0, 2), reward=0.5),
+            Episode(NOW, 6, 5, complete=1, contacts=(0, 2, 0), reward=1.0, episodes=3),
+            Episode(NOW, 5, 5, stage=2, complete=1),
+        ]
+    ]
+    state, _ = _run(_late(schedule), seen + [[]] * 3)
+    record = state.record
+    assert record.episodes.tolist() == [4, 0, 1]
+    # Rounding of float32 throughout.
+    np.testing.assert_allclose(record.success, [6 / 10, np.nan, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(record.complete, [1 / 4, np.nan, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(record.contacts, [5 / 10, np.nan, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(record.reward, [1.5 / 10, np.nan, 0.0], rtol=1e-6)
+    # Both means begin at 1/2, as if 20 trials had come out so, and 10 and 5 more.
+    fast = [0.5 + 10 / 30 * (0.6 - 0.5), np.nan, 0.5 + 5 / 25 * (1.0 - 0.5)]
+    for mean in (record.fast, record.slow):
+        np.testing.assert_allclose(mean, fast, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("success", "first", "second", "trials"), [
+    ("targets", 0.3, 0.6, (10, 20)),
+    ("all", 0.0, 1.0, (1, 5)),
+])  # fmt: skip
+def test_running_means(
+    schedule: Schedule, success: str, first: float, second: float, trials: tuple[int, int]
+) -> None:
+    options = CurriculumConfig(success=success)  # type: ignore[arg-type]  # one of the literals
+    seen = [
+        [Episode(NOW, 10, 3)],
+        [],
+        [Episode(NOW, 20, 12, episodes=5, complete=5)],
+        [],
+        [],
+        [],
+    ]
+    state, rows = _run(_late(schedule), seen, options=options)
+    # n = 20 trials move `fast` by 20 / 40, n = 5 by 5 / 25; `slow` by a fifth of that. The first
+    # verdict moves both from 1/2.
+    begun, rate = (n / (n + 20) for n in trials)
+    start = 0.5 + begun * (first - 0.5)
+    fast = start + rate * (second - start)
+    slow = start + rate / 5 * (second - start)
+    np.testing.assert_allclose(state.record.fast[0], fast, rtol=1e-6)  # rounding of float32
+    np.testing.assert_allclose(state.record.slow[0], slow, rtol=1e-6)
+    np.testing.assert_allclose(state.record.progress[0], abs(fast - slow), rtol=1e-5)  # likewise
+    assert rows[3].success == np.float32(first)
+    assert rows[5].success == np.float32(second)
+
+
+def test_a_stage_without_episodes_keeps_its_record(schedule: Schedule) -> None:
+    seen = [[Episode(NOW, 10, 5), Episode(NOW, 10, 2, stage=1)], [], [Episode(NOW, 10, 7)]]
+    state, _ = _run(_late(schedule), seen + [[]] * 3)
+    # Rounding of float32.
+    np.testing.assert_allclose(state.record.success, [0.7, 0.2, np.nan], rtol=1e-6)
+
+
+# --- when it is decided, under `sequential`
 
 
 def test_no_decision_before_two_step_limits(schedule: Schedule) -> None:
@@ -122,7 +389,7 @@ def test_no_decision_before_two_step_limits(schedule: Schedule) -> None:
     _, rows = _run(_late(schedule), [PERFECT] * 4)
     assert [row.reason for row in rows] == [STAYED, STAYED, STAYED, BY_THRESHOLD]
     assert [row.stage for row in rows] == [0, 0, 0, 1]
-    assert [row.cohort for row in rows] == [0, 1, 1, 3]
+    assert [row.cohort for row in rows] == [0, 1, 1, 2]
     assert [math.isnan(row.success) for row in rows] == [True, True, True, False]
     assert rows[3].success == 1.0
     assert [row.judged for row in rows] == [0, 0, 0, 0]
@@ -131,22 +398,44 @@ def test_no_decision_before_two_step_limits(schedule: Schedule) -> None:
 @pytest.mark.parametrize(("reached", "reason"), [(8, BY_THRESHOLD), (7, STAYED)])
 def test_threshold(schedule: Schedule, reached: int, reason: int) -> None:
     # 8 of 10 are the threshold itself.
-    _, rows = _run(_late(schedule), [[(NOW, 10, reached)], [], [], []])
+    _, rows = _run(_late(schedule), [[Episode(NOW, 10, reached)], [], [], []])
     assert rows[3].reason == reason
     assert rows[3].success == np.float32(reached / 10)
 
 
+@pytest.mark.parametrize(("complete", "reason"), [(4, BY_THRESHOLD), (3, STAYED)])
+def test_threshold_of_whole_episodes(schedule: Schedule, complete: int, reason: int) -> None:
+    """9 of 10 targets would do; 4 of 5 episodes are the threshold itself."""
+    seen = [[Episode(NOW, 10, 9, episodes=5, complete=complete)], [], [], []]
+    _, rows = _run(_late(schedule), seen, options=CurriculumConfig(success="all"))
+    assert rows[3].reason == reason
+    assert rows[3].success == np.float32(complete / 5)
+
+
 def test_late_episodes_of_a_cohort_count_for_it(schedule: Schedule) -> None:
     # The lucky ones end first: 9 of 10 in update 0; then 0 of 10 in update 3, of cohort 0 too.
-    seen = [[(NOW, 10, 9)], [], [(NOW, 50, 50)], [(BEFORE, 10, 0)]]
+    seen = [[Episode(NOW, 10, 9)], [], [Episode(NOW, 50, 50)], [Episode(BEFORE, 10, 0)]]
     state, rows = _run(_late(schedule), seen)
     assert rows[3].reason == STAYED
     assert rows[3].success == np.float32(9 / 20)
     # The next cohort, which saw 50 of 50, is judged a step limit later.
-    assert [int(x) for x in state.previous] == [50, 50]
+    assert (int(state.previous.targets[0]), int(state.previous.reached[0])) == (50, 50)
     _, rows = _run(_late(schedule), [*seen, [], []])
     assert [row.reason for row in rows[4:]] == [STAYED, BY_THRESHOLD]
     assert [row.success for row in rows[4:]] == [np.float32(9 / 20), 1.0]
+
+
+def test_short_episodes_weigh_no_more_than_long_ones(schedule: Schedule) -> None:
+    """Five arenas succeed in an update each, five fail in two: 10 of 15 episodes of a cohort.
+
+    Of those that end in the first update of a cohort all of the new ones are successes.
+    """
+    quick = [Episode(NOW, 5, 5)]
+    both = [Episode(NOW, 5, 5), Episode(BEFORE, 5, 0)]
+    state, rows = _run(_late(schedule), [quick, quick, *[both, quick] * 5])
+    assert {row.reason for row in rows} == {STAYED}
+    assert {row.success for row in rows[3:]} == {np.float32(10 / 15)}
+    assert int(state.stage) == 0
 
 
 def test_a_cohort_without_episodes_decides_nothing(schedule: Schedule) -> None:
@@ -156,15 +445,15 @@ def test_a_cohort_without_episodes_decides_nothing(schedule: Schedule) -> None:
     assert [row.cohort for row in rows] == [0, 1, 1, 2, 2, 3, 3, 4]
 
 
-def test_episodes_of_the_stage_that_was_left_count_no_more(schedule: Schedule) -> None:
+def test_episodes_of_the_stage_that_was_left_decide_no_more(schedule: Schedule) -> None:
     # Left in update 3, from cohort 1. Its perfect episodes go on ending for a step limit.
-    old = [(0, 10, 10), (1, 10, 10)]
+    old = [Episode(0, stage=0), Episode(1, stage=0)]
     state, rows = _run(_late(schedule), [PERFECT] * 4 + [old, old])
     assert rows[3].stage == 1
-    assert [int(x) for x in (*state.current, *state.previous)] == [0, 0, 0, 0]
-    assert math.isnan(rows[4].success)
+    assert math.isnan(rows[5].success)
+    assert state.record.success.tolist()[0] == 1.0  # but it stays known how the old stage went
     # Nothing of the new stage is judged before two step limits of its own, and then only it.
-    new = [*old, (NOW, 10, 3)]
+    new = [*old, Episode(NOW, 10, 3)]
     _, rows = _run(_late(schedule), [PERFECT] * 4 + [new] * 4)
     assert [row.reason for row in rows[4:]] == [STAYED] * 4
     assert [row.judged for row in rows[4:]] == [1] * 4
@@ -182,21 +471,30 @@ def test_deadline(schedule: Schedule) -> None:
 
 
 def test_deadline_reports_what_was_measured(schedule: Schedule) -> None:
-    _, rows = _run(schedule, [[(NOW, 10, 5)]] + [[]] * 4)
+    _, rows = _run(schedule, [[Episode(NOW, 10, 5)]] + [[]] * 4)
     assert (rows[4].reason, rows[4].judged, rows[4].success) == (BY_BUDGET, 0, 0.5)
 
 
+def test_a_deadline_begins_a_cohort_at_once(schedule: Schedule) -> None:
+    """Cohort 2 is cut short in update 4, after one; its episodes end in cohort 3."""
+    cut = [[], [], [], [], [Episode(NOW, 10, 4)], [Episode(BEFORE, 10, 1, stage=0)], []]
+    state, rows = _run(schedule, cut)
+    assert [row.cohort for row in rows] == [0, 1, 1, 2, 3, 3, 4]
+    assert state.record.success.tolist()[0] == np.float32(5 / 20)
+
+
 def test_threshold_goes_before_deadline(schedule: Schedule) -> None:
-    at_once = schedule._replace(deadline=np.array([4, 10, LATE], np.int32))
+    at_once = schedule._replace(deadline=np.array([4, 10, NEVER], np.int32))
     _, rows = _run(at_once, [PERFECT] * 4)
     assert rows[3].reason == BY_THRESHOLD
 
 
-def test_a_stage_entered_late_is_left_at_its_own_deadline(schedule: Schedule) -> None:
-    # All deadlines are past: a stage an update, until the last.
-    _, rows = _run(schedule, [[]] * 4, first=50)
-    assert [row.reason for row in rows] == [BY_BUDGET, BY_BUDGET, STAYED, STAYED]
-    assert [row.stage for row in rows] == [1, 2, 2, 2]
+def test_stages_whose_deadlines_are_past_take_a_step_limit_each(schedule: Schedule) -> None:
+    _, rows = _run(schedule, [[]] * 6, first=50)
+    assert [row.reason for row in rows] == [
+        STAYED, BY_BUDGET, STAYED, BY_BUDGET, STAYED, STAYED,
+    ]  # fmt: skip
+    assert [row.stage for row in rows] == [0, 1, 1, 2, 2, 2]
 
 
 def test_the_last_stage_stays(tiny_config: TrainConfig) -> None:
@@ -206,13 +504,54 @@ def test_the_last_stage_stays(tiny_config: TrainConfig) -> None:
     assert [row.success for row in rows[3:]] == [1.0] * 5  # measured nevertheless
 
 
+def test_the_most_robots_met_never_falls(schedule: Schedule) -> None:
+    options = CurriculumConfig(demotion=0.5)
+    numbers = _late(schedule)._replace(demotion=np.float32(0.5))
+    bad = [Episode(NOW, 10, 0)]
+    state, rows = _run(numbers, [PERFECT] * 4, options=options)
+    assert int(state.met) == 2  # of the second stage
+    state, rows = _run(numbers, [PERFECT] * 4 + [bad] * 4, options=options)
+    assert [row.stage for row in rows] == [0] * 3 + [1] * 4 + [0]
+    assert int(state.met) == 2
+
+
+# --- the log
+
+
+def _row(update: int, decision: int, left: int, to: int) -> dict:
+    return {
+        "update": update,
+        "decision": decision,
+        "decided_stage": left,
+        "next_stage": to,
+        "success_by_stage": [0.9, 0.25, None],
+        "complete_by_stage": [0.7, 0.125, None],
+        "episodes_by_stage": [40, 8, 0],
+        "estimate_by_stage": [0.875, 0.5, None],
+        "weights": [0.25, 0.25, 0.5],
+    }
+
+
 def test_log() -> None:
     rows = [
-        {"update": 3, "decision": BY_THRESHOLD, "decided_stage": 0, "stage_success": 0.9},
-        {"update": 4, "decision": STAYED, "decided_stage": 1, "stage_success": 0.1},
-        {"update": 9, "decision": BY_BUDGET, "decided_stage": 1, "stage_success": 0.25},
+        _row(3, BY_THRESHOLD, 0, 1),
+        _row(4, STAYED, 1, 1),
+        _row(9, BY_BUDGET, 1, 2),
+        _row(12, BY_DEMOTION, 2, 1),
+        _row(15, REWEIGHED, 2, 2),
     ]
-    assert curriculum.log(rows, ["a", "b", "c"]) == [
-        {"update": 3, "from": "a", "to": "b", "why": "threshold", "targets_reached": 0.9},
-        {"update": 9, "from": "b", "to": "c", "why": "budget", "targets_reached": 0.25},
+    first = {"targets_reached": 0.9, "all_reached": 0.7, "episodes": 40}
+    second = {"targets_reached": 0.25, "all_reached": 0.125, "episodes": 8}
+    third = {"targets_reached": None, "all_reached": None, "episodes": 0}
+    assert curriculum.log(rows, ["a", "b", "c"], 7) == [
+        {"update": 3, "seed": 7, "from": "a", "to": "b", "why": "threshold"} | first,
+        {"update": 9, "seed": 7, "from": "b", "to": "c", "why": "budget"} | second,
+        {"update": 12, "seed": 7, "from": "c", "to": "b", "why": "demotion"} | third,
+        {
+            "update": 15,
+            "seed": 7,
+            "why": "reweighed",
+            "weights": {"a": 0.25, "b": 0.25, "c": 0.5},
+            "success": {"a": 0.875, "b": 0.5, "c": None},
+        },
     ]

@@ -4,9 +4,11 @@ import io
 
 from rich.console import Console
 
-from swarmjax.display import Display, summarize
+from swarmjax.display import Display, StageState, summarize
 
+NAMES = ["s1", "s2", "s3"]
 ROW = {
+    "seed": 0,
     "stage": "s2",
     "update": 9,
     "episodes": 2,
@@ -19,6 +21,16 @@ ROW = {
     "value_loss": 0.5,
     "policy_loss": -0.01,
     "std": 0.6,
+    "mix": [2, 6, 0],
+    "success_by_stage": [0.95, 0.25, None],
+}
+OTHER = ROW | {
+    "seed": 1,
+    "stage": "s3",
+    "reached": 1,
+    "stage_success": None,
+    "mix": [0, 4, 4],
+    "success_by_stage": [0.85, 0.75, None],
 }
 SPEEDS = {
     "arena_steps_per_s": 1000.0,
@@ -32,32 +44,87 @@ SPEEDS = {
 def test_a_summary_is_over_the_newest_stage_only() -> None:
     older = ROW | {"stage": "s1", "reached": 0, "targets": 100}
     idle = ROW | {"episodes": 0, "targets": 0, "reached": 0, "reward": 0.0, "contacts": 0}
-    summary = summarize([older, ROW, idle])
-    assert summary["targets_reached"] == 3 / 4
-    assert summary["contacts_per_robot"] == 6 / 4
+    summary = summarize([older, ROW, idle], NAMES)
+    assert summary["stage"] == "s2"
+    assert summary["targets_reached"] == (3 / 4, 3 / 4, 3 / 4)
+    assert summary["contacts_per_robot"] == (6 / 4, 6 / 4, 6 / 4)
     assert summary["update"] == 10
-    assert summarize([idle | {"complete": 0}])["targets_reached"] is None
+    assert summarize([idle | {"complete": 0}], NAMES)["targets_reached"] is None
 
 
-def _shown(terminal: bool) -> str:
+def test_seeds_are_summed_up_each_by_itself() -> None:
+    again = ROW | {"targets": 16, "reached": 12}  # as many again: 15 of 20 is 3 of 4
+    summary = summarize([ROW, OTHER, again], NAMES)
+    assert summary["stage"] == "s2 to s3"
+    assert summary["targets_reached"] == ((3 / 4 + 1 / 4) / 2, 1 / 4, 3 / 4)
+    assert summary["stage_success"] == (0.25, 0.25, 0.25)  # the other has none yet
+    assert summary["episodes"] == 6
+
+
+def test_stages_are_as_each_seed_saw_them_last() -> None:
+    older = ROW | {"mix": [8, 0, 0], "success_by_stage": [0.1, None, None]}
+    first, second, third = summarize([older, ROW, OTHER], NAMES)["stages"]
+    assert first == StageState("s1", (2 / 8 + 0) / 2, ((0.95 + 0.85) / 2, 0.85, 0.95))
+    assert second == StageState("s2", (6 / 8 + 4 / 8) / 2, ((0.25 + 0.75) / 2, 0.25, 0.75))
+    assert third == StageState("s3", (0 + 4 / 8) / 2, None)
+
+
+def _shown(terminal: bool, rows: list, names: list[str]) -> str:
     console = Console(file=io.StringIO(), force_terminal=terminal, width=100)
     with Display(100, console) as display:
         display.say("a sentence that stays, however long it may be, " * 4)
-        display.show(summarize([ROW]), SPEEDS, 75.0)
+        display.show(summarize(rows, names), SPEEDS, 75.0)
     file = console.file
     assert isinstance(file, io.StringIO)
     return file.getvalue()
 
 
+def _line_of(shown: str, name: str) -> str:
+    """The line that begins with a name; it is there twice, as a table is shown again at its end."""
+    [line] = {line for line in shown.splitlines() if line.startswith(name)}
+    return line
+
+
 def test_plain_lines_where_there_is_no_terminal() -> None:
-    sentence, line = _shown(terminal=False).splitlines()
+    sentence, line = _shown(False, [ROW], NAMES).splitlines()
     assert sentence.count("stays") == 4
     for part in ("update 10/100", "stage s2", "75.0 %", "25.0 %", "1,000", "4,321", "1 min 15 s"):
         assert part in line
+    assert "1 of 3 stages above 90 %, worst s2 25.0 %" in line
     assert "\x1b" not in line
 
 
 def test_a_table_on_a_terminal() -> None:
-    shown = _shown(terminal=True)
+    shown = _shown(True, [ROW], NAMES)
     for part in ("targets reached", "75.0 %", "transitions/s", "4,321", "12.5 s", "10 of 100"):
         assert part in shown
+    assert "95.0 %" in _line_of(shown, " s1 ")
+    assert "75 %" in _line_of(shown, " s2 ")
+    assert "-" in _line_of(shown, " s3 ")
+
+
+def test_several_seeds_are_shown_with_their_range() -> None:
+    shown = _shown(True, [ROW, OTHER], NAMES)
+    assert "50.0 % (25 to 75)" in _line_of(shown, "│ targets reached")
+    assert "90.0 % (85 to 95)" in _line_of(shown, " s1 ")
+    assert "stage s2 to s3" in shown
+    # 0.9 is the mean of 0.95 and 0.85, but for rounding: not above.
+    assert "0 of 3 stages above 90 %" in shown
+
+
+def test_of_many_stages_the_best_and_the_worst_are_shown() -> None:
+    names = [f"n{i}" for i in range(9)]
+    success = [None, 0.91, 0.92, 0.5, 0.99, 0.4, 0.93, 0.9, 0.6]
+    row = ROW | {"stage": "n8", "mix": [1, 1, 1, 1, 1, 1, 1, 9, 0], "success_by_stage": success}
+    shown = _shown(True, [row], names)
+    assert "99.0 %" in _line_of(shown, " best: n4")
+    assert "40.0 %" in _line_of(shown, " worst: n5")
+    assert "56 %" in _line_of(shown, " most arenas: n7")  # 9 of 16
+    assert "4 of 9 stages above 90 %" in shown
+    assert "n3" not in shown
+
+
+def test_a_single_stage_has_no_table_of_stages() -> None:
+    row = ROW | {"stage": "s1", "mix": [8], "success_by_stage": [0.25]}
+    assert "stages above" not in _shown(True, [row], ["s1"])
+    assert "stages above" not in _shown(False, [row], ["s1"])

@@ -76,7 +76,12 @@ def _policy(path: Path, drive: tuple = STEER, learners: int = 1, **meta: Any) ->
     return path
 
 
-def _stage(robots: int = 1, side: float = 1.0, obstacles: int = 0, **rest: Any) -> StageConfig:
+def _stage(
+    robots: int = 1,
+    side: float | tuple[float, float] = 1.0,
+    obstacles: int = 0,
+    **rest: Any,
+) -> StageConfig:
     return StageConfig(name="test", robots=robots, side=side, obstacles=obstacles, **rest)
 
 
@@ -257,6 +262,24 @@ def test_touching_is_a_gap_below_zero(tmp_path: Path) -> None:
     touching = evaluate.touching(judge, data)
     assert touching.mean(axis=(0, 1)).min() > 0.1  # every kind occurs
     np.testing.assert_array_equal(touching, gap <= 0.0)
+
+
+def test_the_walls_stand_where_the_level_says(tmp_path: Path) -> None:
+    """Of arenas whose side is drawn: a robot 5 mm away sees it, one 1 mm inside touches it."""
+    judge = _judge(tmp_path, _stage(robots=1, side=(0.6, 1.4)))
+    drawn = [evaluate.draw_level(judge.stage, judge.spacing, 1, i) for i in range(20)]
+    sides = [level.side for level in drawn]
+    assert max(sides) - min(sides) > 0.4
+    for gap in (0.005, -0.001):
+        wall = [np.array([[0.5 * side - 0.037 - gap, 0.0, 0.0]], np.float32) for side in sides]
+        levels = [level._replace(start=x) for level, x in zip(drawn, wall, strict=True)]
+        arenas = evaluate.start(judge, levels)
+        touched = evaluate.touching(judge, arenas.data)
+        assert (touched.any(axis=(1, 2)) == (gap < 0)).all()
+        if gap > 0:
+            nearest = arenas.observation[:, 0, :8].min(axis=-1)
+            assert ((nearest > 0.005) & (nearest < 0.04)).all()  # in range, and in all the same
+            np.testing.assert_allclose(nearest, nearest[0], atol=1e-6)  # float32
 
 
 def test_the_judge_counts_what_the_training_environment_counts(tmp_path: Path) -> None:
@@ -609,7 +632,7 @@ def test_steering_to_the_target_reaches_it_in_empty_arenas(
     result = evaluate.evaluate(config, policy.load(path))
     assert result["targets_reached"] >= 0.95  # only another robot can be in the way
     # The arena's diagonal at full speed, and a turn by half a circle at 3.14 rad/s.
-    assert 0.0 < result["arrival_time_s"] < stage.side * math.sqrt(2) / SPEED + 1.0 + 2.0
+    assert 0.0 < result["arrival_time_s"] < stage.sides[1] * math.sqrt(2) / SPEED + 1.0 + 2.0
 
 
 def test_standing_still_reaches_nothing(tmp_path: Path) -> None:

@@ -15,14 +15,19 @@ LAYERS = (
     {"config"},
     {"sim"},
     {"task"},
-    {"curriculum", "ppo"},
-    {"rollout"},
+    {"ppo"},
+    {"rollout", "promotion"},
+    {"curriculum"},
+    {"curriculum_modes"},
     {"loop"},
+    {"seeds"},
     {"provenance", "checkpoint", "recorder", "display"},
-    {"command", "trainer"},
+    {"report_rows"},
+    {"command", "report_figures", "report_page", "trainer"},
     {"export"},
     {"start"},
-    {"train", "evaluate"},
+    {"report", "train", "evaluate"},
+    {"evaluate_mjx"},
 )
 # These stand alone: the learner knows nothing of robots, a policy file needs only NumPy.
 ONLY = {"ppo": {"config"}, "policy": set(), "epuck": set(), "settings": set()}

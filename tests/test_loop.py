@@ -1,10 +1,10 @@
 """The compiled loop: one trace, any chunk size, every stage."""
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +13,7 @@ import pytest
 from swarmjax import curriculum, loop
 from swarmjax.checkpoint import digest, to_leaves
 from swarmjax.config import CurriculumConfig, StageConfig, TrainConfig
-from swarmjax.curriculum import Schedule
+from swarmjax.curriculum import BY_BUDGET, NEVER, Schedule
 from swarmjax.loop import Program, TrainState
 from swarmjax.task.env import World
 
@@ -39,11 +39,13 @@ def chunk(program: Program) -> Chunk:
 
 def _traced_once(program: Program) -> Chunk:
     """Jits `loop.train_chunk`; tracing it a second time is an error."""
+    traces = itertools.count(1)
 
     def chunk(schedule: Schedule, state: TrainState, n: np.int32) -> tuple[TrainState, dict]:
+        assert next(traces) == 1, "traced again"
         return loop.train_chunk(program, schedule, state, jnp.asarray(n))
 
-    return jax.jit(chex.assert_max_traces(chunk, n=1), donate_argnums=1)
+    return jax.jit(chunk, donate_argnums=1)
 
 
 def _run(chunk: Chunk, schedule: Schedule, state: TrainState, sizes: list[int]) -> TrainState:
@@ -90,21 +92,26 @@ def test_stage_numbers_are_no_part_of_the_program(
     assert digest(to_leaves(state)) != digest(to_leaves(other))
 
 
-def test_the_curriculum_visits_every_stage_within_one_trace(tiny_config: TrainConfig) -> None:
-    """All six stages of the default, promoted by deadline since nothing is learned so fast."""
+def _six(base: TrainConfig, options: CurriculumConfig) -> TrainConfig:
+    """All six stages of the default."""
     sizes = [(2, 0.5, 0), (2, 0.7, 0), (3, 0.7, 1), (3, 1.0, 2), (5, 1.0, 2), (5, 1.2, 3)]
     stages = tuple(
         StageConfig(name=f"s{i + 1}", robots=robots, side=side, obstacles=obstacles)
         for i, (robots, side, obstacles) in enumerate(sizes)
     )
-    config = replace(
-        tiny_config,
+    return replace(
+        base,
         stage=stages,
-        sim=replace(tiny_config.sim, max_robots=5, max_obstacles=3),
-        curriculum=CurriculumConfig(threshold=1.0, budget_share=0.8),
+        sim=replace(base.sim, max_robots=5, max_obstacles=3),
+        curriculum=options,
         budget=8 * 8 * 25,
     )
-    program, schedule = loop.load(config)
+
+
+def test_the_curriculum_visits_every_stage_within_one_trace(tiny_config: TrainConfig) -> None:
+    """Promoted by deadline, since nothing is learned so fast."""
+    options = CurriculumConfig(threshold=1.0, budget_share=0.8)
+    program, schedule = loop.load(_six(tiny_config, options))
     chunk = _traced_once(program)
     state = jax.jit(partial(loop.init, program))(schedule)
     state, metrics = chunk(schedule, state, np.int32(10))
@@ -114,21 +121,128 @@ def test_the_curriculum_visits_every_stage_within_one_trace(tiny_config: TrainCo
     np.testing.assert_array_equal(visited, np.repeat(np.arange(6), [4, 4, 4, 4, 4, 5]))
     assert set(np.asarray(state.arenas.stage)) <= {4, 5}
     assert int(np.max(np.sum(state.arenas.level.present, axis=-1))) == 5
+    assert int(state.curriculum.met) == 5
 
 
-def test_independent_robots_learn_apart(tiny_config: TrainConfig, tiny_world: World) -> None:
-    """The third robot is absent from the first stage: its learner must not move at all."""
+def test_mixed_keeps_arenas_on_earlier_stages_within_one_trace(tiny_config: TrainConfig) -> None:
+    options = CurriculumConfig(mode="mixed", threshold=1.0, earlier_share=0.5)
+    program, schedule = loop.load(_six(tiny_config, options))
+    chunk, init = _traced_once(program), jax.jit(partial(loop.init, program))
+    schedule = schedule._replace(deadline=np.array([3, 8, *[NEVER] * 4], np.int32))
+    _, metrics = chunk(schedule, init(schedule), np.int32(20))
+    np.testing.assert_array_equal(metrics["stage"][:20], np.repeat([0, 1, 2], [3, 5, 12]))
+    # Half of the 8 arenas on the third stage, a quarter on each before it; those still under way
+    # from an earlier stage have ended after a step limit.
+    np.testing.assert_allclose(metrics["weights"][19], [0.25, 0.25, 0.5, 0, 0, 0], rtol=1e-6)
+    assert metrics["mix"][12:20].sum(axis=0).tolist()[3:] == [0, 0, 0]
+    assert (metrics["mix"][12:20].sum(axis=1) == 8).all()
+    # Eight arenas, whose points move on from cohort to cohort: within one of their share.
+    np.testing.assert_allclose(metrics["mix"][12:20].mean(axis=0)[:3], [2, 2, 4], atol=1)
+    # Other numbers of everything are no other program.
+    other = schedule._replace(
+        threshold=np.float32(0.1),
+        demotion=np.float32(0.05),
+        earlier_share=np.float32(0.9),
+        cohort_updates=np.int32(3),
+        deadline=np.arange(1, 7, dtype=np.int32),
+        stages=schedule.stages._replace(robots=np.array([1, 2, 3, 4, 5, 5], np.int32)),
+    )
+    chunk(other, init(other), np.int32(20))
+
+
+def test_adaptive_trains_on_all_stages_within_one_trace(tiny_config: TrainConfig) -> None:
+    options = CurriculumConfig(mode="adaptive")
+    program, schedule = loop.load(_six(tiny_config, options))
+    chunk, init = _traced_once(program), jax.jit(partial(loop.init, program))
+    _, metrics = chunk(schedule, init(schedule), np.int32(25))
+    assert set(np.asarray(metrics["stage"])) == {5}
+    weights = np.asarray(metrics["weights"])
+    assert (weights.min(axis=1) >= 0.1 / 6 - 1e-6).all()  # float32
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0, rtol=1e-6)  # likewise
+    decided = np.flatnonzero(metrics["decision"])
+    # A cohort is two updates; the first verdict falls at the end of the second.
+    assert decided.tolist() == list(range(3, 25, 2))
+    # 8 arenas come round to all six stages.
+    assert (np.asarray(metrics["episodes_by_stage"])[-1] > 0).all()
+    other = schedule._replace(floor=np.float32(1.0), cohort_updates=np.int32(3))
+    _, metrics = chunk(other, init(other), np.int32(25))
+    np.testing.assert_allclose(metrics["weights"], np.full((25, 6), 1 / 6), rtol=1e-6)  # float32
+
+
+def test_metrics_by_stage_are_the_record(
+    program: Program, start: Callable[[], TrainState], chunk: Chunk
+) -> None:
+    state, metrics = chunk(curriculum.schedule(program.config), start(), np.int32(20))
+    record = state.curriculum.record
+    names = {
+        "episodes_by_stage": record.episodes,
+        "success_by_stage": record.success,
+        "complete_by_stage": record.complete,
+        "contacts_by_stage": record.contacts,
+        "return_by_stage": record.reward,
+        "estimate_by_stage": record.fast,
+        "progress_by_stage": record.progress,
+        "weights": state.curriculum.weights,
+    }
+    for name, expected in names.items():
+        np.testing.assert_array_equal(metrics[name][19], expected, err_msg=name)
+    on = np.bincount(np.asarray(state.arenas.stage), minlength=2)
+    np.testing.assert_array_equal(metrics["mix"][19], on)
+    # Half of 20 updates for the first stage of two, unless it was left before.
+    last = int(np.asarray(metrics["decision"]).nonzero()[0][0])
+    assert last <= 9
+    moved = [int(metrics[name][last]) for name in ("decided_stage", "next_stage")]
+    assert moved == [0, 1]
+
+
+def test_a_seed_may_be_given(program: Program, start: Callable[[], TrainState]) -> None:
+    schedule = curriculum.schedule(program.config)
+    init = jax.jit(partial(loop.init, program))
+    same, other = init(schedule, np.int32(0)), init(schedule, np.int32(1))
+    assert digest(to_leaves(same)) == digest(to_leaves(start()))  # the config's is 0
+    assert digest(to_leaves(other)) != digest(to_leaves(same))
+    configured = replace(program, config=replace(program.config, seed=1))
+    again = jax.jit(partial(loop.init, configured))(schedule)
+    assert digest(to_leaves(again)) == digest(to_leaves(other))
+
+
+Independent = tuple[Callable[[], TrainState], Callable[..., tuple[TrainState, dict]]]
+
+
+@pytest.fixture(scope="module")
+def independent(tiny_config: TrainConfig, tiny_world: World) -> Independent:
+    """Robots with a learner each; the third joins at the deadline of the first stage."""
     config = replace(
         tiny_config,
-        stage=tiny_config.stage[:1],
         algo=replace(tiny_config.algo, policy="independent"),
+        curriculum=CurriculumConfig(threshold=1.0),
     )
     program = Program(config, replace(tiny_world, config=config))
     schedule = curriculum.schedule(config)
-    before = jax.jit(partial(loop.init, program))(schedule)
-    after, _ = jax.jit(partial(loop.train_chunk, program))(schedule, before, np.int32(3))
+    init = jax.jit(partial(loop.init, program))
+    return lambda: init(schedule), jax.jit(partial(loop.train_chunk, program, schedule))
+
+
+def test_independent_robots_learn_apart(independent: Independent) -> None:
+    """The third robot is absent from the first stage: its learner must not move at all."""
+    start, train = independent
+    before, after = start(), train(start(), np.int32(3))[0]
     name = "learners/params/actor/mean/kernel"
     moved = np.abs(to_leaves(after)[name] - to_leaves(before)[name]).max(axis=(1, 2))
     assert (moved[:2] > 1e-4).all()
     assert moved[2] == 0.0
     assert not np.array_equal(to_leaves(after)[name][0], to_leaves(after)[name][1])
+
+
+def test_newcomers_start_from_what_the_others_learned(independent: Independent) -> None:
+    """The deadline falls after ten updates, half of all."""
+    start, train = independent
+    before, metrics = train(start(), np.int32(9))
+    after, decided = train(before, np.int32(1))
+    assert not np.asarray(metrics["decision"]).any()
+    assert int(decided["decision"][0]) == BY_BUDGET
+    assert (int(before.curriculum.met), int(after.curriculum.met)) == (2, 3)
+    untouched, kept, carried = (to_leaves(x.learners) for x in (start(), before, after))
+    for name in carried:
+        np.testing.assert_array_equal(kept[name][2], untouched[name][2], err_msg=name)
+        np.testing.assert_array_equal(carried[name][2], carried[name][0], err_msg=name)

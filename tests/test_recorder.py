@@ -9,7 +9,7 @@ import pytest
 from swarmjax import recorder
 from swarmjax.recorder import Recorder
 
-METRICS = {
+ONE_SEED = {
     "update": np.array([4, 5, 0]),
     "stage": np.array([0, 1, 0]),
     "episodes": np.array([2, 0, 0]),
@@ -24,11 +24,19 @@ METRICS = {
     "contacts_obstacle": np.array([3, 0, 0]),
     "contacts_wall": np.array([1, 0, 0]),
     "stage_success": np.array([np.nan, 0.5, 0.0]),
+    "success_by_stage": np.array([[np.nan, 0.25], [0.5, np.nan], [0.0, 0.0]]),
+    "mix": np.array([[8, 0], [6, 2], [0, 0]]),
 }
+METRICS = {name: column[None] for name, column in ONE_SEED.items()}
+
+
+def _row(update: int, seed: int = 0) -> dict:
+    return {"update": update, "arena_steps": update, "seed": seed}
 
 
 def test_rows_are_counts_with_their_shares() -> None:
-    first, second = recorder.rows(METRICS, 2, ["s1", "s2"], control_steps=100)
+    first, second = recorder.rows(METRICS, 2, ["s1", "s2"], [7], control_steps=100)
+    assert first["seed"] == second["seed"] == 7
     assert first["stage"] == "s1"
     assert first["arena_steps"] == 500  # updates 0..4 of 100
     assert first["targets_reached"] == 3 / 4
@@ -40,18 +48,30 @@ def test_rows_are_counts_with_their_shares() -> None:
     assert first["stage_success"] is None
     assert second["targets_reached"] is None
     assert second["stage_success"] == 0.5
+    assert first["success_by_stage"] == [None, 0.25]
+    assert second["mix"] == [6, 2]
     json.dumps([first, second], allow_nan=False)
 
 
+def test_seeds_of_an_update_stand_together() -> None:
+    other = ONE_SEED | {"reached": np.array([4, 0, 0]), "mix": ONE_SEED["mix"][:, ::-1]}
+    metrics = {name: np.stack([ONE_SEED[name], other[name]]) for name in ONE_SEED}
+    rows = recorder.rows(metrics, 2, ["s1", "s2"], range(7, 9), control_steps=100)
+    assert [(row["update"], row["seed"]) for row in rows] == [(4, 7), (4, 8), (5, 7), (5, 8)]
+    assert [row["targets_reached"] for row in rows] == [3 / 4, 4 / 4, None, None]
+    assert [row["mix"] for row in rows] == [[8, 0], [0, 8], [6, 2], [2, 6]]
+    assert [row["arena_steps"] for row in rows] == [500, 500, 600, 600]  # of a seed
+
+
 def test_a_resumed_run_drops_what_came_after_its_checkpoint(tmp_path: Path) -> None:
-    with Recorder(tmp_path, tensorboard=False, update=0) as record:
+    with Recorder(tmp_path, seeds=[0], tensorboard=False, update=0) as record:
         for update in range(4):
-            record.write([{"update": update, "arena_steps": update}], [], {})
-        record.write([{"update": 4, "arena_steps": 4}], [{"update": 4, "why": "budget"}], {})
+            record.write([_row(update)], [], {})
+        record.write([_row(4)], [{"update": 4, "why": "budget"}], {})
     with (tmp_path / "metrics.jsonl").open("a") as file:
         file.write('{"update": 5, "arena')  # a crash in the middle of a line
-    with Recorder(tmp_path, tensorboard=False, update=3) as record:
-        record.write([{"update": 3, "arena_steps": 33}], [], {})
+    with Recorder(tmp_path, seeds=[0], tensorboard=False, update=3) as record:
+        record.write([_row(3) | {"arena_steps": 33}], [], {})
     lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["update"] for line in lines] == [0, 1, 2, 3]
     assert json.loads(lines[-1])["arena_steps"] == 33
@@ -60,11 +80,27 @@ def test_a_resumed_run_drops_what_came_after_its_checkpoint(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("wanted", [True, False])
 def test_tensorboard_is_written_where_it_is_wanted(tmp_path: Path, wanted: bool) -> None:
-    with Recorder(tmp_path, tensorboard=wanted, update=0) as record:
-        record.write([{"update": 0, "arena_steps": 8, "return": 0.5}], [], {"speed": 2.0})
+    with Recorder(tmp_path, seeds=[0], tensorboard=wanted, update=0) as record:
+        record.write([_row(0) | {"return": 0.5}], [], {"speed": 2.0})
     events = list(tmp_path.glob("tensorboard/*"))
     assert bool(events) == wanted
     if wanted:
         content = events[0].read_bytes()
         assert b"return" in content
         assert b"speed" in content
+
+
+def test_several_seeds_have_a_folder_each_and_cost_what_one_does(tmp_path: Path) -> None:
+    with Recorder(tmp_path, seeds=[3, 4], tensorboard=True, update=0) as record:
+        rows = [_row(update, seed) | {f"at{update}": 1.0} for update in range(4) for seed in (3, 4)]
+        record.write(rows, [], {"speed": 2.0})
+    assert {path.name for path in tmp_path.glob("tensorboard/*")} == {"seed3", "seed4"}
+    content = {
+        seed: next(tmp_path.glob(f"tensorboard/seed{seed}/*")).read_bytes() for seed in (3, 4)
+    }
+    for seed in (3, 4):
+        written = [update for update in range(4) if f"at{update}".encode() in content[seed]]
+        assert written == [0, 2]
+    assert [b"speed" in content[seed] for seed in (3, 4)] == [True, False]
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["seed"] for line in lines] == [3, 4] * 4

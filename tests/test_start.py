@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarmjax import checkpoint, command, config, export, loop, start, train
-from swarmjax.checkpoint import CheckpointError, digest
+from swarmjax import checkpoint, command, config, export, loop, seeds, start, train
+from swarmjax.checkpoint import CheckpointError, Checkpoints, digest
 from swarmjax.config import TrainConfig
 from swarmjax.loop import TrainState
 from swarmjax.start import Source
@@ -69,7 +69,7 @@ def _load(words: list[str]) -> tuple[Source, TrainState, TrainConfig]:
     settings = config.load_train([*TINY, *words])
     source = start.read(settings)
     assert source is not None
-    return source, loop.init(*loop.load(settings)), settings
+    return source, seeds.init(*loop.load(settings)), settings
 
 
 def _rows(run: Path) -> list[dict]:
@@ -118,9 +118,9 @@ def test_networks_and_normaliser_are_carried_and_nothing_else(trained: Path) -> 
     counts = [name for name in found if name.endswith("/count") and "optimizer_state" in name]
     assert counts
     for name in counts:
-        assert learned[name].tolist() == [UPDATES * 2], name  # a step for each minibatch
-        assert found[name].tolist() == [0], name
-    assert (int(learned["update"]), int(found["update"])) == (UPDATES, 0)
+        assert learned[name].tolist() == [[UPDATES * 2]], name  # a step for each minibatch
+        assert found[name].tolist() == [[0]], name
+    assert (learned["update"].tolist(), found["update"].tolist()) == ([UPDATES], [0])
 
 
 def test_exploration_is_reset_only_where_that_is_said(trained: Path) -> None:
@@ -131,10 +131,54 @@ def test_exploration_is_reset_only_where_that_is_said(trained: Path) -> None:
     reset = checkpoint.to_leaves(start.carry(source, state, resetting))
     learned = checkpoint.restore(trained)[0]
     np.testing.assert_array_equal(kept[LOG_STD], learned[LOG_STD], strict=True)
-    expected = np.full((1, 2), math.log(0.25), np.float32)
+    expected = np.full((1, 1, 2), math.log(0.25), np.float32)
     np.testing.assert_array_equal(reset[LOG_STD], expected, strict=True)
     for name in reset.keys() - {LOG_STD}:
         np.testing.assert_array_equal(reset[name], kept[name], err_msg=name, strict=True)
+
+
+@pytest.fixture(scope="module")
+def pair(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two seeds, its second lane the first one's numbers and 1."""
+    run = tmp_path_factory.mktemp("pair") / "run"
+    learned = checkpoint.restore(trained)[0]
+    lanes = {name: np.concatenate([leaf, leaf + 1]) for name, leaf in learned.items()}
+    with Checkpoints(run, keep=1) as checkpoints:
+        checkpoints.save(lanes, UPDATES)
+    stored = export.read_config(trained) | {"seeds": 2}
+    (run / "config.json").write_text(json.dumps(stored))
+    return run
+
+
+def test_several_seeds_begin_with_as_many_lane_by_lane(trained: Path, pair: Path) -> None:
+    source, state, settings = _load([f"start={pair}", "seeds=2", "seed=5"])
+    found = checkpoint.to_leaves(start.carry(source, state, settings))
+    learned = checkpoint.restore(trained)[0]
+    for name in (name for name in found if name.startswith(CARRIED)):
+        expected = np.concatenate([learned[name], learned[name] + 1])
+        np.testing.assert_array_equal(found[name], expected, err_msg=name, strict=True)
+
+
+def test_several_seeds_may_all_begin_with_the_same_one(trained: Path) -> None:
+    source, state, settings = _load([f"start={trained}", "seeds=3"])
+    found = checkpoint.to_leaves(start.carry(source, state, settings))
+    fresh, learned = checkpoint.to_leaves(state), checkpoint.restore(trained)[0]
+    for name, leaf in found.items():
+        expected = fresh[name]
+        if name.startswith(CARRIED):
+            expected = np.concatenate([learned[name]] * 3)
+        np.testing.assert_array_equal(leaf, expected, err_msg=name, strict=True)
+
+
+@pytest.mark.parametrize("count", [1, 3, 4])
+def test_any_other_number_of_seeds_is_refused(
+    count: int, pair: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sentence = _refusal(capsys, monkeypatch, *TINY, f"start={pair}", f"seeds={count}")
+    assert sentence == (
+        f"start is '{pair}', a run of 2 seeds, but seeds is {count}: give seeds=2, or a run of one "
+        "seed."
+    )
 
 
 def test_a_damaged_checkpoint_is_passed_over_and_said(
@@ -252,9 +296,9 @@ def test_a_checkpoint_that_its_config_belies_is_refused(
     words = [f"start={tmp_path}", "algo.hidden=[16]", f"run.dir={tmp_path / 'new'}"]
     sentence = _refusal(capsys, monkeypatch, *TINY, *words)
     assert sentence.startswith(f"start is '{tmp_path}': it takes the directory of a run with")
-    # The output layer of the actor is the first that is looked at: [learners, width, U].
-    assert "but the checkpoint holds float32[1, 8, 2] for " in sentence
-    assert "this run's config needs float32[1, 16, 2]." in sentence
+    # The output layer of the actor is the first that is looked at: [seeds, learners, width, U].
+    assert "but the checkpoint holds float32[1, 1, 8, 2] for " in sentence
+    assert "this run's config needs float32[1, 1, 16, 2]." in sentence
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarmjax import checkpoint, command, config, export, train
-from swarmjax.checkpoint import CheckpointError, digest
+from swarmjax import checkpoint, command, config, export, policy, train
+from swarmjax.checkpoint import CheckpointError, Checkpoints, digest
 from swarmjax.config import ExportConfig, TrainConfig
 
 TINY = [
@@ -28,6 +28,16 @@ TINY = [
     "task.step_limit=8",
     f"budget={4 * 4 * 9}",
     "run.tensorboard=false",
+]
+
+
+# Two stages of which the first is left by its budget, since nobody is that good.
+SEVERAL = [
+    "stage=curriculum",
+    "stage.sequence=[s1,s2]",
+    "curriculum.threshold=1.0",
+    "seed=3",
+    "seeds=2",
 ]
 
 
@@ -79,7 +89,8 @@ def test_a_run_directory_holds_what_it_promises(whole: Path) -> None:
     summary = json.loads((whole / "summary.json").read_text())
     assert summary["updates"] == 9
     assert summary["budget_spent"] is True
-    assert summary["transitions"] == sum(row["transitions"] for row in rows)
+    assert summary["seeds"] == [0]
+    assert summary["transitions"] == [sum(row["transitions"] for row in rows)]
     stored = json.loads((whole / "config.json").read_text())
     assert config.build(TrainConfig, stored).algo.hidden == (8,)
 
@@ -100,8 +111,119 @@ def test_a_resumed_run_ends_where_an_uninterrupted_one_does(whole: Path, tmp_pat
     assert _rows(tmp_path) == _rows(whole)
     summary = json.loads((tmp_path / "summary.json").read_text())
     kept = json.loads((whole / "summary.json").read_text())
-    for name in ("arena_steps", "transitions", "targets_reached", "promotions"):
+    for name in ("arena_steps", "transitions", "targets_reached", "decisions"):
         assert summary[name] == kept[name], name
+
+
+@pytest.fixture(scope="module")
+def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Seeds 3 and 4 in one run, on two stages; the first is left by its budget."""
+    run = tmp_path_factory.mktemp("several") / "run"
+    assert _train(*SEVERAL, f"run.dir={run}", "run.chunk=2") == 0
+    return run
+
+
+def test_several_seeds_leave_what_each_of_them_came_to(several: Path) -> None:
+    rows = _rows(several)
+    assert [(row["update"], row["seed"]) for row in rows] == [
+        (u, k) for u in range(9) for k in (3, 4)
+    ]
+    leaves = checkpoint.restore(several)[0]
+    assert {len(leaf) for leaf in leaves.values()} == {2}
+    name = "learners/params/actor/mean/kernel"
+    for lane, seed in enumerate((3, 4)):
+        found = policy.load(several / f"policy-seed{seed}.npz")
+        np.testing.assert_array_equal(found.mean.kernel, leaves[name][lane])
+        assert found.meta["seed"] == seed
+    assert not np.array_equal(*leaves[name])
+    assert not (several / "policy.npz").exists()
+
+
+def test_the_summary_of_several_seeds_has_a_list_for_each_figure(several: Path) -> None:
+    rows, summary = _rows(several), json.loads((several / "summary.json").read_text())
+    assert summary["seeds"] == [3, 4]
+    assert summary["arena_steps"] == 4 * 4 * 9  # of a seed
+    transitions = [
+        sum(row["transitions"] for row in rows if row["seed"] == seed) for seed in (3, 4)
+    ]
+    assert summary["transitions"] == transitions
+    assert summary["transitions_per_s"] == pytest.approx(sum(transitions) / summary["train_s"])
+    steps = 2 * 4 * 4 * 9
+    assert summary["arena_steps_per_s"] == pytest.approx(steps / summary["train_s"])
+    for seed, decisions, reached in zip(
+        (3, 4), summary["decisions"], summary["targets_reached"], strict=True
+    ):
+        # Half of nine updates for the first stage: it is left after the fifth.
+        moves = [
+            (entry["update"], entry["seed"], entry["from"], entry["to"]) for entry in decisions
+        ]
+        assert moves == [(4, seed, "s1", "s2")]
+        last = [row for row in rows if row["seed"] == seed][-1]
+        assert [reached.get(name) for name in ("s1", "s2")] == last["success_by_stage"]
+    lines = (several / "curriculum.jsonl").read_text().splitlines()
+    logged = [entry for decisions in summary["decisions"] for entry in decisions]
+    assert [json.loads(line) for line in lines] == logged
+
+
+def test_several_seeds_resume_exactly(several: Path, tmp_path: Path) -> None:
+    assert _train(*SEVERAL, f"run.dir={tmp_path}", "run.stop_after=4") == 0
+    assert train.main([f"resume={tmp_path}"]) == 0
+    assert _digest(tmp_path) == _digest(several)
+    assert _rows(tmp_path) == _rows(several)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    kept = json.loads((several / "summary.json").read_text())
+    for name in ("arena_steps", "transitions", "targets_reached", "decisions"):
+        assert summary[name] == kept[name], name
+
+
+def test_what_is_shown_names_the_seed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert _train(*SEVERAL, f"run.dir={tmp_path}", "run.stop_after=5") == 0
+    shown = capsys.readouterr().out
+    assert "seeds 3 to 4 side by side" in shown
+    for seed in (3, 4):
+        assert f"seed {seed}, update 5: s1 -> s2 by budget" in shown
+
+
+def test_a_seed_that_breaks_stops_the_run_and_is_named(
+    several: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    leaves = {name: leaf.copy() for name, leaf in checkpoint.restore(several)[0].items()}
+    leaves["update"][:] = 4
+    for name, leaf in leaves.items():
+        if name.startswith("learners/params/critic/"):
+            leaf[1] = np.nan
+    (tmp_path / "config.json").write_bytes((several / "config.json").read_bytes())
+    with Checkpoints(tmp_path, keep=1) as checkpoints:
+        checkpoints.save(leaves, 4)
+    capsys.readouterr()
+    assert train.main([f"resume={tmp_path}"]) == train.FAILED
+    assert "_loss is no longer finite at update 4 of seed 4: try lower" in capsys.readouterr().out
+    assert checkpoint.restore(tmp_path)[1] == 4
+
+
+def test_export_gives_all_seeds_or_the_one_that_is_asked_for(
+    several: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = {seed: (several / f"policy-seed{seed}.npz").read_bytes() for seed in (3, 4)}
+    assert export.main([f"run={several}", f"out={tmp_path / 'all.npz'}"]) == 0
+    assert export.main([f"run={several}", "seed=4", f"out={tmp_path / 'one.npz'}"]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "all-seed3.npz",
+        "all-seed4.npz",
+        "one.npz",
+    }
+    for seed, name in ((3, "all-seed3"), (4, "all-seed4"), (4, "one")):
+        found = policy.load(tmp_path / f"{name}.npz")
+        kept = policy.load(several / f"policy-seed{seed}.npz")
+        assert found.digest == kept.digest
+        assert found.meta["seed"] == seed
+    (several / "policy-seed3.npz").unlink()
+    assert export.main([f"run={several}", "seed=3"]) == 0
+    assert (several / "policy-seed3.npz").exists()
+    capsys.readouterr()
+    sentence = _refusal(capsys, "export", f"run={several}", "seed=5")
+    assert f"seed is 5, but {several} was trained with seeds 3 to 4: give one of them." in sentence
+    assert (several / "policy-seed4.npz").read_bytes() == first[4]
 
 
 def test_another_seed_is_another_run(whole: Path, tmp_path: Path) -> None:
@@ -174,7 +296,7 @@ def test_a_checkpoint_of_another_shape_is_refused(
         (["stage=s6", "stage.robots=6"], ["stage.robots", "6", "sim.max_robots", "5"]),
         (["stage=s6", "stage.side=0.5"], ["stage.side", "0.5", "at least"]),
         (["arenas=6", "algo.minibatches=4"], ["arenas", "6", "multiple of 4"]),
-        (["seeds=2"], ["seeds", "2", "not built"]),
+        (["seeds=0"], ["seeds", "0", "1 to 4096"]),
         (["run.dir=/proc/none"], ["run.dir", "/proc/none", "cannot be written"]),
     ],
 )

@@ -142,7 +142,7 @@ def load(config: TrainConfig) -> World:
         model.ids(compiled, size),
         config.robot,
         impl=impl,
-        arenas=config.arenas,
+        arenas=config.arenas * (config.seeds if config.seeds_by == "vmap" else 1),
         substeps=count,
     )
     spacing = Spacing(

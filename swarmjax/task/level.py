@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from swarmjax.config import PASSAGE
+from swarmjax.sim import noise
+from swarmjax.sim.noise import Stream
 from swarmjax.task import fixed_level
 from swarmjax.task.placement import (
     UNITS,
@@ -129,7 +131,9 @@ def _split(uniforms: Array, spacing: Spacing) -> _Uniforms:
 
 def _random(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     """Places obstacles, then targets, then starts at random."""
-    side = units(stage.side, xp)
+    seed = _seed(drawn, xp)
+    length = _side(stage, seed, xp)
+    side = units(length, xp)
     present = xp.arange(spacing.robots) < stage.robots
     around = _place_obstacles(drawn, stage, side, xp)
     target = _place_targets(drawn, around, present, spacing, side, xp)
@@ -138,7 +142,7 @@ def _random(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     turn = drawn.obstacle_yaw * np.float32(0.5 * math.pi)
     half = 0.5 * stage.obstacle_size * xp.ones_like(turn)
     return Level(
-        side=stage.side,
+        side=length,
         present=present,
         start=xp.concatenate([metres(start, xp), yaw[:, None]], axis=-1),
         target=metres(target, xp),
@@ -146,7 +150,7 @@ def _random(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
         obstacle=xp.concatenate(
             [metres(around.centre, xp), xp.stack([turn, half, half], axis=-1)], axis=-1
         ),
-        seed=_seed(drawn, xp),
+        seed=seed,
     )
 
 
@@ -154,6 +158,18 @@ def _seed(drawn: _Uniforms, xp: Any) -> Array:
     """Makes 32 random bits of two uniform numbers, of which a float32 holds 16 for sure."""
     high, low = (drawn.seed * np.float32(2**16)).astype(xp.uint32)
     return (high << 16) | low
+
+
+def _side(stage: Stage, seed: Array, xp: Any) -> Array:
+    """Draws the side of the arena, m, in whole units, where the stage leaves it open.
+
+    A hash of the level's seed, so that nothing else about a level depends on it.
+    """
+    low = xp.ceil(stage.side * UNITS).astype(xp.int32)
+    count = xp.floor(stage.largest_side * UNITS).astype(xp.int32) - low + 1
+    uniform = noise.uniform(seed, 0, Stream.ARENA_SIDE, (), xp)
+    above = xp.floor(uniform * count.astype(xp.float32)).astype(xp.int32)
+    return xp.where(count > 1, metres(low + above, xp), stage.side)
 
 
 def _place_obstacles(drawn: _Uniforms, stage: Stage, side: Array, xp: Any) -> _Obstacles:

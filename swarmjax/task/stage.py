@@ -17,7 +17,8 @@ class Stage(NamedTuple):
     Attributes:
       robots: how many are there, int32.
       obstacles: how many are there, int32.
-      side: of the arena, m.
+      side: of the arena, or the smallest that it may have, m.
+      largest_side: the largest that it may have, m; where it is larger, each level draws its own.
       obstacle_size: edge of the boxes of a random level, m.
       fixed: the paper's fixed level instead of a random one, bool.
       fence: the obstacle of a fixed level is the fence instead of boxes, bool.
@@ -26,6 +27,7 @@ class Stage(NamedTuple):
     robots: Array
     obstacles: Array
     side: Array
+    largest_side: Array
     obstacle_size: Array
     fixed: Array
     fence: Array
@@ -42,7 +44,8 @@ def stack(stages: Sequence[StageConfig]) -> Stage:
     return Stage(
         robots=np.array([s.robots for s in stages], np.int32),
         obstacles=np.array([s.obstacles for s in stages], np.int32),
-        side=np.array([s.side for s in stages], np.float32),
+        side=np.array([s.sides[0] for s in stages], np.float32),
+        largest_side=np.array([s.sides[1] for s in stages], np.float32),
         obstacle_size=np.array([s.obstacle_size for s in stages], np.float32),
         fixed=np.array([s.level == "fixed" for s in stages]),
         fence=np.array([s.layout == "fence" for s in stages]),
@@ -61,17 +64,18 @@ def largest_half(stages: Sequence[StageConfig]) -> float:
 
 def _check_fixed(stage: StageConfig) -> None:
     """Refuses a fixed level whose row of starts is too short, or that runs out of boxes."""
-    most = {"robots": fixed_level.most_robots(stage.side), "obstacles": len(fixed_level.BOXES)}
+    side = stage.sides[0]  # a fixed level has one
+    most = {"robots": fixed_level.most_robots(side), "obstacles": len(fixed_level.BOXES)}
     for key, limit in most.items():
         if stage.level == "fixed" and getattr(stage, key) > limit:
             raise ConfigError(
                 f"stage {stage.name}: {key} is {getattr(stage, key)}, but the fixed level of a "
-                f"{stage.side:g} m arena has room for {limit}: give at most {limit}."
+                f"{side:g} m arena has room for {limit}: give at most {limit}."
             )
 
 
 def _half(stage: StageConfig) -> float:
     """Half the longest edge of the obstacles of a stage, m."""
     if stage.layout == "fence":
-        return fixed_level.FENCE_HALF_LENGTH * stage.side
+        return fixed_level.FENCE_HALF_LENGTH * stage.sides[1]
     return fixed_level.BOX_HALF if stage.level == "fixed" else 0.5 * stage.obstacle_size

@@ -140,6 +140,56 @@ def test_numpy_and_jax_draw_the_same_levels(stage: StageConfig, drawn: Level) ->
     assert expected.start.dtype == expected.target.dtype == expected.obstacle.dtype == np.float32
 
 
+# --- an arena of any size between two
+
+RANGE = StageConfig(name="range", robots=3, side=(0.8, 1.3), obstacles=2)
+
+
+def test_a_side_is_drawn_from_its_range(draw: Draw) -> None:
+    side = draw(_uniforms(20), _repeated(RANGE)).side
+    # The whole units within 0.8 m (3276.8) and 1.3 m (5324.8).
+    np.testing.assert_array_equal(side * UNITS, np.round(side * UNITS))
+    assert (side * UNITS >= 3277).all()
+    assert (side * UNITS <= 5324).all()
+    # A fair sampler fails a seed with probability 1e-5; drawn before any look at the result.
+    assert stats.kstest((side * UNITS - 3277 + 0.5) / 2048, "uniform").pvalue > 1e-5
+
+
+def test_both_ends_of_a_range_are_drawn(draw: Draw) -> None:
+    ends = 1.0 + np.array([0, 3]) / UNITS
+    narrow = StageConfig(name="narrow", robots=1, side=(ends[0], ends[1]))
+    side = draw(_uniforms(21), _repeated(narrow)).side
+    counts = np.bincount(np.round((side - 1.0) * UNITS).astype(int))
+    assert stats.chisquare(counts).pvalue > 1e-5  # as above
+    assert len(counts) == 4
+
+
+def test_numpy_draws_the_same_side(draw: Draw) -> None:
+    found, single = draw(_uniforms(22), _repeated(RANGE)), task_stage.stack([RANGE])
+    for i, uniforms in enumerate(_uniforms(22)[:200]):
+        expected = level.sample(uniforms, task_stage.select(single, 0), SPACING, np)
+        assert expected.side == found.side[i]
+        assert expected.side.dtype == np.float32
+        np.testing.assert_array_equal(expected.target, found.target[i])
+
+
+def test_nothing_else_depends_on_the_range(draw: Draw) -> None:
+    """The level is the one that a stage of just the drawn side has."""
+    found, stage = draw(_uniforms(23), _repeated(RANGE)), _repeated(RANGE)
+    assert len(np.unique(found.side)) > 1000
+    same = draw(_uniforms(23), stage._replace(side=found.side, largest_side=found.side))
+    jax.tree.map(np.testing.assert_array_equal, found, same)
+    fixed = draw(_uniforms(23), stage._replace(largest_side=stage.side))
+    assert (fixed.side == np.float32(0.8)).all()
+    np.testing.assert_array_equal(fixed.seed, found.seed)
+
+
+def test_nothing_overlaps_in_an_arena_of_any_size(draw: Draw) -> None:
+    found = draw(_uniforms(24), _repeated(RANGE))
+    assert found.obstacle_present[:, :2].all()
+    _assert_nothing_overlaps(found, RANGE.robots, RANGE.obstacles)
+
+
 # --- what is there, and where it is
 
 
@@ -148,7 +198,7 @@ def test_the_stage_says_how_many_there_are(stage: StageConfig, drawn: Level) -> 
     boxes = [True] * stage.obstacles + [False] * (SPACING.obstacles - stage.obstacles)
     assert (drawn.present == robots).all()
     assert (drawn.obstacle_present == boxes).all()
-    assert (drawn.side == np.float32(stage.side)).all()
+    assert (drawn.side == np.float32(stage.sides[0])).all()
     assert (drawn.obstacle[..., 3:] == np.float32(0.5 * stage.obstacle_size)).all()
 
 
@@ -188,7 +238,7 @@ def test_a_robot_passes_between_obstacles_and_walls(stage: StageConfig, drawn: L
     box = drawn.obstacle[:, : stage.obstacles].astype(np.float64)
     assert (_box_gaps(box) >= PASSAGE - ROUNDING).all()
     reach = np.abs(_corners(box)).max(axis=(-2, -1))
-    assert (0.5 * stage.side - reach >= PASSAGE - ROUNDING).all()
+    assert (0.5 * stage.sides[0] - reach >= PASSAGE - ROUNDING).all()
 
 
 def test_targets_are_so_far_apart_that_a_robot_passes_between_two_parked_ones(
@@ -209,12 +259,12 @@ def test_levels_fill_the_arena(stage: StageConfig, drawn: Level) -> None:
         assert stats.chisquare(counts).pvalue > 1e-5, counts
         # Rounded up from the hull and 2 cm, a robot's centre comes as near to any wall; what is
         # left over is less than one step of the lattice.
-        rim = 0.5 * stage.side - HULL - level.MARGIN - np.array([place.max(), -place.min()])
-        assert (rim < stage.side / LATTICE + 1 / UNITS).all()
+        rim = 0.5 * stage.sides[0] - HULL - level.MARGIN - np.array([place.max(), -place.min()])
+        assert (rim < stage.sides[0] / LATTICE + 1 / UNITS).all()
         # No ninth of it is left out. The middle one has the least, where the obstacle of a small
         # arena must stand: a fifth of its share was seen (34 of 159), 3 standard deviations of the
         # count above the bound; the seeds are fixed.
-        third = np.clip(np.floor(3 * (place / (stage.side - 2 * HULL - 0.04) + 0.5)), 0, 2)
+        third = np.clip(np.floor(3 * (place / (stage.sides[0] - 2 * HULL - 0.04) + 0.5)), 0, 2)
         cells = np.bincount((3 * third[:, 0] + third[:, 1]).astype(int), minlength=9)
         assert (cells > 0.1 * PER_STAGE / 9).all(), cells
 

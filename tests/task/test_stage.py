@@ -9,19 +9,21 @@ from swarmjax.task import stage
 
 PLAIN = StageConfig(name="a", robots=2, side=0.5)
 BOXES = StageConfig(name="b", robots=5, side=1.2, obstacles=3, obstacle_size=0.2)
+OPEN = StageConfig(name="e", robots=2, side=(0.8, 1.6))
 FENCE = StageConfig(name="c", robots=3, side=1.4, obstacles=1, level="fixed", layout="fence")
 SMALL = StageConfig(name="d", robots=1, side=1.0, obstacles=1, obstacle_size=0.02, level="fixed")
 
 
 def test_stack() -> None:
-    found = stage.stack([PLAIN, BOXES, FENCE])
+    found = stage.stack([PLAIN, BOXES, FENCE, OPEN])
     expected = stage.Stage(
-        robots=np.array([2, 5, 3], np.int32),
-        obstacles=np.array([0, 3, 1], np.int32),
-        side=np.array([0.5, 1.2, 1.4], np.float32),
-        obstacle_size=np.array([0.1, 0.2, 0.1], np.float32),
-        fixed=np.array([False, False, True]),
-        fence=np.array([False, False, True]),
+        robots=np.array([2, 5, 3, 2], np.int32),
+        obstacles=np.array([0, 3, 1, 0], np.int32),
+        side=np.array([0.5, 1.2, 1.4, 0.8], np.float32),
+        largest_side=np.array([0.5, 1.2, 1.4, 1.6], np.float32),
+        obstacle_size=np.array([0.1, 0.2, 0.1, 0.1], np.float32),
+        fixed=np.array([False, False, True, False]),
+        fence=np.array([False, False, True, False]),
     )
     for mine, theirs in zip(found, expected, strict=True):
         assert mine.dtype == theirs.dtype

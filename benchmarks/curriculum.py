@@ -1,0 +1,240 @@
+"""Where does a curriculum pay? Its modes against training on the goal alone, at equal arena steps.
+
+`python -m benchmarks.curriculum goal=s6 arms=final,sequential,mixed,adaptive [key=value ...]` takes
+the keys of `curriculum_arms.StudyConfig` and of `swarmjax.train`, but `stage`, `algo.policy` and
+`curriculum.mode`, which the arms are about; `seeds` is 10 unless given. Each arm trains all its
+seeds in one program, stops at points that are evenly spread over the logarithm of the arena steps,
+and judges every seed's policies there, on the device, on the same levels: of the goal, of the 1.5 m
+arena that no arm trains on (with 5 robots compiled in), and of the first stage of the goal's
+curriculum, whether the arm has seen it or not. It prints a JSON line for each arm and policy as
+soon as it is done; `benchmarks.curriculum_table` makes tables and plots of them.
+
+The baseline `final` trains on the goal alone. Where an option of a mode is what differs, arms are
+run one at a time and labelled: `arms=adaptive label=progress curriculum.score=progress`.
+"""
+
+import hashlib
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+from benchmarks import curriculum_arms
+from benchmarks.curriculum_arms import StudyConfig
+from swarmjax import command, config, evaluate_mjx, loop, provenance, seeds
+from swarmjax.config import StageConfig, TrainConfig
+from swarmjax.loop import Program, TrainState
+from swarmjax.ppo.learner import LearnerState
+from swarmjax.sim import physics
+from swarmjax.task import env
+from swarmjax.task.level import Level
+
+Judge = Callable[[LearnerState], dict[str, dict[str, np.ndarray]]]
+
+
+def load_judge(study: StudyConfig, trained: TrainConfig, judged: dict[str, StageConfig]) -> Judge:
+    """Makes the judge of all points, arms and policies; compiled once for each kind of policy.
+
+    Args:
+      study: the study.
+      trained: the config of any arm.
+      judged: the stages, by role.
+
+    Returns:
+      From learners [N, L] to the means [N] over the levels of each of the `Outcomes`, by role.
+    """
+    stages, arenas = tuple(judged.values()), len(judged) * study.levels
+    world = env.load(
+        replace(
+            trained,
+            stage=stages,
+            seeds_by="vmap",
+            algo=replace(trained.algo, minibatches=1),
+            arenas=arenas,
+            budget=arenas * trained.algo.rollout,
+        )
+    )
+    drawn = [evaluate_mjx.draw_levels(world, s, study.level_seed, study.levels) for s in stages]
+    levels = Level(*(np.concatenate(fields) for fields in zip(*drawn, strict=True)))
+    run = partial(evaluate_mjx.outcomes, world, steps=trained.task.step_limit)
+    call = jax.jit(jax.vmap(run, in_axes=(0, None)))
+
+    def judge(learners: LearnerState) -> dict[str, dict[str, np.ndarray]]:
+        found = call(learners, levels)._asdict()
+        by_stage = {name: np.split(np.asarray(x), len(stages), 1) for name, x in found.items()}
+        return {
+            role: {name: parts[i].mean(axis=1) for name, parts in by_stage.items()}
+            for i, role in enumerate(judged)
+        }
+
+    return judge
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Curves:
+    """What came of an arm.
+
+    Attributes:
+      judged: by role and measure, [N, P].
+      transitions: [N, P] robot steps that each seed trained on until then.
+      stage: [N, P] index of the newest stage.
+      mix: [P, S] share of the arenas on each stage, all seeds together.
+      broken_arenas: episodes of training that ended as the physics broke, all seeds together.
+      train_s: [P] seconds of training until then, compilation and judging apart.
+      judge_s: seconds of judging.
+      compile_s: seconds that compiling the training took.
+      judge_compile_s: seconds of judging once before, with what is compiled on the way.
+    """
+
+    judged: dict[str, dict[str, list[list[float]]]]
+    transitions: list[list[int]]
+    stage: list[list[int]]
+    mix: list[list[float]]
+    broken_arenas: int
+    train_s: list[float]
+    judge_s: float
+    compile_s: float
+    judge_compile_s: float
+
+
+def measure(trained: TrainConfig, at: np.ndarray, judge: Judge) -> Curves:
+    """Trains one arm, and judges it at every point.
+
+    Args:
+      trained: its config.
+      at: [P] updates, rising.
+      judge: judges learners [N, L].
+
+    Returns:
+      The curves.
+    """
+    program, schedule = loop.load(trained)
+    state = jax.jit(partial(seeds.init, program))(schedule)
+    compile_s, call = _timed(partial(_compile, program, schedule, state))
+    # Warp builds its kernels at its first step, which is no part of training either.
+    judge_compile_s, _ = _timed(partial(judge, state.learners))
+    rows, train_s, judge_s = [], [], 0.0
+    for n in np.diff(at, prepend=0):
+        seconds, (state, row) = _timed(partial(_train, program, call, state, int(n)))
+        train_s.append(seconds + (train_s[-1] if train_s else 0.0))
+        seconds, found = _timed(partial(judge, state.learners))
+        judge_s += seconds
+        rows.append(row | {"judged": found})
+    judged = {
+        role: {name: _curve([row["judged"][role][name] for row in rows]) for name in names}
+        for role, names in rows[0]["judged"].items()
+    }
+    return Curves(
+        judged=judged,
+        transitions=np.cumsum([row["transitions"] for row in rows], axis=0).T.tolist(),
+        stage=np.array([row["stage"] for row in rows]).T.tolist(),
+        mix=[row["mix"].round(4).tolist() for row in rows],
+        broken_arenas=int(sum(row["broken_arenas"] for row in rows)),
+        train_s=train_s,
+        judge_s=judge_s,
+        compile_s=compile_s,
+        judge_compile_s=judge_compile_s,
+    )
+
+
+def _curve(rows: Sequence[np.ndarray]) -> list[list[float]]:
+    """[N, P] of P rows [N], to five digits."""
+    return np.array(rows, np.float64).T.round(5).tolist()
+
+
+def _timed[T](call: Callable[[], T]) -> tuple[float, T]:
+    """Returns the seconds that a call took, and what it returned, once that is there."""
+    began = time.perf_counter()
+    result = jax.block_until_ready(call())
+    return time.perf_counter() - began, result
+
+
+def _compile(program: Program, schedule: Any, state: TrainState) -> Callable[..., Any]:
+    """Compiles training; the schedule, which is fixed from here on, is bound."""
+    train = jax.jit(partial(seeds.train_chunk, program), donate_argnums=1)
+    return partial(train.lower(schedule, state, np.int32(1)).compile(), schedule)
+
+
+def _train(
+    program: Program, call: Callable[..., Any], state: TrainState, n: int
+) -> tuple[TrainState, dict[str, Any]]:
+    """Trains all seeds for n updates, in calls no longer than the program reports."""
+    transitions, broken, metrics, last = 0, 0, {}, 0
+    for done in range(0, n, program.rows):
+        last = min(program.rows, n - done)
+        state, metrics = call(state, np.int32(last))
+        metrics = jax.device_get(metrics)
+        transitions = transitions + metrics["transitions"][:, :last].astype(np.int64).sum(axis=1)
+        broken += metrics["broken_arenas"][:, :last].sum()
+    mix = metrics["mix"][:, last - 1].sum(axis=0)
+    return state, {
+        "transitions": transitions,
+        "broken_arenas": broken,
+        "stage": metrics["stage"][:, last - 1],
+        "mix": mix / mix.sum(),
+    }
+
+
+def results(study: StudyConfig, words: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Trains and judges all arms; yields a line each."""
+    arms = [
+        (arm, policy, curriculum_arms.load_arm(study, arm, policy, words))
+        for policy in study.policies
+        for arm in study.arms
+    ]
+    judged = curriculum_arms.roles(study, arms[0][2], words)
+    judge = load_judge(study, arms[0][2], judged)
+    for arm, _, trained in arms:
+        at = curriculum_arms.points(study, trained)
+        curves = measure(trained, at, judge)
+        yield _line(study, arm, trained, at) | {
+            "roles": {role: stage.name for role, stage in judged.items()},
+            **vars(curves),
+        }
+
+
+def _line(study: StudyConfig, arm: str, trained: TrainConfig, at: np.ndarray) -> dict[str, Any]:
+    """What an arm was."""
+    whole = config.to_dict(trained)
+    digest = hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
+    return {
+        "benchmark": "curriculum",
+        "goal": study.goal,
+        "arm": study.label or arm,
+        "policy": trained.algo.policy,
+        "curriculum": whole["curriculum"],
+        "stages": [stage.name for stage in trained.stage],
+        "seeds": list(seeds.numbers(trained)),
+        "arenas": trained.arenas,
+        "budget": trained.budget,
+        "levels": study.levels,
+        "level_seed": study.level_seed,
+        "steps": trained.task.step_limit,
+        "robot": trained.robot.body,
+        "realism": trained.realism.name,
+        "impl": physics.resolve_impl(trained.sim.impl),
+        "arena_steps": (at * trained.arenas * trained.algo.rollout).tolist(),
+        "settings_digest": digest[:12],
+        "device": provenance.device(),
+        "versions": provenance.versions(),
+        "commit": provenance.commit(),
+    }
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    study, words = curriculum_arms.parse(arguments)
+    for line in results(study, words):
+        sys.stdout.write(json.dumps(line) + "\n")
+        sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("curriculum", main, TrainConfig))

@@ -1,0 +1,131 @@
+"""What a study of curricula compares: its arms, the points on their way, and who judges them.
+
+An arm is a curriculum mode with the stages that lead to the goal; `final` is the baseline, the goal
+alone. `benchmarks.curriculum` says how it is called.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal
+
+import numpy as np
+
+from swarmjax import config, settings
+from swarmjax.config import ConfigError, StageConfig, TrainConfig
+from swarmjax.settings import Section, about
+
+BASELINE = "final"
+HELD_OUT = "expanded"
+HELD_OUT_ROBOTS = 5  # policies that trained with more are not judged on arenas never trained
+_CHOSEN = {"stage": "goal", "algo.policy": "policies", "curriculum.mode": "arms"}
+_LISTS = ("arms", "policies")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyConfig(Section):
+    """What is compared, and how it is judged."""
+
+    goal: str = field(default="s6", metadata=about("stage that all arms are for"))
+    arms: tuple[Literal["final", "sequential", "mixed", "adaptive", "adaptive-grid"], ...] = field(
+        default=("final", "sequential", "mixed", "adaptive"),
+        metadata=about("final: the goal alone; adaptive-grid: stage=grid instead of the list"),
+    )
+    policies: tuple[Literal["shared", "independent"], ...] = field(
+        default=("shared", "independent"), metadata=about("algo.policy")
+    )
+    label: str | None = field(default=None, metadata=about("what the one arm is called"))
+    points: int = field(default=10, metadata=about("points at which arms are judged", 2, 1000))
+    first: int = field(default=100_000, metadata=about("arena steps of the first one", 1, 10**15))
+    levels: int = field(default=256, metadata=about("of each stage", 1, 2**20))
+    level_seed: int = field(default=2, metadata=about("of their levels", 0, config.MAX_COUNT))
+
+    def _check(self) -> None:
+        if self.label is not None and len(self.arms) > 1:
+            raise ConfigError(f"label is {self.label}, but arms has {len(self.arms)}: give one.")
+
+
+def parse(words: Sequence[str]) -> tuple[StudyConfig, list[str]]:
+    """Takes the study's own words out of those of the command line.
+
+    Args:
+      words: `key=value`.
+
+    Returns:
+      The study, and the words that are for training.
+
+    Raises:
+      ConfigError: if a word of the study is unsound, or one of training is what arms are about.
+    """
+    mine = set(settings.names(StudyConfig))
+    parts = [(word, *word.partition("=")[::2]) for word in words]
+    for _, key, _ in parts:
+        if key in _CHOSEN:
+            raise ConfigError(f"{key} cannot be given: choose it by {_CHOSEN[key]}.")
+    given = {key: value.split(",") if key in _LISTS else value for _, key, value in parts}
+    study = {key: value for key, value in given.items() if key in mine}
+    return settings.build(StudyConfig, study), [word for word, key, _ in parts if key not in mine]
+
+
+def curriculum_of(goal: str) -> str:
+    """The file of configs/stage/ whose sequence leads to a goal."""
+    return "curriculum" if goal == "s6" else f"{goal}_curriculum"
+
+
+def load_arm(study: StudyConfig, arm: str, policy: str, words: Sequence[str]) -> TrainConfig:
+    """Makes the config of one arm.
+
+    Args:
+      study: the study.
+      arm: one of its arms.
+      policy: one of its policies.
+      words: of training, `key=value`.
+
+    Returns:
+      The config; all arms of a study have the same arenas and budget.
+
+    Raises:
+      ConfigError: if a word is unsound.
+    """
+    chosen = {
+        BASELINE: [f"stage={study.goal}"],
+        "adaptive-grid": ["stage=grid", "curriculum.mode=adaptive"],
+    }.get(arm, [f"stage={curriculum_of(study.goal)}", f"curriculum.mode={arm}"])
+    return config.load_train(["seeds=10", *words, *chosen, f"algo.policy={policy}"])
+
+
+def points(study: StudyConfig, trained: TrainConfig) -> np.ndarray:
+    """Updates [P] after which the arms are judged, evenly spread over their logarithm.
+
+    Args:
+      study: the study.
+      trained: the config of an arm.
+
+    Returns:
+      Rising whole numbers, the last one the whole budget; fewer than asked if some are the same.
+
+    Raises:
+      ConfigError: if the budget ends before the first point.
+    """
+    update = trained.arenas * trained.algo.rollout
+    first = max(1, round(study.first / update))
+    if first >= trained.updates:
+        raise ConfigError(
+            f"first is {study.first}, but budget is {trained.budget}: give less than "
+            f"{trained.updates * update}."
+        )
+    return np.unique(np.geomspace(first, trained.updates, study.points).round().astype(int))
+
+
+def roles(study: StudyConfig, trained: TrainConfig, words: Sequence[str]) -> dict[str, StageConfig]:
+    """The stages that are judged, by what they are judged for."""
+    load = partial(_stages, words)
+    found = {"goal": load(study.goal)[-1], "first": load(curriculum_of(study.goal))[0]}
+    if trained.sim.max_robots == HELD_OUT_ROBOTS:
+        found["held_out"] = load(HELD_OUT)[-1]
+    return found
+
+
+def _stages(words: Sequence[str], name: str) -> tuple[StageConfig, ...]:
+    maxima = [word for word in words if word.startswith("sim.")]
+    return config.load_train([*maxima, f"stage={name}"]).stage

@@ -1,0 +1,80 @@
+"""What does the curriculum's engine cost in training speed?
+
+`python -m benchmarks.curriculum_cost [key=value ...]` takes the keys of `swarmjax.train` and trains
+pairs of programs in turn: a list of one stage, and a curriculum of `COPIES` of that very stage in
+each mode, so that both simulate the same mix and differ by the engine alone. It prints a JSON line
+for each mode: the median ratio of its speed to the single stage's, and the 95 % interval of that
+median by order statistics, which asks nothing of the distribution.
+"""
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+from benchmarks.pairs import Arm, median, time_in_turn
+from swarmjax import command, config, provenance
+from swarmjax.config import TrainConfig
+from swarmjax.sim import physics
+
+PAIRS = 20
+COPIES = {"sequential": 6, "mixed": 6, "adaptive": 6, "adaptive-grid": 48}
+CALL_SECONDS = 0.7  # of a call, about
+
+
+def curriculum(settings: TrainConfig, name: str) -> TrainConfig:
+    """Copies the one stage of a config, and chooses the mode of an arm of `COPIES`."""
+    stage = settings.stage[-1]
+    copies = tuple(replace(stage, name=f"{stage.name}-{i}") for i in range(COPIES[name]))
+    words = [f"curriculum.mode={name.removesuffix('-grid')}"]
+    options = config.load_train(words).curriculum
+    return replace(settings, stage=copies, stage_name=name, curriculum=options)
+
+
+def results(settings: TrainConfig) -> Iterator[dict[str, Any]]:
+    """Compiles all arms, then compares each with the single stage; yields a line each."""
+    single = replace(settings, stage=settings.stage[-1:])
+    programs = [single, *(curriculum(settings, name) for name in COPIES)]
+    with ThreadPoolExecutor(len(programs)) as pool:
+        baseline, *arms = pool.map(Arm, programs)
+    baseline.time(1)
+    updates = max(1, round(CALL_SECONDS / baseline.time(1)))
+    for name, arm in zip(COPIES, arms, strict=True):
+        times = time_in_turn(baseline, arm, updates, PAIRS)
+        ratio, low, high = median([theirs / mine for theirs, mine in times])
+        yield {
+            "benchmark": "curriculum_cost",
+            "mode": name,
+            "stages": COPIES[name],
+            "speed_ratio": ratio,
+            "speed_ratio_low": low,
+            "speed_ratio_high": high,
+            "pairs": PAIRS,
+            "updates": updates,
+            "arena_steps_per_s": updates
+            * settings.arenas
+            * settings.algo.rollout
+            / median([mine for _, mine in times])[0],
+            "robot": settings.robot.body,
+            "impl": physics.resolve_impl(settings.sim.impl),
+            "arenas": settings.arenas,
+            "compile_s": arm.compile_s,
+            "device": provenance.device(),
+            "versions": provenance.versions(),
+            "commit": provenance.commit(),
+        }
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    settings = config.load_train(["stage=s6", *arguments])
+    for line in results(settings):
+        sys.stdout.write(json.dumps(line) + "\n")
+        sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("curriculum_cost", main, TrainConfig))

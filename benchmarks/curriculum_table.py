@@ -1,0 +1,255 @@
+"""Tables and learning curves of what `benchmarks.curriculum` has printed.
+
+`python -m benchmarks.curriculum_table FILE... [measure=all_reached] [out=DIR]` prints a Markdown
+table for each goal, kind of policy, number of arenas and budget; with `out` it also draws the
+learning curves of each into DIR, as `<goal>-<policy>-<arenas>-<budget>-<measure>.png`. The measure
+is the share of targets that were reached, or of episodes in which all were.
+
+Every figure is the interquartile mean over seeds, with the 95 % interval of a stratified bootstrap
+over them (swarmjax.statistics). The columns:
+
+- `goal`, `1.5 m`: the share at the end, on the goal and in the arena never trained.
+- `to 0.8`, `to 0.9`: arena steps until a seed's share on the goal is first so large.
+- `area`, `area (log)`: mean share on the goal over training, by arena steps and by their logarithm.
+- `forgotten`: the best share on the first stage at any point, less the last one.
+- `P(end)`, `P(area)`: probability that a seed ends higher than one of the baseline, and that its
+  `area` is larger.
+"""
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+
+from benchmarks.curriculum_arms import BASELINE
+from swarmjax import command, statistics
+from swarmjax.config import ConfigError, TrainConfig
+from swarmjax.statistics import Interval
+
+MEASURES = {"targets_reached": "targets reached", "all_reached": "episodes in which all arrived"}
+THRESHOLDS = (0.8, 0.9)
+COLUMNS = ("arm", "goal", "1.5 m", "to 0.8", "to 0.9", "area", "area (log)", "forgotten")
+_SHARED = ("arena_steps", "levels", "level_seed", "steps", "roles", "robot", "realism")
+_TITLES = {"goal": "goal", "held_out": "1.5 m, never trained", "first": "first stage"}
+
+Line = dict[str, Any]
+
+
+class Key(NamedTuple):
+    """What the arms of one table have in common."""
+
+    goal: str
+    policy: str
+    arenas: int
+    budget: int
+
+
+class Figures(NamedTuple):
+    """What each seed of an arm came to, [N] each.
+
+    Attributes:
+      goal: share on the goal at the end.
+      held_out: on the 1.5 m arena; None where it was not judged.
+      steps: by threshold, arena steps until it was first reached; inf if it never was.
+      area: mean share over arena steps.
+      log_area: mean share over their logarithm.
+      forgotten: best share on the first stage less the last one.
+    """
+
+    goal: np.ndarray
+    held_out: np.ndarray | None
+    steps: dict[float, np.ndarray]
+    area: np.ndarray
+    log_area: np.ndarray
+    forgotten: np.ndarray
+
+
+def tables(lines: Sequence[Line]) -> dict[Key, dict[str, Line]]:
+    """Puts together the lines of each table, by arm, the baseline first.
+
+    Args:
+      lines: as `benchmarks.curriculum` prints them.
+
+    Returns:
+      The arms of each table.
+
+    Raises:
+      ConfigError: if an arm is there twice, or arms of a table were judged differently.
+    """
+    found: dict[Key, dict[str, Line]] = {}
+    for line in sorted(lines, key=lambda line: line["arm"] != BASELINE):
+        key = Key(*(line[name] for name in Key._fields))
+        arms = found.setdefault(key, {})
+        if line["arm"] in arms:
+            raise ConfigError(f"arm {line['arm']} of {_title(key)} is there twice: leave one out.")
+        for name in _SHARED:
+            for other in arms.values():
+                if line[name] != other[name]:
+                    raise ConfigError(
+                        f"arms {other['arm']} and {line['arm']} of {_title(key)} differ in {name}: "
+                        "judge them alike."
+                    )
+        arms[line["arm"]] = line
+    return found
+
+
+def figures(line: Line, measure: str) -> Figures:
+    """Works out what each seed came to.
+
+    Args:
+      line: of an arm.
+      measure: one of `MEASURES`.
+
+    Returns:
+      Its figures.
+    """
+    steps = np.array(line["arena_steps"], float)
+    curve = {role: np.array(found[measure]) for role, found in line["judged"].items()}
+    goal, first = curve["goal"], curve["first"]
+    return Figures(
+        goal=goal[:, -1],
+        held_out=curve["held_out"][:, -1] if "held_out" in curve else None,
+        steps={share: statistics.steps_to(steps, goal, share) for share in THRESHOLDS},
+        area=statistics.area_under(steps, goal),
+        log_area=statistics.area_under(np.log10(steps), goal),
+        forgotten=first.max(axis=1) - first[:, -1],
+    )
+
+
+def table(key: Key, arms: dict[str, Line], measure: str) -> str:
+    """Writes the table of some arms.
+
+    Args:
+      key: what they have in common.
+      arms: their lines, by name.
+      measure: one of `MEASURES`.
+
+    Returns:
+      Markdown.
+    """
+    found = {name: figures(line, measure) for name, line in arms.items()}
+    baseline = found.get(BASELINE)
+    columns = [*COLUMNS, *(("P(end)", "P(area)") if baseline else ())]
+    rows = [columns, ["---"] * len(columns)]
+    rows += [[name, *_cells(mine), *_chances(mine, baseline)] for name, mine in found.items()]
+    title = f"### {_title(key)}: {MEASURES[measure]}"
+    return "\n".join([title, "", *(f"| {' | '.join(row)} |" for row in rows)])
+
+
+def _title(key: Key) -> str:
+    return f"{key.goal}, {key.policy}, {key.arenas} arenas, {key.budget:,} arena steps"
+
+
+def _cells(mine: Figures) -> Iterator[str]:
+    """Words of an arm's own columns."""
+    yield _share(mine.goal)
+    yield "-" if mine.held_out is None else _share(mine.held_out)
+    for steps in mine.steps.values():
+        yield _words(_over_seeds(steps), _count)
+    for values in (mine.area, mine.log_area, mine.forgotten):
+        yield _share(values)
+
+
+def _chances(mine: Figures, baseline: Figures | None) -> Iterator[str]:
+    """Words of how likely an arm is to beat the baseline."""
+    if baseline is None:
+        return
+    for name in ("goal", "area"):
+        ours, theirs = (getattr(each, name)[:, None] for each in (mine, baseline))
+        chance = statistics.probability_of_improvement(ours, theirs)
+        yield "-" if mine is baseline else _words(chance, "{:.2f}".format)
+
+
+def _over_seeds(values: np.ndarray) -> Interval[float]:
+    """Interquartile mean of values [N], with its interval."""
+    return statistics.bootstrap(values[:, None], statistics.iqm)
+
+
+def _share(values: np.ndarray) -> str:
+    return _words(_over_seeds(values), "{:.3f}".format)
+
+
+def _count(steps: float) -> str:
+    """Puts steps in words, to two digits."""
+    return "never" if np.isinf(steps) else f"{float(f'{steps:.2g}'):,.0f}"
+
+
+def _words(interval: Interval[float], word: Callable[[float], str]) -> str:
+    low, high = word(interval.low), word(interval.high)
+    return f"{word(interval.estimate)} ({low} to {high})"
+
+
+def draw(key: Key, arms: dict[str, Line], measure: str, path: Path) -> None:
+    """Draws the learning curves of some arms, with their bands.
+
+    Args:
+      key: what they have in common.
+      arms: their lines, by name.
+      measure: one of `MEASURES`.
+      path: of the picture.
+    """
+    roles = [role for role in _TITLES if role in next(iter(arms.values()))["judged"]]
+    figure = Figure(figsize=(4.5 * len(roles), 3.8), layout="constrained")
+    figure.suptitle(_title(key))
+    for axes, role in zip(figure.subplots(1, len(roles), squeeze=False)[0], roles, strict=True):
+        _draw_curves(axes, arms, role, measure)
+    figure.savefig(path, dpi=150)
+
+
+def _draw_curves(axes: Axes, arms: dict[str, Line], role: str, measure: str) -> None:
+    """Draws the curves of one judged stage."""
+    for name, line in arms.items():
+        band = statistics.curve(np.array(line["judged"][role][measure]))
+        (drawn,) = axes.plot(line["arena_steps"], band.estimate, label=name)
+        axes.fill_between(
+            line["arena_steps"], band.low, band.high, color=drawn.get_color(), alpha=0.2, lw=0
+        )
+    stage = next(iter(arms.values()))["roles"][role]
+    axes.set(xscale="log", xlabel="arena steps", ylabel=f"{MEASURES[measure]}, IQM")
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_title(f"{stage} ({_TITLES[role]})")
+    axes.grid(visible=True, alpha=0.3)
+    axes.legend()
+
+
+def read(path: Path) -> list[Line]:
+    """Reads the lines of a file.
+
+    Raises:
+      ConfigError: if it cannot be read, or a line is none of `benchmarks.curriculum`.
+    """
+    try:
+        lines = [json.loads(text) for text in path.read_text().splitlines() if text]
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ConfigError(f"{path} cannot be read: {error}.") from None
+    if not all(isinstance(line, dict) and line.get("benchmark") == "curriculum" for line in lines):
+        raise ConfigError(f"{path} holds other lines than those of benchmarks.curriculum.")
+    return lines
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    given = dict(word.split("=", 1) for word in arguments if word.startswith(("out=", "measure=")))
+    files = [word for word in arguments if not word.startswith(("out=", "measure="))]
+    measure = given.get("measure", "targets_reached")
+    if measure not in MEASURES:
+        raise ConfigError(f"measure is '{measure}': give one of {', '.join(MEASURES)}.")
+    if not files:
+        raise ConfigError("there is no file: give those that benchmarks.curriculum printed.")
+    for key, arms in tables([line for name in files for line in read(Path(name))]).items():
+        sys.stdout.write(table(key, arms, measure) + "\n\n")
+        if "out" in given:
+            Path(given["out"]).mkdir(parents=True, exist_ok=True)
+            name = "-".join(map(str, (*key, measure)))
+            draw(key, arms, measure, Path(given["out"]) / f"{name}.png")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("curriculum_table", main, TrainConfig))

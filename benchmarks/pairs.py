@@ -1,0 +1,84 @@
+"""Two programs timed in turn, and what can be said of the ratio of their times."""
+
+import time
+from collections.abc import Sequence
+from functools import partial
+from math import comb
+
+import jax
+import numpy as np
+
+from swarmjax import loop, seeds
+from swarmjax.config import TrainConfig
+
+
+class Arm:
+    """One program with its state, that trains on with every call.
+
+    Attributes:
+      settings: its config.
+      compile_s: seconds that compiling took.
+      transitions: robot steps that all seeds were trained on by the last call.
+    """
+
+    def __init__(self, settings: TrainConfig) -> None:
+        program, schedule = loop.load(settings)
+        self.settings = settings
+        self._state = jax.jit(partial(seeds.init, program))(schedule)
+        began = time.perf_counter()
+        train = jax.jit(partial(seeds.train_chunk, program, schedule), donate_argnums=0)
+        self._train = train.lower(self._state, np.int32(1)).compile()
+        self.compile_s = time.perf_counter() - began
+        self.transitions = 0
+
+    def time(self, updates: int) -> float:
+        """Trains for some updates and returns the seconds that took."""
+        began = time.perf_counter()
+        self._state, metrics = self._train(self._state, np.int32(updates))
+        jax.block_until_ready(metrics)
+        seconds = time.perf_counter() - began
+        self.transitions = int(np.asarray(metrics["transitions"])[:, :updates].sum(dtype=np.int64))
+        return seconds
+
+
+def time_in_turn(one: Arm, other: Arm, updates: int, pairs: int) -> list[tuple[float, float]]:
+    """Times calls of two arms in turn, after one of each that is not counted.
+
+    Args:
+      one: an arm.
+      other: another.
+      updates: of each call.
+      pairs: of calls; which arm comes first changes from pair to pair.
+
+    Returns:
+      Seconds of `one` and of `other`, a pair each.
+    """
+    for each in (one, other):
+        each.time(updates)
+    times = []
+    for i in range(pairs):
+        first, second = (one, other) if i % 2 == 0 else (other, one)
+        a, b = first.time(updates), second.time(updates)
+        times.append((a, b) if i % 2 == 0 else (b, a))
+    return times
+
+
+def median(values: Sequence[float]) -> tuple[float, float, float]:
+    """The median, and an interval that holds the true one with at least 95 %.
+
+    Of n independent values as many lie below the true median as heads fall in n throws of a coin,
+    whatever their distribution: the interval runs from the k-th smallest to the k-th largest, with
+    the largest k that leaves at most 2.5 % on either side.
+
+    Args:
+      values: at least 6.
+
+    Returns:
+      Median, lower and upper end.
+    """
+    ordered, n = sorted(values), len(values)
+    below = np.cumsum([comb(n, heads) / 2**n for heads in range(n + 1)])
+    k = int(np.searchsorted(below, 0.025, side="right"))
+    if k < 1:
+        raise ValueError(f"values are {n}: give at least 6 for an interval of 95 %.")
+    return float(np.median(ordered)), ordered[k - 1], ordered[n - k]

@@ -1,0 +1,69 @@
+"""How much faster do several seeds train in one program than one by itself?
+
+`python -m benchmarks.seeds_speed [key=value ...]` takes the keys of `swarmjax.train` (`seeds` is 10
+unless given; `arenas` are those of each seed) and trains all seeds, and one, in turn. It prints a
+JSON line: transitions a second of both, and their ratio, the median over `PAIRS` pairs with a 95 %
+interval by order statistics.
+"""
+
+import json
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+from benchmarks.pairs import Arm, median
+from swarmjax import command, config, provenance
+from swarmjax.config import TrainConfig
+from swarmjax.sim import physics
+
+PAIRS = 10
+CALL_SECONDS = 0.5  # of a call of one seed, about
+
+
+def _speed(arm: Arm, updates: int) -> float:
+    """Transitions a second of one call."""
+    seconds = arm.time(updates)
+    return arm.transitions / seconds
+
+
+def result(settings: TrainConfig) -> dict[str, Any]:
+    """Compiles both programs and times them in turn; returns the line."""
+    with ThreadPoolExecutor(2) as pool:
+        one, all_ = pool.map(Arm, [replace(settings, seeds=1), settings])
+    for arm in (one, all_):
+        arm.time(1)
+    updates = max(1, round(CALL_SECONDS / one.time(1)))
+    pairs = [(_speed(one, updates), _speed(all_, updates)) for _ in range(PAIRS)]
+    ratio, low, high = median([many / single for single, many in pairs])
+    return {
+        "benchmark": "seeds_speed",
+        "seeds": settings.seeds,
+        "seeds_by": settings.seeds_by,
+        "arenas": settings.arenas,
+        "speed_ratio": ratio,
+        "speed_ratio_low": low,
+        "speed_ratio_high": high,
+        "pairs": PAIRS,
+        "transitions_per_s_of_one": median([single for single, _ in pairs])[0],
+        "transitions_per_s": median([many for _, many in pairs])[0],
+        "compile_s_of_one": one.compile_s,
+        "compile_s": all_.compile_s,
+        "stages": [stage.name for stage in settings.stage],
+        "impl": physics.resolve_impl(settings.sim.impl),
+        "device": provenance.device(),
+        "versions": provenance.versions(),
+        "commit": provenance.commit(),
+    }
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    settings = config.load_train(["stage=s6", "seeds=10", *arguments])
+    sys.stdout.write(json.dumps(result(settings)) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("seeds_speed", main, TrainConfig))

@@ -1,0 +1,77 @@
+"""What a promotion does to the learners, as the config says."""
+
+import math
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+
+from swarmjax.config import TrainConfig
+from swarmjax.ppo.learner import LearnerState
+
+
+def carry_over(
+    learners: LearnerState, config: TrainConfig, before: Array, after: Array, promoted: Array
+) -> LearnerState:
+    """Prepares the learners for a stage that a promotion has begun.
+
+    Where each robot has a learner and the swarm grows beyond what was met so far, the newcomers
+    take those of the others over in turn: parameters, optimiser and normaliser. Without that they
+    begin as they are, untrained. Then the optimiser, the normaliser and the exploration of all
+    learners are dealt with as `config.curriculum` says. What is kept costs nothing.
+
+    Args:
+      learners: [L].
+      config: of the run.
+      before: [] the most robots that a stage has had so far, at least 1.
+      after: [] the same with the stage that now begins.
+      promoted: [] whether there was a promotion; otherwise nothing happens.
+
+    Returns:
+      The learners, [L].
+    """
+    options, carried = config.curriculum, learners
+    if options.newcomers == "copy" and config.learners > 1:
+        carried = _copied(carried, before, after)
+    if options.optimizer == "reset":
+        carried = replace(carried, optimizer_state=_forgotten(carried.optimizer_state))
+    if options.normalizer == "relearn":
+        # With a count of 0 the next batch's moments replace these, which normalise it meanwhile.
+        unweighted = replace(carried.normalizer, count=jnp.zeros_like(carried.normalizer.count))
+        carried = replace(carried, normalizer=unweighted)
+    if options.exploration == "reset":
+        carried = replace(carried, params=_explorative(carried.params, config.algo.initial_std))
+    if carried is learners:
+        return learners
+    return jax.tree.map(lambda new, old: jnp.where(promoted, new, old), carried, learners)
+
+
+def _copied(learners: LearnerState, before: Array, after: Array) -> LearnerState:
+    """Puts learner i % before in the place of learner i, for before <= i < after."""
+    index = jnp.arange(learners.normalizer.count.shape[0])
+    new = (index >= before) & (index < after)
+    source = jnp.where(new, index % before, index)
+    return jax.tree.map(lambda x: x[source], learners)
+
+
+def _forgotten(state: optax.OptState) -> optax.OptState:
+    """Sets Adam's moments, and the count that corrects their bias, to 0.
+
+    The learning rate's schedule counts by itself and goes on.
+    """
+
+    def is_adam(part: object) -> bool:
+        return isinstance(part, optax.ScaleByAdamState)
+
+    def forget(part: optax.OptState) -> optax.OptState:
+        return jax.tree.map(jnp.zeros_like, part) if is_adam(part) else part
+
+    return jax.tree.map(forget, state, is_leaf=is_adam)
+
+
+def _explorative(params: dict, std: float) -> dict:
+    """Sets the policy's standard deviation to what a new one begins with."""
+    log_std = jnp.full_like(params["actor"]["log_std"], math.log(std))
+    return params | {"actor": params["actor"] | {"log_std": log_std}}

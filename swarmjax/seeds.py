@@ -1,0 +1,93 @@
+"""Several seeds of a run in one program: `loop` with a leading axis N on state and metrics.
+
+Each seed is a whole run with networks, arenas and curriculum of its own; nothing passes between
+lanes. Seed k is `config.seed + k`. The axis is there for one seed too, so that there is one kind
+of state, of checkpoint and of metrics.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+
+from swarmjax import loop
+from swarmjax.config import TrainConfig
+from swarmjax.curriculum import Schedule
+from swarmjax.loop import Metrics, Program, TrainState
+from swarmjax.sim.physics import PhysicsState
+
+
+def numbers(config: TrainConfig) -> range:
+    """Returns the seeds of a run, lane by lane."""
+    return range(config.seed, config.seed + config.seeds)
+
+
+def init(program: Program, schedule: Schedule) -> TrainState:
+    """Starts every seed of a run.
+
+    Args:
+      program: the compiled side.
+      schedule: the curriculum's numbers.
+
+    Returns:
+      [N] states before the first update.
+    """
+    lanes = np.array(numbers(program.config), np.uint32)
+    return each(program.config, partial(loop.init, program, schedule), lanes)
+
+
+def train_chunk(
+    program: Program, schedule: Schedule, state: TrainState, n: Array
+) -> tuple[TrainState, Metrics]:
+    """Trains every seed for `n` updates; `jit` it with `program` bound and `state` donated.
+
+    Args:
+      program: the compiled side.
+      schedule: the curriculum's numbers, the same for all.
+      state: [N] before.
+      n: [] updates to do, at most `program.rows`, int32.
+
+    Returns:
+      [N] states after, and metrics [N, rows, ...]: the first n rows hold an update each.
+    """
+    return each(program.config, lambda lane: loop.train_chunk(program, schedule, lane, n), state)
+
+
+def each(config: TrainConfig, function: Callable[[Any], Any], lanes: Any) -> Any:
+    """Applies a function of one seed to all of them, as `config.seeds_by` says.
+
+    Side by side (`vmap`) the matrix products are batched, which rounds differently from one seed
+    alone, but the same in every lane; one seed is not batched at all. In turn (`map`) a seed comes
+    to the same bits however many there are.
+
+    Args:
+      config: the run's config.
+      function: from a tree to a tree.
+      lanes: the function's argument with a leading axis N.
+
+    Returns:
+      The function's results with a leading axis N.
+    """
+    if config.seeds_by == "map":
+        return jax.lax.map(function, lanes)
+    if config.seeds == 1:
+        alone = function(jax.tree.map(lambda x: x[0], lanes))
+        return jax.tree.map(lambda x: x[None], alone)
+    return jax.vmap(function)(lanes)
+
+
+def stepped_together(program: Program, state: TrainState) -> PhysicsState:
+    """Takes out of a state the arenas that the program steps together, all on one axis.
+
+    Args:
+      program: the compiled side.
+      state: [N].
+
+    Returns:
+      [N A] arenas where seeds go side by side, [A] where they go in turn.
+    """
+    lanes = 1 if program.config.seeds_by == "map" else program.config.seeds
+    return jax.tree.map(lambda x: x[:lanes].reshape(-1, *x.shape[2:]), state.arenas.sim)

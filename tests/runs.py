@@ -1,0 +1,53 @@
+"""Run directories written by hand, for the tests of the report."""
+
+import json
+from pathlib import Path
+
+from swarmjax import config
+from swarmjax.config import AlgoConfig, SimConfig, StageConfig, TaskConfig, TrainConfig
+
+CONFIG = TrainConfig(
+    stage=(
+        StageConfig(name="pair", robots=2, side=0.5),
+        StageConfig(name="trio", robots=3, side=0.8, obstacles=2),
+    ),
+    task=TaskConfig(step_limit=16),  # a cohort is two updates of 8 control steps
+    algo=AlgoConfig(hidden=(8,), rollout=8, minibatches=2),
+    sim=SimConfig(impl="jax"),
+    arenas=8,
+    budget=8 * 8 * 20,
+)
+
+
+def row(update: int, seed: int = 0, **given: object) -> dict:
+    """A row of metrics.jsonl, all arenas on the first of two stages, nothing measured yet."""
+    return {
+        "seed": seed,
+        "update": update,
+        "arena_steps": 64 * (update + 1),
+        "train_s": 30.0 * (update + 1),
+        "mix": [8, 0],
+        "weights": [1.0, 0.0],
+        "success_by_stage": [None, None],
+        "complete_by_stage": [None, None],
+        "contacts_by_stage": [None, None],
+        "return_by_stage": [None, None],
+        "progress_by_stage": [None, None],
+        "episodes_by_stage": [None, None],
+        **given,
+    }
+
+
+def write(
+    run: Path,
+    rows: list[dict],
+    decisions: list[dict] | None = None,
+    trained: TrainConfig = CONFIG,
+) -> Path:
+    """Writes a run directory."""
+    run.mkdir(parents=True, exist_ok=True)
+    (run / "config.json").write_text(json.dumps(config.to_dict(trained)))
+    (run / "metrics.jsonl").write_text("".join(json.dumps(each) + "\n" for each in rows))
+    lines = "".join(json.dumps(each) + "\n" for each in decisions or [])
+    (run / "curriculum.jsonl").write_text(lines)
+    return run

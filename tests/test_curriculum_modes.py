@@ -1,0 +1,440 @@
+"""The modes: forced by hand, and against a plain reference on episodes of a real tiny run."""
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from swarmjax import curriculum, rollout
+from swarmjax.config import (
+    AlgoConfig,
+    CurriculumConfig,
+    RobotConfig,
+    SimConfig,
+    StageConfig,
+    TaskConfig,
+    TrainConfig,
+)
+from swarmjax.curriculum import (
+    BY_BUDGET,
+    BY_DEMOTION,
+    BY_THRESHOLD,
+    NEVER,
+    REASONS,
+    REWEIGHED,
+    STAYED,
+    Choice,
+    Curriculum,
+    Record,
+    Schedule,
+    Verdict,
+)
+from swarmjax.curriculum_modes import MODES
+from swarmjax.ppo import learner as ppo
+from swarmjax.rollout import Ended
+from swarmjax.task import env, observation
+from swarmjax.task.env import EnvState
+
+COHORT = 4  # updates
+SEQUENTIAL, MIXED = CurriculumConfig(), CurriculumConfig(mode="mixed")
+ADAPTIVE = CurriculumConfig(mode="adaptive")
+PROGRESS = CurriculumConfig(mode="adaptive", score="progress")
+
+_advance = jax.jit(curriculum.advance, static_argnums=(2, 3))
+
+
+def _schedule(stages: int, **changes: Any) -> Schedule:
+    """Stages of 1, 2, .. robots, without deadlines."""
+    chosen = tuple(StageConfig(name=f"s{i}", robots=1 + i, side=1.0) for i in range(stages))
+    config = TrainConfig(stage=chosen, sim=SimConfig(max_robots=9))
+    numbers = curriculum.schedule(config)._replace(
+        deadline=np.full(stages, NEVER, np.int32),
+        demotion=np.float32(0.3),
+        earlier_share=np.float32(0.25),
+        floor=np.float32(0.1),
+        cohort_updates=np.int32(COHORT),
+    )
+    return numbers._replace(**changes)
+
+
+def _state(stage: int, stages: int, cohort: int = 9, since: int = 5) -> Curriculum:
+    start = curriculum.init(_schedule(stages), SEQUENTIAL, MODES["sequential"])
+    number = {"stage": stage, "cohort": cohort, "since": since}
+    return replace(start, **{key: jnp.int32(value) for key, value in number.items()})
+
+
+def _verdict(success: list[float], over: bool = True, judged: bool = True) -> Verdict:
+    values = jnp.array(success, jnp.float32)
+    return Verdict(over=jnp.array(over), judged=over & judged & ~jnp.isnan(values), success=values)
+
+
+def _choose(
+    options: CurriculumConfig, state: Curriculum, numbers: Schedule, verdict: Verdict, update: int
+) -> Choice:
+    return MODES[options.mode](state, numbers, options, verdict, jnp.int32(update))
+
+
+# --- promotion, hold, demotion, first and last stage
+
+
+@pytest.mark.parametrize("options", [SEQUENTIAL, MIXED], ids=lambda options: options.mode)
+@pytest.mark.parametrize(
+    ("stage", "success", "to", "why"),
+    [
+        (1, 0.8, 2, BY_THRESHOLD),
+        (1, 0.79, 1, STAYED),
+        (1, 0.3, 1, STAYED),
+        (1, 0.29, 0, BY_DEMOTION),
+        (0, 0.0, 0, STAYED),  # nothing before the first
+        (2, 1.0, 2, STAYED),  # nothing after the last
+        (2, 0.0, 1, BY_DEMOTION),
+    ],
+)
+def test_a_verdict_decides(
+    options: CurriculumConfig, stage: int, success: float, to: int, why: int
+) -> None:
+    seen = [math.nan] * 3
+    seen[stage] = success
+    found = _choose(options, _state(stage, 3), _schedule(3), _verdict(seen), 100)
+    assert (int(found.stage), int(found.reason)) == (to, why)
+
+
+def test_nothing_is_demoted_unless_asked_for() -> None:
+    numbers = _schedule(3, demotion=np.float32(-1.0))
+    found = _choose(SEQUENTIAL, _state(1, 3), numbers, _verdict([1.0, 0.0, 1.0]), 100)
+    assert (int(found.stage), int(found.reason)) == (1, STAYED)
+
+
+@pytest.mark.parametrize(("deadline", "why"), [(101, STAYED), (102, BY_DEMOTION)])
+def test_no_way_back_to_a_stage_whose_deadline_is_past(deadline: int, why: int) -> None:
+    """After update 100, which is the 101st."""
+    numbers = _schedule(3, deadline=np.array([deadline, 500, NEVER], np.int32))
+    found = _choose(SEQUENTIAL, _state(1, 3), numbers, _verdict([1.0, 0.0, 1.0]), 100)
+    assert int(found.reason) == why
+
+
+@pytest.mark.parametrize(
+    ("cohort", "over", "success", "why"),
+    [
+        (5, False, 1.0, STAYED),  # right after a decision: not even the deadline counts
+        (5, True, 1.0, BY_BUDGET),  # a step limit later; the verdict is of the cohort before
+        (6, False, 1.0, BY_BUDGET),
+        (6, True, 1.0, BY_THRESHOLD),  # the first cohort that began since
+        (6, True, 0.0, BY_BUDGET),  # the deadline of its own stage goes before demotion
+    ],
+)
+def test_after_a_decision_a_step_limit_passes(
+    cohort: int, over: bool, success: float, why: int
+) -> None:
+    numbers = _schedule(3, deadline=np.array([200, 50, NEVER], np.int32))
+    seen = _verdict([1.0, success, 1.0], over)
+    found = _choose(SEQUENTIAL, _state(1, 3, cohort, since=5), numbers, seen, 100)
+    assert REASONS[int(found.reason)] == REASONS[why]
+
+
+def test_a_stage_that_was_not_judged_now_is_not_decided_by_what_it_once_did() -> None:
+    seen = _verdict([1.0, 1.0, 1.0], judged=False)
+    found = _choose(SEQUENTIAL, _state(1, 3), _schedule(3), seen, 100)
+    assert int(found.reason) == STAYED
+
+
+# --- weights
+
+
+@pytest.mark.parametrize(
+    ("stage", "weights"),
+    [
+        (0, [1.0, 0.0, 0.0, 0.0]),
+        (1, [0.25, 0.75, 0.0, 0.0]),
+        (3, [0.25 / 3, 0.25 / 3, 0.25 / 3, 0.75]),
+    ],
+)
+def test_mixed_keeps_a_share_on_earlier_stages(stage: int, weights: list[float]) -> None:
+    found = _choose(MIXED, _state(stage, 4), _schedule(4), _verdict([math.nan] * 4), 3)
+    np.testing.assert_allclose(found.weights, weights, rtol=1e-6)  # rounding of float32
+    found = _choose(SEQUENTIAL, _state(stage, 4), _schedule(4), _verdict([math.nan] * 4), 3)
+    assert found.weights.tolist() == np.eye(4)[stage].tolist()
+
+
+def _known(state: Curriculum, fast: list[float], slow: list[float]) -> Curriculum:
+    means = {"fast": jnp.array(fast, jnp.float32), "slow": jnp.array(slow, jnp.float32)}
+    return replace(state, record=state.record._replace(**means))
+
+
+NAN = math.nan
+
+
+@pytest.mark.parametrize(
+    ("options", "fast", "slow", "score"),
+    [
+        # p (1 - p); a quarter for what is unknown.
+        (ADAPTIVE, [0.9, 0.5, 0.2, NAN], [0.0] * 4, [0.09, 0.25, 0.16, 0.25]),
+        (ADAPTIVE, [1.0, 1.0, 0.0, 1.0], [0.0] * 4, [1.0] * 4),  # nothing to learn: evenly
+        (ADAPTIVE, [NAN] * 4, [NAN] * 4, [1.0] * 4),
+        # |fast - slow|; the most that is known for what is unknown.
+        (PROGRESS, [0.9, 0.5, 0.2, NAN], [0.8, 0.5, 0.5, NAN], [0.1, 0.0, 0.3, 0.3]),
+        (PROGRESS, [0.9, 0.5, NAN, NAN], [0.9, 0.5, NAN, NAN], [1.0] * 4),
+        (PROGRESS, [NAN] * 4, [NAN] * 4, [1.0] * 4),
+    ],
+)
+def test_adaptive_weighs_by_its_score(
+    options: CurriculumConfig, fast: list[float], slow: list[float], score: list[float]
+) -> None:
+    state = _known(_state(3, 4), fast, slow)
+    found = _choose(options, state, _schedule(4), _verdict([0.5] * 4), 3)
+    expected = 0.1 / 4 + 0.9 * np.array(score) / sum(score)
+    np.testing.assert_allclose(found.weights, expected, rtol=1e-5)  # float32, differences of it
+    assert (int(found.stage), int(found.reason)) == (3, REWEIGHED)
+
+
+def test_adaptive_waits_for_the_end_of_a_cohort() -> None:
+    state = replace(_known(_state(1, 2), [0.5, 0.9], [0.5, 0.9]), weights=jnp.array([0.125, 0.875]))
+    found = _choose(ADAPTIVE, state, _schedule(2), _verdict([0.5, 0.9], over=False), 3)
+    assert found.weights.tolist() == [0.125, 0.875]
+    assert int(found.reason) == STAYED
+    found = _choose(ADAPTIVE, state, _schedule(2), _verdict([0.5, 0.9], judged=False), 3)
+    assert int(found.reason) == STAYED
+
+
+SHARES = st.lists(st.one_of(st.just(NAN), st.floats(0.0, 1.0, width=32)), min_size=1, max_size=40)
+
+
+@settings(max_examples=40)
+@given(
+    fast=SHARES,
+    seed=st.integers(0, 99),
+    floor=st.floats(2.0**-10, 1.0, width=32),
+    index=st.integers(0, 3),
+)
+def test_weights_are_shares(fast: list[float], seed: int, floor: float, index: int) -> None:
+    stages = len(fast)
+    slow = np.where(np.isnan(fast), NAN, np.random.default_rng(seed).random(stages))
+    options = (SEQUENTIAL, MIXED, ADAPTIVE, PROGRESS)[index]
+    state = _known(_blank(stages, seed % stages), fast, slow.tolist())
+    numbers = _numbers(stages, floor)
+    found = np.asarray(_choose(options, state, numbers, _verdict(fast), 3).weights)
+    assert found.sum() == pytest.approx(1.0, abs=1e-5)  # float32 sum of 40
+    assert (found >= (floor / stages * (1 - 1e-6) if index > 1 else 0.0)).all()  # its rounding
+    assert (found <= 1.0 + 1e-6).all()
+
+
+@functools.cache
+def _numbers_of(stages: int) -> Schedule:
+    return _schedule(9)._replace(deadline=np.full(stages, NEVER, np.int32))
+
+
+def _numbers(stages: int, floor: float) -> Schedule:
+    return _numbers_of(stages)._replace(floor=np.float32(floor))
+
+
+def _blank(stages: int, stage: int) -> Curriculum:
+    """What a mode reads of a curriculum of any number of stages."""
+    state = _state(0, 1)
+    return replace(
+        state,
+        stage=jnp.int32(stage),
+        weights=jnp.zeros(stages),
+        record=Record(*[jnp.zeros(stages)] * 7),
+    )
+
+
+# --- a plain reference, on episodes of a real tiny run
+
+STAGES, ARENAS = 3, 8
+UPDATES = 100
+
+
+class Reference:
+    """The curriculum as lists of episodes, in NumPy and plain Python."""
+
+    def __init__(self, numbers: Schedule, options: CurriculumConfig) -> None:
+        self.numbers, self.options = numbers, options
+        self.cohort = self.age = self.since = 0
+        self.stages = len(numbers.deadline)
+        self.stage = self.stages - 1 if options.mode == "adaptive" else 0
+        self.episodes: list[tuple[int, int, int, int, int]] = []
+        self.fast = np.full(self.stages, np.nan, np.float32)
+        self.slow = np.full(self.stages, np.nan, np.float32)
+        self.weights = self._weights()
+
+    def update(self, ended: Ended, number: int) -> int:
+        """Takes an update in; returns why something was decided."""
+        over = np.asarray(ended.episodes) > 0
+        columns = (ended.cohort, ended.stage, ended.targets, ended.reached, ended.all_reached)
+        self.episodes += list(zip(*(np.asarray(c)[over].tolist() for c in columns), strict=True))
+        self.age += 1
+        is_over = self.age == self.numbers.cohort_updates
+        judged = self._judge() if is_over else {}
+        reason = self._decide(judged, is_over, number)
+        if is_over and self.options.mode == "adaptive":
+            self.weights, reason = self._weights(), REWEIGHED if judged else STAYED
+        if reason in (BY_THRESHOLD, BY_BUDGET, BY_DEMOTION):
+            self.stage += -1 if reason == BY_DEMOTION else 1
+            self.weights = self._weights()
+        if is_over or reason != STAYED:
+            self.cohort, self.age = self.cohort + 1, 0
+            self.since = self.since if reason == STAYED else self.cohort
+        return reason
+
+    def _judge(self) -> dict[int, np.float32]:
+        """Success of the cohort before, by stage."""
+        judged = {}
+        for stage in range(self.stages):
+            mine = [e for e in self.episodes if e[:2] == (self.cohort - 1, stage)]
+            if not mine:
+                continue
+            _, _, targets, reached, complete = np.sum(mine, axis=0)
+            part, whole = {"targets": (reached, targets), "all": (complete, len(mine))}[
+                self.options.success
+            ]
+            judged[stage] = success = np.float32(part) / np.float32(whole)
+            rate = np.float32(whole) / np.float32(whole + 20)
+            half = np.float32(0.5)
+            if np.isnan(self.fast[stage]):
+                self.fast[stage] = self.slow[stage] = half + rate * (success - half)
+                continue
+            for mean, speed in ((self.fast, rate), (self.slow, np.float32(0.2) * rate)):
+                mean[stage] += speed * (success - mean[stage])
+        return judged
+
+    def _decide(self, judged: dict[int, np.float32], is_over: bool, number: int) -> int:
+        deadline = self.numbers.deadline
+        if self.options.mode == "adaptive":
+            return STAYED
+        success = judged.get(self.stage) if self.cohort - 1 >= self.since else None
+        if self.stage < self.stages - 1:
+            if success is not None and success >= self.numbers.threshold:
+                return BY_THRESHOLD
+            if number + 1 >= deadline[self.stage] and (is_over or self.cohort > self.since):
+                return BY_BUDGET
+        if self.stage > 0 and success is not None and success < self.numbers.demotion:
+            return STAYED if number + 1 >= deadline[self.stage - 1] else BY_DEMOTION
+        return STAYED
+
+    def _weights(self) -> np.ndarray:
+        if self.options.mode == "adaptive":
+            unknown = np.isnan(self.fast)
+            score = np.where(unknown, 0.25, self.fast * (1 - self.fast))
+            if self.options.score == "progress":
+                change = np.abs(self.fast - self.slow)
+                most = 1.0 if unknown.all() else np.nanmax(change)
+                score = np.where(unknown, most, change)
+            share = (
+                score / score.sum() if score.sum() > 0 else np.full(self.stages, 1 / self.stages)
+            )
+            floor = np.float32(self.numbers.floor)
+            return floor / self.stages + (1 - floor) * share
+        weights = np.zeros(self.stages)
+        weights[self.stage] = 1.0
+        if self.options.mode == "mixed" and self.stage:
+            weights[: self.stage] = self.numbers.earlier_share / self.stage
+            weights[self.stage] = 1 - self.numbers.earlier_share
+        return weights
+
+
+Step = Callable[[jax.Array, EnvState | None, jax.Array, jax.Array], tuple[EnvState, Ended]]
+
+
+@pytest.fixture(scope="module")
+def step() -> Step:
+    """A rollout of 8 arenas whose robots wander so wildly that some meet their targets."""
+    sizes = [(1, 0.4), (1, 0.5), (2, 0.5)]
+    config = TrainConfig(
+        stage=tuple(StageConfig(name=f"s{i}", robots=n, side=s) for i, (n, s) in enumerate(sizes)),
+        robot=RobotConfig(max_speed=0.6, max_wheel_speed=40.0),
+        task=TaskConfig(step_limit=8 * COHORT, target_radius=0.09),
+        algo=AlgoConfig(hidden=(8,), rollout=8, minibatches=2, initial_std=1.5),
+        sim=SimConfig(impl="jax", max_robots=2, max_obstacles=0),
+        arenas=ARENAS,
+    )
+    world, stages = env.load(config), curriculum.schedule(config).stages
+    keys = jax.random.split(jax.random.key(1), 1)
+    sizes = (observation.SIZE, rollout.ACTION_SIZE, config.updates)
+    learners = jax.vmap(lambda key: ppo.init(key, config.algo, *sizes))(keys)
+
+    draw = jax.jit(functools.partial(rollout.draw_starts, world, stages))
+    collect = jax.jit(functools.partial(rollout.collect, world))
+
+    def run(
+        index: jax.Array, arenas: EnvState | None, cohort: jax.Array, key: jax.Array
+    ) -> tuple[EnvState, Ended]:
+        level_key, rollout_key = jax.random.split(key)
+        starts = draw(index, cohort, level_key)
+        before = starts if arenas is None else arenas
+        after, _, ended = collect(learners, before, starts, rollout_key)
+        return after, ended
+
+    return run
+
+
+# So that chance, which brings an eighth of the robots there, decides now this and now that.
+EARLY, LATE = np.array([24, 90, NEVER], np.int32), np.array([60, 80, NEVER], np.int32)
+CASES = {
+    "sequential": (SEQUENTIAL, {"deadline": EARLY}),
+    "sequential-all": (CurriculumConfig(success="all"), {"deadline": EARLY}),
+    "mixed": (MIXED, {"deadline": LATE, "earlier_share": np.float32(0.5)}),
+    "learnability": (ADAPTIVE, {}),
+    "progress": (PROGRESS, {"floor": np.float32(0.4)}),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_decisions_are_those_of_the_reference(step: Step, name: str) -> None:
+    options, changes = CASES[name]
+    limits = {"threshold": np.float32(0.25), "demotion": np.float32(0.1)}
+    numbers = _schedule(3, **(limits | changes))
+    state = curriculum.init(numbers, options, MODES[options.mode])
+    reference, arenas, why = Reference(numbers, options), None, []
+    for number in range(UPDATES):
+        index = curriculum.assign(state, ARENAS)
+        arenas, ended = step(index, arenas, state.cohort, jax.random.key(number))
+        state, decision = _advance(
+            curriculum.count(state, ended), numbers, options, MODES[options.mode], number
+        )
+        why.append(int(decision.reason))
+        assert reference.update(ended, number) == why[-1]
+        assert int(state.stage) == reference.stage
+        assert (int(state.cohort), int(state.since)) == (reference.cohort, reference.since)
+        # Rounding of float32 in sums and quotients; the shares themselves decide exactly.
+        np.testing.assert_allclose(state.weights, reference.weights, rtol=1e-5)
+    decided = [reason for reason in why if reason != STAYED]
+    assert len(decided) >= 4
+    assert len(set(decided)) >= (1 if options.mode == "adaptive" else 2)
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**32 - 1), index=st.integers(0, 3))
+def test_no_decision_within_a_step_limit_of_the_last(seed: int, index: int) -> None:
+    """Whatever the episodes come to, and however soon the deadlines are."""
+    random = np.random.default_rng(seed)
+    options = (SEQUENTIAL, MIXED, ADAPTIVE, PROGRESS)[index]
+    soon = np.sort(random.integers(1, 30, 3)).astype(np.int32)
+    numbers = _schedule(4, deadline=np.append(soon, np.int32(NEVER)))
+    state, last = curriculum.init(numbers, options, MODES[options.mode]), -COHORT
+    for number in range(40):
+        state = _seen(state, random)
+        state, decision = _advance(state, numbers, options, MODES[options.mode], number)
+        if int(decision.reason) != STAYED:
+            assert number - last >= COHORT
+            last = number
+    assert last > 0
+
+
+def _seen(state: Curriculum, random: np.random.Generator) -> Curriculum:
+    """Adds any tallies."""
+    targets = random.integers(0, 3, 4)
+    drawn = {"targets": targets, "reached": random.integers(0, targets + 1), "episodes": targets}
+    columns = {key: jnp.asarray(value, jnp.int32) for key, value in drawn.items()}
+    return replace(
+        state,
+        current=state.current._replace(**columns),
+        previous=state.previous._replace(**columns),
+    )

@@ -1,0 +1,278 @@
+"""The study of curricula: its arms and points, what it measures, and its tables, by hand."""
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from sentences import refusal
+
+from benchmarks import curriculum, curriculum_arms, curriculum_table
+from benchmarks.curriculum_arms import StudyConfig
+from benchmarks.curriculum_table import Key
+from swarmjax import config, evaluate_mjx
+from swarmjax.config import TrainConfig
+from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.learner import LearnerState
+from swarmjax.task import env, level
+from swarmjax.task import stage as task_stage
+
+HARD = ("crowd", "crowd_dense", "dense", "narrow")
+ROOM = ["sim.max_robots=10", "sim.max_obstacles=8"]
+
+# --- arms
+
+
+def test_words_of_the_study_are_told_from_those_of_training() -> None:
+    words = ["arms=final,mixed", "seeds=4", "goal=crowd", "points=3", "curriculum.threshold=0.9"]
+    study, rest = curriculum_arms.parse(words)
+    assert study == StudyConfig(arms=("final", "mixed"), goal="crowd", points=3)
+    assert rest == ["seeds=4", "curriculum.threshold=0.9"]
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["stage=s6"], "stage cannot be given: choose it by goal"),
+        (["curriculum.mode=mixed"], "curriculum.mode cannot be given: choose it by arms"),
+        (["arms=final,none"], "arms is 'none': give final, sequential"),
+        (["points=1"], "points is 1"),
+        (["label=x"], "label is x, but arms has 4"),
+    ],
+)
+def test_unsound_words_are_refused(words: list[str], expected: str) -> None:
+    assert expected in refusal(curriculum_arms.parse, words)
+
+
+@pytest.mark.parametrize(
+    ("arm", "mode", "stages"),
+    [
+        ("final", "sequential", ["s6"]),
+        ("sequential", "sequential", ["s1", "s2", "s3", "s4", "s5", "s6"]),
+        ("mixed", "mixed", ["s1", "s2", "s3", "s4", "s5", "s6"]),
+        ("adaptive", "adaptive", ["s1", "s2", "s3", "s4", "s5", "s6"]),
+    ],
+)
+def test_arms_differ_in_mode_and_stages_alone(arm: str, mode: str, stages: list[str]) -> None:
+    made = curriculum_arms.load_arm(StudyConfig(), arm, "independent", ["arenas=16", "budget=1e6"])
+    assert made.curriculum.mode == mode
+    assert [stage.name for stage in made.stage] == stages
+    same = replace(
+        made, stage=made.stage[-1:], curriculum=config.CurriculumConfig(), stage_name="s6"
+    )
+    assert same == config.load_train(
+        ["stage=s6", "seeds=10", "arenas=16", "budget=1e6", "algo.policy=independent"]
+    )
+
+
+def test_the_grid_ends_in_the_goal() -> None:
+    last = curriculum_arms.load_arm(StudyConfig(), "adaptive-grid", "shared", []).stage[-1]
+    (goal,) = config.load_train(["stage=s6"]).stage
+    assert replace(last, name="s6") == goal
+
+
+@pytest.mark.parametrize("goal", HARD)
+def test_a_hard_goal_ends_its_own_curriculum(goal: str) -> None:
+    study = StudyConfig(goal=goal)
+    (alone,) = curriculum_arms.load_arm(study, "final", "shared", ROOM).stage
+    stages = curriculum_arms.load_arm(study, "mixed", "shared", ROOM).stage
+    assert stages[-1] == alone
+    assert max(side for stage in stages for side in stage.sides) <= 1.2  # 1.5 m is held out
+    for key in ("robots", "obstacles"):
+        numbers = [getattr(stage, key) for stage in stages]
+        assert numbers == sorted(numbers)  # the easiest first
+
+
+@pytest.mark.parametrize("name", [*HARD, "crowd7", "dense5", "narrow2"])
+def test_levels_of_hard_stages_leave_nothing_out(name: str) -> None:
+    (stage,) = config.load_train([*ROOM, f"stage={name}"]).stage
+    one = task_stage.select(task_stage.stack([stage]), np.intp(0))
+    spacing = level.Spacing(stage.robots, stage.obstacles, 0.037, 0.05)
+    random = np.random.default_rng(0)
+    for _ in range(30):
+        uniforms = random.random(level.uniform_count(spacing), dtype=np.float32)
+        drawn = level.sample(uniforms, one, spacing, np)
+        assert drawn.present.all()
+        assert drawn.obstacle_present.all()
+        assert np.abs(drawn.obstacle[:, :2]).max() < 0.6  # none is parked
+
+
+def test_points_are_even_in_the_logarithm() -> None:
+    # 16 arenas of 32 steps make updates of 512; 1e5 of these are 195.3 of them, 1e6 are 1953.1.
+    trained = config.load_train(["arenas=16", "budget=1e6"])
+    found = curriculum_arms.points(StudyConfig(points=3, first=100_000), trained)
+    # The middle one: sqrt(195 * 1953) = 617.1.
+    np.testing.assert_array_equal(found, [195, 617, 1953])
+    few = curriculum_arms.points(StudyConfig(points=9, first=1), replace(trained, budget=512 * 4))
+    np.testing.assert_array_equal(few, [1, 2, 3, 4])  # nine of them fall on four updates
+    sentence = refusal(curriculum_arms.points, StudyConfig(first=10**6), trained)
+    assert "give less than 999936" in sentence  # 1953 * 512
+
+
+def test_the_held_out_arena_is_for_swarms_of_its_size() -> None:
+    five = config.load_train(["stage=s6"])
+    found = curriculum_arms.roles(StudyConfig(), five, [])
+    names = {role: (stage.name, stage.sides) for role, stage in found.items()}
+    assert names == {
+        "goal": ("s6", (1.2, 1.2)),
+        "first": ("s1", (0.5, 0.5)),
+        "held_out": ("expanded", (1.5, 1.5)),
+    }
+    ten = config.load_train([*ROOM, "stage=crowd"])
+    assert curriculum_arms.roles(StudyConfig(goal="crowd"), ten, ROOM).keys() == {"goal", "first"}
+
+
+# --- measuring
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_config: TrainConfig) -> TrainConfig:
+    return replace(tiny_config, seeds=3, budget=8 * 8 * 6)
+
+
+def _count(learners: LearnerState) -> dict[str, dict[str, np.ndarray]]:
+    """Instead of a judge: how many transitions each policy's normaliser has seen."""
+    return {"goal": {"targets_reached": np.asarray(learners.normalizer.count[:, 0])}}
+
+
+def test_an_arm_is_judged_at_its_points(trained: TrainConfig) -> None:
+    at = np.array([1, 2, 5])
+    curves = curriculum.measure(trained, at, _count)
+    seen = np.array(curves.judged["goal"]["targets_reached"])
+    np.testing.assert_array_equal(seen, curves.transitions)
+    assert (seen[:, 0] > 0).all()
+    # 8 arenas of two robots or three for 8 control steps; those that arrive early add fewer.
+    assert (np.diff(seen, prepend=0) <= 8 * 3 * 8 * np.diff(at, prepend=0)).all()
+    assert np.array(curves.stage).shape == (3, 3)
+    np.testing.assert_allclose(np.sum(curves.mix, axis=1), 1.0, atol=3e-4)  # rounded to 1e-4
+    assert (np.diff(curves.train_s, prepend=0.0) > 0).all()
+    assert curves.broken_arenas == 0
+
+
+def test_the_judge_gives_means_by_seed_and_stage(trained: TrainConfig) -> None:
+    judged = {"goal": trained.stage[1], "first": trained.stage[0]}
+    study = StudyConfig(levels=4, level_seed=5)
+    keys = jax.random.split(jax.random.key(0), (2, 1))
+    start = jax.vmap(jax.vmap(lambda key: ppo.init(key, trained.algo, 10, 2, 1)))
+    learners = start(keys)
+    # Untrained policies hardly move: these drive ahead, at two speeds.
+    learners.params["actor"]["mean"]["bias"] += np.array([[[1.0, 0.0]], [[0.5, 0.3]]], np.float32)
+    found = curriculum.load_judge(study, trained, judged)(learners)
+    world = env.load(replace(trained, arenas=4, algo=replace(trained.algo, minibatches=1)))
+    alone = jax.jit(partial(evaluate_mjx.outcomes, world, steps=trained.task.step_limit))
+    for role, stage in judged.items():
+        levels = evaluate_mjx.draw_levels(world, stage, 5, 4)
+        for seed in range(2):
+            outcome = alone(jax.tree.map(lambda x, i=seed: x[i], learners), levels)
+            for name, values in outcome._asdict().items():
+                # Batched matrix products round differently.
+                expected = np.asarray(values).mean()
+                np.testing.assert_allclose(found[role][name][seed], expected, atol=1e-5)
+    assert found["first"]["contacts_per_robot"].max() > 0.0
+
+
+# --- tables
+
+STEPS = [10_000, 100_000, 1_000_000]
+GOAL = [[0.2, 0.6, 1.0], [0.2, 0.4, 0.8], [0.0, 0.2, 0.6], [0.4, 0.8, 0.9]]
+FIRST = [[0.9, 1.0, 0.7], [0.9, 0.8, 1.0], [1.0, 0.9, 0.9], [0.5, 0.6, 0.5]]
+KEY = Key(goal="s6", policy="shared", arenas=16, budget=1_000_000)
+
+
+def _line(arm: str, goal: list = GOAL, **rest: Any) -> dict[str, Any]:
+    return {
+        "benchmark": "curriculum",
+        "arm": arm,
+        **KEY._asdict(),
+        "arena_steps": STEPS,
+        "levels": 4,
+        "level_seed": 2,
+        "steps": 500,
+        "robot": "planar",
+        "realism": "ideal",
+        "roles": {"goal": "s6", "first": "s1"},
+        "judged": {
+            "goal": {"targets_reached": goal, "all_reached": FIRST},
+            "first": {"targets_reached": FIRST, "all_reached": goal},
+        },
+        **rest,
+    }
+
+
+def test_figures_by_hand() -> None:
+    found = curriculum_table.figures(_line("mixed"), "targets_reached")
+    np.testing.assert_allclose(found.goal, [1.0, 0.8, 0.6, 0.9])
+    assert found.held_out is None
+    # Straight between the points: the first seed is half-way from 0.6 to 1 at 550,000 steps.
+    np.testing.assert_allclose(found.steps[0.8], [550_000, 1_000_000, np.inf, 100_000])
+    # And three quarters of the way at 775,000.
+    np.testing.assert_allclose(found.steps[0.9], [775_000, np.inf, np.inf, 1_000_000])
+    # Trapezoids of 90,000 and 900,000 steps: their shares of the span are 1/11 and 10/11.
+    np.testing.assert_allclose(found.area[0], (0.4 + 10 * 0.8) / 11)
+    # Of one decade each.
+    np.testing.assert_allclose(found.log_area, [0.6, 0.45, 0.25, 0.725])
+    np.testing.assert_allclose(found.forgotten, [0.3, 0.0, 0.1, 0.1])
+    other = curriculum_table.figures(_line("mixed"), "all_reached")
+    np.testing.assert_allclose(other.goal, [0.7, 1.0, 0.9, 0.5])
+
+
+def test_table_by_hand() -> None:
+    # Every seed of the better arm ends higher than any of the baseline, and learns sooner.
+    better = [[0.9, 1.0, 1.0]] * 4
+    worse = [[0.0, 0.1, 0.5]] * 4
+    arms = curriculum_table.tables([_line("mixed", better), _line("final", worse)])
+    assert list(arms) == [KEY]
+    text = curriculum_table.table(KEY, arms[KEY], "targets_reached").splitlines()
+    assert text[0] == "### s6, shared, 16 arenas, 1,000,000 arena steps: targets reached"
+    assert text[2].startswith("| arm | goal | 1.5 m | to 0.8 | to 0.9 | area |")
+    baseline, mixed = ([cell.strip() for cell in row.split("|")[1:-1]] for row in text[4:])
+    # Equal seeds leave no interval. Area by steps: (0.05 + 10 * 0.3) / 11 and (0.95 + 10) / 11.
+    never, soon = "never (never to never)", "10,000 (10,000 to 10,000)"
+    assert baseline[:5] == ["final", "0.500 (0.500 to 0.500)", "-", never, never]
+    assert baseline[5].startswith("0.277")
+    assert mixed[:5] == ["mixed", "1.000 (1.000 to 1.000)", "-", soon, soon]
+    assert mixed[5].startswith("0.995")
+    assert mixed[7].startswith("0.100")  # of 0.3, 0, 0.1 and 0.1 the middle two
+    assert baseline[8:] == ["-", "-"]
+    assert mixed[8:] == ["1.00 (1.00 to 1.00)"] * 2
+
+
+def test_lines_that_do_not_compare_are_refused() -> None:
+    twice = refusal(curriculum_table.tables, [_line("mixed"), _line("mixed")])
+    assert "arm mixed of s6, shared" in twice
+    others = refusal(curriculum_table.tables, [_line("final"), _line("mixed", levels=5)])
+    assert "final and mixed" in others
+    assert "levels" in others
+    apart = [_line("final"), _line("final", budget=5)]
+    assert len(curriculum_table.tables(apart)) == 2
+
+
+def test_curves_are_drawn_as_interquartile_means() -> None:
+    axes = Figure().subplots()
+    curriculum_table._draw_curves(axes, {"mixed": _line("mixed")}, "goal", "targets_reached")
+    (drawn,) = axes.get_lines()
+    np.testing.assert_array_equal(drawn.get_xdata(), STEPS)
+    # The middle two of each point: 0.2 and 0.2, 0.4 and 0.6, 0.8 and 0.9.
+    np.testing.assert_allclose(np.asarray(drawn.get_ydata(), float), [0.2, 0.5, 0.85])
+    assert axes.get_xscale() == "log"
+
+
+def test_the_command_reads_files_and_draws(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "lines.jsonl"
+    path.write_text("".join(json.dumps(_line(arm)) + "\n" for arm in ("final", "mixed")))
+    assert curriculum_table.main([str(path), f"out={tmp_path / 'figures'}"]) == 0
+    assert capsys.readouterr().out.count("\n| ") == 4
+    drawn = tmp_path / "figures" / "s6-shared-16-1000000-targets_reached.png"
+    assert drawn.read_bytes()[:4] == b"\x89PNG"
+    path.write_text('{"benchmark": "other"}\n')
+    assert "holds other lines" in refusal(curriculum_table.main, [str(path)])
+    assert "cannot be read" in refusal(curriculum_table.main, [str(tmp_path / "none.jsonl")])
+    assert "there is no file" in refusal(curriculum_table.main, [])
+    assert "measure is 'time'" in refusal(curriculum_table.main, [str(path), "measure=time"])

@@ -1,0 +1,157 @@
+"""What a promotion leaves of the learners, leaf by leaf."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from swarmjax import promotion
+from swarmjax.config import AlgoConfig, CurriculumConfig, TrainConfig
+from swarmjax.ppo import learner as ppo
+from swarmjax.ppo import normalizer
+from swarmjax.ppo.learner import Batch, LearnerState
+
+LEARNERS, OBSERVED = 5, 3
+ALGO = AlgoConfig(
+    hidden=(4,), policy="independent", epochs=2, minibatches=1, initial_std=0.5, rollout=8
+)
+
+
+@pytest.fixture(scope="module")
+def config(tiny_config: TrainConfig) -> TrainConfig:
+    return replace(tiny_config, algo=ALGO, sim=replace(tiny_config.sim, max_robots=LEARNERS))
+
+
+@pytest.fixture(scope="module")
+def learners(config: TrainConfig) -> LearnerState:
+    """Five learners that have learned something, each something else."""
+    updates = config.updates
+    keys = jax.random.split(jax.random.key(0), LEARNERS)
+    start = jax.vmap(lambda key: ppo.init(key, ALGO, OBSERVED, 2, updates))(keys)
+    draw = iter(jax.random.split(jax.random.key(1), 6))
+
+    def numbers(*shape: int) -> jax.Array:
+        return jax.random.normal(next(draw), (LEARNERS, 4, 8, *shape))
+
+    batch = Batch(
+        observation=numbers(OBSERVED),
+        action=numbers(2),
+        log_prob=numbers(),
+        advantage=numbers(),
+        return_=numbers(),
+        valid=jnp.ones((LEARNERS, 4, 8), bool),
+    )
+    learn = jax.jit(jax.vmap(lambda state, b, key: ppo.update(state, ALGO, b, key, updates)))
+    return learn(start, batch, keys)[0]
+
+
+def _promote(
+    learners: LearnerState,
+    config: TrainConfig,
+    before: int = 2,
+    after: int = 2,
+    promoted: bool = True,
+    **options: Any,
+) -> LearnerState:
+    chosen = replace(config, curriculum=CurriculumConfig(**options))
+    return promotion.carry_over(
+        learners, chosen, jnp.int32(before), jnp.int32(after), jnp.array(promoted)
+    )
+
+
+def _assert_same(found: Any, expected: Any) -> None:
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+
+
+RESET = {"optimizer": "reset", "normalizer": "relearn", "exploration": "reset"}
+
+
+def test_newcomers_take_over_in_turn(config: TrainConfig, learners: LearnerState) -> None:
+    found = _promote(learners, config, before=2, after=5)
+    # Robots 0 and 1 trained; 2, 3 and 4 copy 0, 1 and 0: parameters, optimiser, normaliser.
+    _assert_same(found, jax.tree.map(lambda x: x[np.array([0, 1, 0, 1, 0])], learners))
+    kernel = np.asarray(found.params["actor"]["mean"]["kernel"])
+    assert not np.array_equal(kernel[0], kernel[1])
+
+
+def test_only_those_come_that_the_swarm_grows_by(
+    config: TrainConfig, learners: LearnerState
+) -> None:
+    found = _promote(learners, config, before=3, after=4)
+    _assert_same(found, jax.tree.map(lambda x: x[np.array([0, 1, 2, 0, 4])], learners))
+    _assert_same(_promote(learners, config, before=3, after=3), learners)
+
+
+def test_fresh_newcomers_stay_as_they_are(config: TrainConfig, learners: LearnerState) -> None:
+    found = _promote(learners, config, before=2, after=5, newcomers="fresh")
+    assert found is learners
+
+
+def test_what_is_kept_costs_nothing(config: TrainConfig, learners: LearnerState) -> None:
+    shared = replace(config, algo=replace(ALGO, policy="shared"))
+    one = jax.tree.map(lambda x: x[:1], learners)
+    assert _promote(one, shared, before=2, after=5) is one
+
+
+def test_nothing_happens_without_a_promotion(config: TrainConfig, learners: LearnerState) -> None:
+    found = _promote(learners, config, before=2, after=5, promoted=False, **RESET)
+    _assert_same(found, learners)
+
+
+def test_optimizer(config: TrainConfig, learners: LearnerState) -> None:
+    found = _promote(learners, config, optimizer="reset")
+    _assert_same((found.params, found.normalizer), (learners.params, learners.normalizer))
+
+    def parts(state: Any, kind: type) -> list[Any]:
+        leaves = jax.tree.leaves(state, is_leaf=lambda part: isinstance(part, kind))
+        return [part for part in leaves if isinstance(part, kind)]
+
+    adams = parts(found.optimizer_state, optax.ScaleByAdamState)
+    assert len(adams) == 2  # of actor and critic
+    for before, after in zip(
+        parts(learners.optimizer_state, optax.ScaleByAdamState), adams, strict=True
+    ):
+        assert all(np.any(leaf) for leaf in jax.tree.leaves(before))
+        assert not any(np.any(leaf) for leaf in jax.tree.leaves(after))
+    rates = parts(found.optimizer_state, optax.ScaleByScheduleState)
+    assert [rate.count.tolist() for rate in rates] == [[2] * LEARNERS] * 2  # gradient steps so far
+
+
+def test_normalizer_forgets_with_the_next_batch(
+    config: TrainConfig, learners: LearnerState
+) -> None:
+    found = _promote(learners, config, normalizer="relearn")
+    _assert_same((found.params, found.optimizer_state), (learners.params, learners.optimizer_state))
+    assert found.normalizer.count.tolist() == [0.0] * LEARNERS
+    _assert_same(found.normalizer.mean, learners.normalizer.mean)
+    _assert_same(found.normalizer.variance, learners.normalizer.variance)
+    seen = np.array([[1.0, 2.0, 30.0], [3.0, 2.0, 10.0]], np.float32)
+    one = jax.tree.map(lambda x: x[0], found.normalizer)
+    after = normalizer.update(one, jnp.asarray(seen), jnp.ones(2, bool))
+    # The batch alone; rounding of float32, of means that were elsewhere before.
+    np.testing.assert_allclose(after.mean, [2.0, 2.0, 20.0], rtol=1e-6)
+    np.testing.assert_allclose(after.variance, [1.0, 0.0, 100.0], rtol=1e-6, atol=1e-6)
+
+
+def test_exploration(config: TrainConfig, learners: LearnerState) -> None:
+    before = learners.params["actor"]["log_std"]
+    assert np.abs(np.exp(before) - 0.5).max() > 1e-4  # it has moved
+    found = _promote(learners, config, exploration="reset")
+    # initial_std of the config; rounding of float32.
+    np.testing.assert_allclose(np.exp(found.params["actor"]["log_std"]), 0.5, rtol=1e-6)
+    kept = found.params["actor"] | {"log_std": before}
+    _assert_same(replace(found, params=found.params | {"actor": kept}), learners)
+
+
+def test_newcomers_are_reset_like_the_others(config: TrainConfig, learners: LearnerState) -> None:
+    found = _promote(learners, config, before=2, after=4, **RESET)
+    kernel = np.asarray(learners.params["critic"]["torso"]["hidden_0"]["kernel"])
+    _assert_same(
+        found.params["critic"]["torso"]["hidden_0"]["kernel"], kernel[np.array([0, 1, 0, 1, 4])]
+    )
+    assert not found.normalizer.count.any()
+    np.testing.assert_allclose(np.exp(found.params["actor"]["log_std"]), 0.5, rtol=1e-6)  # float32

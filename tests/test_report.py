@@ -1,0 +1,85 @@
+"""`swarmjax.report` from its command line."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from runs import row, write
+
+from swarmjax import command, report
+from swarmjax.config import ReportConfig
+
+
+def _run(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["report", *words])
+    return command.run("report", report.main, ReportConfig)
+
+
+def test_a_report_is_written_beside_its_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = write(tmp_path / "a 'run'", [row(0)])
+    assert _run(monkeypatch, f"run={str(run)!r}") == 0
+    out = run / "report"
+    assert {path.name for path in out.iterdir()} == {"mix.png", "success.png", "report.html"}
+    page = (out / "report.html").read_text()
+    assert f"<h1>Report of {tmp_path}/a &#x27;run&#x27;</h1>" in page
+    assert "<code>python -m swarmjax.report &#x27;run=" in page
+    assert str(out / "report.html") in capsys.readouterr().out
+
+
+def test_a_report_is_written_where_it_is_wanted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, out = write(tmp_path / "run", [row(0)]), tmp_path / "deep" / "out"
+    assert _run(monkeypatch, f"run={run}", f"out={out}") == 0
+    assert (out / "report.html").exists()
+    assert not (run / "report").exists()
+    first = (out / "report.html").read_bytes()
+    assert _run(monkeypatch, f"run={run}", f"out={out}") == 0
+    assert (out / "report.html").read_bytes() == first
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (["run=gone"], "gone is no run directory: it has no config.json."),
+        (["run=cut"], "cut/metrics.jsonl in line 2 is cut off or damaged: "),
+        (["run=empty"], "empty/metrics.jsonl has no update of every seed: train it first."),
+        (["run=good", "out=file"], "out is file, which cannot be written: File exists."),
+        ([], "run is missing and has no default: give it."),
+        (["run=good", "step=1"], "step is not a key: give one of run, out."),
+    ],
+)
+def test_errors_are_one_sentence(
+    words: list[str],
+    what: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, rows in (("good", [row(0)]), ("cut", [row(0), row(1)]), ("empty", [])):
+        write(Path(name), rows)
+    text = Path("cut/metrics.jsonl").read_text()
+    Path("cut/metrics.jsonl").write_text(text[:-20])
+    Path("file").write_text("")
+    assert _run(monkeypatch, *words) == 2
+    sentence = capsys.readouterr().err
+    assert sentence.startswith(f"swarmjax.report: error: {what}")
+    assert sentence.count("\n") == 1
+
+
+def test_matplotlib_is_loaded_to_draw_only_and_jax_never(tmp_path: Path) -> None:
+    run = write(tmp_path, [row(0)])
+    code = (
+        "import sys\n"
+        "from swarmjax import display, recorder, report\n"
+        "assert 'matplotlib' not in sys.modules\n"
+        f"report.main(['run={run}'])\n"
+        "assert 'matplotlib' in sys.modules\n"
+        "assert 'jax' not in sys.modules\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,179 @@
+"""The figures of a report: what they show, taken from the artists that draw it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from runs import CONFIG, row, write
+
+from swarmjax import report_figures, report_rows
+from swarmjax.config import StageConfig
+from swarmjax.report_rows import History
+
+BOLD, THIN = "#0b4f9e", "0.62"
+
+
+def _history(run: Path, rows: list[dict], stages: tuple[StageConfig, ...] | None = None) -> History:
+    trained = replace(CONFIG, stage=stages) if stages else CONFIG
+    return report_rows.read(write(run, rows, trained=trained))
+
+
+def _stages(cells: list[tuple[int, int, float]]) -> tuple[StageConfig, ...]:
+    return tuple(
+        StageConfig(name=f"r{r}-o{o}-s{100 * s:.0f}", robots=r, obstacles=o, side=s)
+        for r, o, s in cells
+    )
+
+
+def _wide_row(success: list[float | None], **given: object) -> dict:
+    """A row of as many stages as there are shares of success, arenas spread evenly."""
+    count = len(success)
+    lists = {key: [None] * count for key in row(0) if key.endswith("_by_stage")}
+    even = {"mix": [1] * count, "weights": [1.0 / count] * count}
+    return row(0) | lists | even | {"success_by_stage": success} | given
+
+
+def _lines(panel: Axes, colour: str, style: str) -> list[np.ndarray]:
+    """Curves [points, 2] of one colour and style, undrawn points left out."""
+    found = [line for line in panel.lines if line.get_color() == colour]
+    points = [np.asarray(line.get_xydata()) for line in found if line.get_linestyle() == style]
+    return [each[~np.isnan(each[:, 1])] for each in points]
+
+
+def test_the_mix_is_stacked_as_the_mean_over_seeds(tmp_path: Path) -> None:
+    rows = [
+        *(row(0, seed, mix=[8, 0]) for seed in (0, 1)),
+        row(1, 0, mix=[4, 4]),
+        row(1, 1, mix=[8, 0]),
+    ]
+    figure = report_figures.mix(_history(tmp_path, rows))
+    axes = figure.axes[0]
+    first, second = (band for band in axes.collections if isinstance(band, PolyCollection))
+    low, high = (np.asarray(band.get_paths()[0].vertices) for band in (first, second))
+    # The first update lasts from 0 to 64 arena control steps, the second to 128.
+    assert set(low[low[:, 0] == 64][:, 1]) == {0.0, 1.0, (4 / 8 + 8 / 8) / 2}
+    assert set(low[low[:, 0] == 128][:, 1]) == {0.0, 0.75}
+    assert set(high[high[:, 0] == 128][:, 1]) == {0.75, 1.0}
+    assert axes.get_xlim() == (0, 128)
+    names = [label.get_text() for label in figure.axes[1].get_yticklabels()]
+    assert sorted(names) == ["pair", "trio"]
+
+
+def test_many_updates_are_averaged_and_none_is_left_out(tmp_path: Path) -> None:
+    # Every tenth update is on the other stage: ten times as many updates as bands have points.
+    rows = [row(i, mix=[0, 8] if i % 10 == 3 else [8, 0]) for i in range(2000)]
+    figure = report_figures.mix(_history(tmp_path, rows))
+    band = figure.axes[0].collections[1]
+    heights = np.asarray(band.get_paths()[0].vertices)[:, 1]
+    # 199 stretches of 9 to 11 updates hold one or two of them, or none.
+    assert heights.min() > 1.0 - 2.5 / 9
+    assert (heights < 1.0).mean() > 0.4  # half of the outline is the lower edge
+
+
+def test_names_on_the_strip_are_thinned_from_the_last(tmp_path: Path) -> None:
+    stages = _stages([(2, 0, 0.5 + 0.01 * i) for i in range(48)])
+    figure = report_figures.mix(_history(tmp_path, [_wide_row([None] * 48)], stages))
+    names = [label.get_text() for label in figure.axes[1].get_yticklabels()]
+    assert names == [stage.name for stage in stages][::-2]
+
+
+def test_success_has_every_seed_and_their_interquartile_mean(tmp_path: Path) -> None:
+    shares = [0.1, 0.2, 0.4, 0.9]
+    rows = [row(0, seed, success_by_stage=[share, None]) for seed, share in enumerate(shares)]
+    rows += [row(1, seed, success_by_stage=[0.5, 0.25 if seed else None]) for seed in range(4)]
+    figure = report_figures.success(_history(tmp_path, rows))
+    pair, trio = figure.axes
+    [bold] = _lines(pair, BOLD, "-")
+    # The middle two of four; float32 in the rows.
+    assert bold == pytest.approx(np.array([[64, 0.3], [128, 0.5]]), rel=1e-6)
+    assert [line[0, 1] for line in _lines(pair, THIN, "-")] == pytest.approx(shares, rel=1e-6)
+    assert pair.get_title(loc="left") == "pair   50 %"
+    # The second stage has no arenas: what is known of it is dotted; and one seed knows nothing.
+    assert [len(line) for line in _lines(trio, BOLD, ":")] == [0]
+    assert [len(line) for line in _lines(trio, THIN, ":")] == [0, 1, 1, 1]
+    assert trio.get_title(loc="left") == "trio   25 %"
+
+
+def test_what_a_stage_was_left_with_is_dotted(tmp_path: Path) -> None:
+    rows = [
+        row(i, weights=[float(i == 0), float(i > 0)], success_by_stage=[0.5, None])
+        for i in range(10)
+    ]
+    pair, trio = report_figures.success(_history(tmp_path, rows)).axes
+    # Two cohorts of two updates after update 0, at which it last had arenas.
+    [[*lately]], [[*left]] = _lines(pair, BOLD, "-"), _lines(pair, BOLD, ":")
+    assert [x for x, _ in lately] == [64 * (i + 1) for i in range(5)]
+    assert [x for x, _ in left] == [64 * (i + 1) for i in range(5, 10)]
+    assert trio.get_title(loc="left") == "trio   not measured"
+
+
+@pytest.mark.parametrize(("stages", "promotes"), [(2, True), (1, False)])
+def test_the_share_that_promotes_is_drawn_where_something_does(
+    stages: int, promotes: bool, tmp_path: Path
+) -> None:
+    history = _history(tmp_path, [_wide_row([0.5] * stages)], CONFIG.stage[:stages])
+    figure = report_figures.success(history)
+    drawn = [line for line in figure.axes[0].lines if line.get_linestyle() == "--"]
+    assert [np.asarray(line.get_ydata()).tolist() for line in drawn] == [[0.8, 0.8]] * promotes
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["seed 0"] + ["promotes"] * promotes
+
+
+def test_a_panel_for_each_of_many_stages(tmp_path: Path) -> None:
+    stages = _stages([(2, 0, 0.5 + 0.01 * i) for i in range(34)])
+    figure = report_figures.success(_history(tmp_path, [_wide_row([0.5] * 34)], stages))
+    shown = [panel for panel in figure.axes if panel.get_visible()]
+    titles = [panel.get_title(loc="left").split()[0] for panel in shown]
+    assert titles == [stage.name for stage in stages]
+    # 8 to a row: below the last ones of a row that is not full stand the steps as well.
+    labelled = [panel.xaxis.get_tick_params()["labelbottom"] for panel in shown]
+    assert labelled == [False] * 26 + [True] * 8
+
+
+CELLS = [(2, 0, 0.5), (2, 0, 1.0), (3, 0, 1.0), (2, 2, 1.0), (3, 2, 1.0)]
+
+
+def test_a_grid_shows_the_last_success_of_each_cell(tmp_path: Path) -> None:
+    wide = _wide_row([0.1, 0.2, None, 0.4, 0.5])
+    figure = report_figures.grid(_history(tmp_path, [wide], _stages(CELLS)))
+    assert figure is not None
+    none, two, _ = figure.axes
+    assert (none.get_title(), two.get_title()) == ("0 obstacles", "2 obstacles")
+    # Rows are 2 and 3 robots, columns 0.5 and 1 m.
+    assert [text.get_text() for text in none.texts] == ["10", "20", "", "-"]
+    assert [text.get_text() for text in two.texts] == ["", "40", "", "50"]
+    expected = np.ma.masked_invalid([[np.nan, 0.4], [np.nan, 0.5]]).astype(np.float32)
+    np.testing.assert_array_equal(two.images[0].get_array(), expected)
+    assert [label.get_text() for label in none.get_xticklabels()] == ["0.5", "1"]
+    assert [label.get_text() for label in none.get_yticklabels()] == ["2", "3"]
+
+
+@pytest.mark.parametrize(
+    ("cells", "is_grid"),
+    [
+        (CELLS, True),  # 5 of 2 x 2 x 2
+        ([(2, 0, 0.5), (3, 0, 0.7), (2, 2, 1.0)], False),  # 3 of 2 x 2 x 3
+        ([(2, 0, 0.5), (2, 0, 0.7), (2, 0, 1.0)], False),  # a row
+        ([(5, 3, 1.2)], False),
+    ],
+)
+def test_a_grid_is_told_by_its_cells(cells: list[tuple[int, int, float]], is_grid: bool) -> None:
+    found = report_figures.cells_of(_stages(cells))
+    assert found == ({(r, o, (s, s)): i for i, (r, o, s) in enumerate(cells)} if is_grid else None)
+
+
+def test_stages_that_share_a_cell_make_no_grid() -> None:
+    stages = _stages(CELLS)
+    assert report_figures.cells_of((*stages, replace(stages[0], name="again"))) is None
+
+
+def test_files_are_png_and_the_same_again(tmp_path: Path) -> None:
+    history = _history(tmp_path, [_wide_row([0.1, 0.2, None, 0.4, 0.5])], _stages(CELLS))
+    files = report_figures.draw(history)
+    assert list(files) == ["mix", "success", "grid"]
+    assert all(content.startswith(b"\x89PNG\r\n") for content in files.values())
+    assert not any(b"Matplotlib" in content for content in files.values())
+    assert report_figures.draw(history) == files

@@ -1,0 +1,170 @@
+"""The page of a report: read as a browser would, it says what the run came to."""
+
+import base64
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+from runs import row, write
+
+from swarmjax import report_page, report_rows
+from swarmjax.report_rows import History
+
+FIGURES = {"mix": b"\x89PNG-mix", "success": b"\x89PNG-success"}
+
+
+class Page(HTMLParser):
+    """Tags with their attributes, and the texts of table cells and facts."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.rows: list[list[str]] = []
+        self.words: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag == "tr":
+            self.rows.append([])
+        elif tag in ("td", "th"):
+            self.rows[-1].append("")
+
+    def handle_data(self, data: str) -> None:
+        tag = self.tags[-1][0] if self.tags else ""
+        if tag in ("td", "th"):
+            self.rows[-1][-1] += data.strip()
+        elif data.strip():
+            self.words.append(data.strip())
+
+    def fact(self, name: str) -> str:
+        """What stands beside a name in the summary."""
+        return self.words[self.words.index(name) + 1]
+
+
+def _history(run: Path, rows: list[dict], decisions: list[dict] | None = None) -> History:
+    return report_rows.read(write(run, rows, decisions))
+
+
+def _page(history: History, title: str = "a run", command: str = "make it") -> Page:
+    return Page(report_page.page(title, command, history, FIGURES))
+
+
+def test_the_summary_says_where_the_run_stands(tmp_path: Path) -> None:
+    shares = [(0.95, 0.5), (0.85, 0.625), (0.93, None)]
+    rows = [row(3, seed, success_by_stage=list(two)) for seed, two in enumerate(shares)]
+    decisions = [{"seed": 0, "update": 1, "why": why} for why in ("budget", "budget", "threshold")]
+    page = _page(_history(tmp_path, rows, decisions))
+    assert page.fact("stages") == "2: pair to trio"
+    assert page.fact("seeds") == "0 to 2"
+    # 20 updates of 64 steps in all; 30 s an update.
+    assert page.fact("trained") == (
+        "4 of 20 updates, 256 arena control steps of a seed, 8 arenas, 2.0 minutes"
+    )
+    # Three values or fewer are not trimmed: the mean of 0.5 and 0.625 is 0.5625.
+    assert page.fact("last stage") == (
+        "trio: targets reached 56.2 % (interquartile mean of 2 of 3 seeds, 50.0 % to 62.5 %)"
+    )
+    # The first stage has 0.91 on average.
+    assert page.fact("all stages") == "1 of 2 at 90.0 % or more; lowest trio with 56.2 %"
+    assert page.fact("decisions") == "2 by budget, 1 by threshold"
+    assert page.fact("computed by") == "not written down before the end of the run"
+    assert "threshold=0.8" in page.fact("curriculum")
+    assert page.fact("made by") == "make it"
+
+
+def test_a_run_that_measured_nothing_has_a_page(tmp_path: Path) -> None:
+    history = replace(_history(tmp_path, [row(0)]), seconds=None)
+    page = _page(history)
+    assert page.fact("last stage") == "trio: not measured yet"
+    assert page.fact("all stages") == "0 of 2 at 90.0 % or more"
+    assert page.fact("decisions") == "none"
+    assert page.fact("Decisions of the curriculum") == "None."
+    assert "minutes" not in page.fact("trained")
+    assert ["pair", "2", "0", "0.5", "100.0 %", "-", "-", "-", "-", "0 of 1"] in page.rows
+
+
+def test_a_single_seed_has_no_range(tmp_path: Path) -> None:
+    page = _page(_history(tmp_path, [row(0, 4, success_by_stage=[None, 0.5])]))
+    assert page.fact("last stage") == "trio: targets reached 50.0 %"
+    assert page.fact("seeds") == "4"
+    assert page.fact("all stages").endswith("lowest trio with 50.0 %; 1 not measured")
+
+
+def test_where_it_was_computed_is_taken_from_the_summary(tmp_path: Path) -> None:
+    write(tmp_path, [row(0)])
+    (tmp_path / "summary.json").write_text('{"device": "a chip", "commit": null}')
+    assert _page(report_rows.read(tmp_path)).fact("computed by") == "a chip, commit unknown"
+
+
+def test_promotions_are_tabled_and_reweighings_summed_up(tmp_path: Path) -> None:
+    moved = {
+        "from": "pair",
+        "to": "trio",
+        "why": "threshold",
+        "targets_reached": 0.875,
+        "all_reached": 0.75,
+    }
+    weights = {f"n{i}": i / 100 for i in range(10)} | {"none": None}
+    decisions = [
+        {"seed": 1, "update": 3, **moved},
+        {"seed": 0, "update": 5, "from": "trio", "to": "pair", "why": "demotion"},
+        {"seed": 0, "update": 7, "why": "reweighed", "weights": {"n0": 1.0}},
+        {"seed": 0, "update": 9, "why": "reweighed", "weights": weights},
+    ]
+    rows = _page(_history(tmp_path, [row(0)], decisions)).rows
+    # 64 arena control steps an update.
+    assert ["1", "4", "256", "pair", "trio", "threshold", "87.5 %", "75.0 %"] in rows
+    assert ["0", "6", "384", "trio", "pair", "demotion", "-", "-"] in rows
+    assert ["0", "2", "10", "n9 9.0 %, n8 8.0 %, n7 7.0 %, n6 6.0 %, n5 5.0 %"] in rows
+
+
+def test_stages_are_tabled_with_their_last_figures(tmp_path: Path) -> None:
+    last = {
+        "success_by_stage": [0.75, 0.5],
+        "complete_by_stage": [0.5, 0.25],
+        "contacts_by_stage": [1.25, None],
+        "return_by_stage": [-0.5, 2.0],
+    }
+    rows = [row(0, mix=[8, 0]), row(1, mix=[6, 2], **last)]
+    found = _page(_history(tmp_path, rows)).rows
+    # 14 of 16 arenas were on the first stage.
+    assert [
+        "pair",
+        "2",
+        "0",
+        "0.5",
+        "87.5 %",
+        "75.0 %",
+        "50.0 %",
+        "1.25",
+        "-0.5",
+        "1 of 1",
+    ] in found
+    assert ["trio", "3", "2", "0.8", "12.5 %", "50.0 %", "25.0 %", "-", "2", "1 of 1"] in found
+
+
+def test_what_comes_from_outside_is_escaped(tmp_path: Path) -> None:
+    evil = "<script>alert('&')</script>"
+    decisions = [
+        {"seed": 0, "update": 1, "from": evil, "to": evil, "why": evil},
+        {"seed": 0, "update": 2, "why": evil, "weights": {evil: 1.0}},
+    ]
+    write(tmp_path, [row(0)], decisions)
+    (tmp_path / "summary.json").write_text(f'{{"device": "{evil}", "commit": "{evil}"}}')
+    page = _page(report_rows.read(tmp_path), title=evil, command=evil)
+    assert {tag for tag, _ in page.tags}.isdisjoint({"script", "link"})
+    assert ["0", "2", "128", evil, evil, evil, "-", "-"] in page.rows
+    assert page.fact("made by") == evil
+    assert evil in page.words  # the title
+
+
+def test_the_page_needs_nothing_else(tmp_path: Path) -> None:
+    history = _history(tmp_path, [row(0)])
+    text = report_page.page("a run", "make it", history, FIGURES)
+    sources = [attributes.get("src") for tag, attributes in Page(text).tags if tag == "img"]
+    start = "data:image/png;base64,"
+    found = [base64.b64decode((source or "").removeprefix(start)) for source in sources]
+    assert found == list(FIGURES.values())
+    assert not re.search(r"https?:|url\(|@import", text)

@@ -1,0 +1,153 @@
+"""What a report reads of a run."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from runs import CONFIG, row, write
+from sentences import refusal
+
+from swarmjax import report_rows
+from swarmjax.config import CurriculumConfig
+
+NAN = np.nan
+
+
+def test_rows_become_arrays_by_seed_and_update(tmp_path: Path) -> None:
+    rows = [
+        row(0, 8, mix=[8, 0]),
+        row(0, 7, mix=[6, 2], success_by_stage=[0.5, None]),
+        row(1, 7, mix=[2, 6], weights=[0.25, 0.75], success_by_stage=[0.75, 0.125]),
+        row(1, 8, mix=[0, 8], contacts_by_stage=[2.0, None], complete_by_stage=[None, 0.25]),
+    ]
+    history = report_rows.read(write(tmp_path, rows))
+    assert history.names == ["pair", "trio"]
+    assert history.seeds.tolist() == [7, 8]
+    assert history.updates.tolist() == [0, 1]
+    assert history.arena_steps.tolist() == [64, 128]
+    assert history.seconds == 60.0
+    expected = [[[0.75, 0.25], [0.25, 0.75]], [[1.0, 0.0], [0.0, 1.0]]]
+    np.testing.assert_array_equal(history.mix, expected)
+    np.testing.assert_array_equal(history.weights[0], [[1.0, 0.0], [0.25, 0.75]])
+    expected = [[[0.5, NAN], [0.75, 0.125]], [[NAN, NAN], [NAN, NAN]]]
+    np.testing.assert_array_equal(history.success, expected)
+    np.testing.assert_array_equal(history.by_stage["contacts_by_stage"][1, 1], [2.0, NAN])
+
+
+def test_success_is_what_the_curriculum_decides_by(tmp_path: Path) -> None:
+    rows = [row(0, success_by_stage=[0.9, None], complete_by_stage=[0.7, None])]
+    by_all = replace(CONFIG, curriculum=CurriculumConfig(success="all"))
+    history = report_rows.read(write(tmp_path, rows, trained=by_all))
+    assert history.success[0, 0, 0] == np.float32(0.7)
+    assert report_rows.measure(history) == "episodes in which all arrived"
+
+
+def test_updates_that_a_seed_lacks_are_left_out(tmp_path: Path) -> None:
+    rows = [row(0, 0), row(1, 0), row(0, 1), row(1, 1), row(2, 0)]  # stopped between two lines
+    history = report_rows.read(write(tmp_path, rows))
+    assert history.updates.tolist() == [0, 1]
+    assert history.mix.shape == (2, 2, 2)
+
+
+def test_all_null_is_no_measurement_and_no_share(tmp_path: Path) -> None:
+    history = report_rows.read(write(tmp_path, [row(0, mix=[None, None], weights=[None, None])]))
+    assert np.isnan(history.success).all()
+    assert not history.mix.any()
+    assert not report_rows.trained_lately(history).any()
+
+
+def test_decisions_are_in_the_order_of_seeds_and_updates(tmp_path: Path) -> None:
+    found = [{"seed": seed, "update": update} for seed, update in ((1, 0), (0, 5), (0, 2))]
+    history = report_rows.read(write(tmp_path, [row(0)], found))
+    order = [(entry["seed"], entry["update"]) for entry in history.decisions]
+    assert order == [(0, 2), (0, 5), (1, 0)]
+
+
+def test_a_verdict_is_of_the_networks_as_they_are_for_two_cohorts(tmp_path: Path) -> None:
+    # A cohort is two updates, and the first stage loses its arenas after update 1.
+    rows = [row(i, weights=[1.0, 0.0] if i <= 1 else [0.0, 1.0]) for i in range(8)]
+    lately = report_rows.trained_lately(report_rows.read(write(tmp_path, rows)))
+    assert lately[0, :, 0].tolist() == [True] * 6 + [False] * 2  # 1 + 4 is the last
+    assert lately[0, :, 1].tolist() == [False] * 2 + [True] * 6
+
+
+def test_seeds_are_put_together_where_all_have_a_value() -> None:
+    # Of four values the middle two: (2 + 3) / 2; a mean would be 27.5.
+    values = np.array([[1.0, 1.0], [2.0, NAN], [3.0, 1.0], [104.0, 1.0]])
+    np.testing.assert_array_equal(report_rows.together(values), [2.5, NAN])
+
+
+def test_seeds_without_a_value_are_left_out_and_counted() -> None:
+    values = np.array([[1.0, NAN, NAN], [2.0, 0.5, NAN], [3.0, 0.25, NAN], [104.0, NAN, NAN]])
+    mean, measured = report_rows.among(values)
+    np.testing.assert_array_equal(mean, [2.5, 0.375, NAN])
+    assert measured.tolist() == [4, 2, 0]
+
+
+def test_sides_are_written_as_points_and_ranges() -> None:
+    assert report_rows.side_text(1.0) == "1"
+    assert report_rows.side_text((0.5, 1.25)) == "0.5 to 1.25"
+    assert report_rows.span(0.7) == (0.7, 0.7)
+
+
+@pytest.mark.parametrize(
+    ("file", "what"),
+    [
+        ("config.json", "{run} is no run directory: it has no config.json."),
+        ("metrics.jsonl", "{run} has no metrics.jsonl: it holds no training yet."),
+        ("curriculum.jsonl", "{run} has no curriculum.jsonl: it holds no training yet."),
+    ],
+)
+def test_a_file_that_is_not_there_is_named(file: str, what: str, tmp_path: Path) -> None:
+    write(tmp_path, [row(0)])
+    (tmp_path / file).unlink()
+    assert refusal(report_rows.read, tmp_path) == what.format(run=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "what"),
+    [
+        ("metrics.jsonl", "", " has no update of every seed: train it first."),
+        ("metrics.jsonl", '{"seed": 0, "upd', " in line 1 is cut off or damaged: "),
+        ("metrics.jsonl", "[]\n", " in line 1 is cut off or damaged: "),
+        ("metrics.jsonl", "\xff\xfe\n", " cannot be read: "),
+        ("metrics.jsonl", '{"seed": 0, "update": 0}\n', " in line 1 has no arena_steps: the run"),
+        ("curriculum.jsonl", '{"seed": 0, "update": 3}', " in line 1 is cut off or damaged: "),
+        ("curriculum.jsonl", '{"seed": 0}\n', " in line 1 has no whole number as update: it is"),
+        ("config.json", "{", " cannot be read: "),
+        ("config.json", "[]", " holds no keys and values: it is damaged."),
+        ("summary.json", "{", " cannot be read: "),
+    ],
+)
+def test_a_damaged_file_is_named_with_its_line(
+    file: str, content: str, what: str, tmp_path: Path
+) -> None:
+    write(tmp_path, [row(0)])
+    (tmp_path / file).write_bytes(content.encode("latin-1"))
+    assert refusal(report_rows.read, tmp_path).startswith(f"{tmp_path / file}{what}")
+
+
+@pytest.mark.parametrize(
+    ("given", "what"),
+    [
+        ({"seed": None}, " has no whole number as seed: it is damaged."),
+        ({"mix": [8]}, " has mix that is no list of 2 numbers, one a stage."),
+        ({"weights": "x"}, " has weights that is no list of 2 numbers, one a stage."),
+        (
+            {"success_by_stage": [[1], [2, 3]]},
+            " has success_by_stage that is no list of 2 numbers, one a stage.",
+        ),
+    ],
+)
+def test_a_row_that_does_not_fit_is_named(given: dict, what: str, tmp_path: Path) -> None:
+    write(tmp_path, [row(0), row(1) | given])
+    sentence = refusal(report_rows.read, tmp_path)
+    assert sentence == f"{tmp_path / 'metrics.jsonl'} in line 2{what}"
+
+
+def test_a_config_that_is_refused_is_named(tmp_path: Path) -> None:
+    write(tmp_path, [row(0)])
+    (tmp_path / "config.json").write_text('{"arenas": 0}')
+    sentence = refusal(report_rows.read, tmp_path)
+    assert sentence.startswith(f"{tmp_path / 'config.json'} does not fit: stage is missing")

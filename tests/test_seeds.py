@@ -1,0 +1,221 @@
+"""Seeds in one program: lanes that know nothing of each other, each of them a run."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, Literal
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmjax import curriculum, loop, seeds
+from swarmjax.checkpoint import Leaves, to_leaves
+from swarmjax.config import TrainConfig
+from swarmjax.loop import Program, TrainState
+from swarmjax.sim import physics
+from swarmjax.task import env
+from swarmjax.task.env import World
+
+SEEDS, UPDATES = 3, np.int32(2)
+Run = Callable[[TrainState, np.int32], tuple[TrainState, dict]]
+
+
+def _program(
+    config: TrainConfig, world: World, count: int, by: Literal["vmap", "map"], first: int = 0
+) -> Program:
+    config = replace(config, seed=first, seeds=count, seeds_by=by)
+    return Program(config, replace(world, config=config))
+
+
+def _start(program: Program) -> TrainState:
+    return jax.jit(partial(seeds.init, program))(curriculum.schedule(program.config))
+
+
+def _run(program: Program) -> Run:
+    return partial(
+        jax.jit(partial(seeds.train_chunk, program)), curriculum.schedule(program.config)
+    )
+
+
+@pytest.fixture(scope="module")
+def side_by_side(tiny_config: TrainConfig, tiny_world: World) -> Program:
+    return _program(tiny_config, tiny_world, SEEDS, "vmap")
+
+
+@pytest.fixture(scope="module")
+def start(side_by_side: Program) -> TrainState:
+    return _start(side_by_side)
+
+
+@pytest.fixture(scope="module")
+def run(side_by_side: Program) -> Run:
+    """Trains all seeds; tracing it a second time is an error."""
+
+    def chunk(
+        schedule: curriculum.Schedule, state: TrainState, n: np.int32
+    ) -> tuple[TrainState, dict]:
+        return seeds.train_chunk(side_by_side, schedule, state, jnp.asarray(n))
+
+    chex.clear_trace_counter()  # it knows functions by their address, and some are gone
+    traced_once = jax.jit(chex.assert_max_traces(chunk, n=1))
+    return partial(traced_once, curriculum.schedule(side_by_side.config))
+
+
+def _lane(found: tuple[TrainState, dict], lane: int) -> Leaves:
+    """State and metrics of one seed, by name."""
+    state, metrics = found
+    leaves = to_leaves(state) | {name: np.asarray(column) for name, column in metrics.items()}
+    return {name: leaf[lane] for name, leaf in leaves.items()}
+
+
+def _assert_same(found: Leaves, expected: Leaves) -> None:
+    assert found.keys() == expected.keys()
+    for name, leaf in found.items():
+        np.testing.assert_array_equal(leaf, expected[name], err_msg=name, strict=True)
+
+
+def test_every_seed_is_another_run(start: TrainState, run: Run) -> None:
+    lanes = [_lane(run(start, UPDATES), k) for k in range(SEEDS)]
+    for name in ("key", "arenas/level/start", "learners/params/actor/mean/kernel", "policy_loss"):
+        assert not np.array_equal(lanes[0][name], lanes[1][name]), name
+        assert not np.array_equal(lanes[1][name], lanes[2][name]), name
+    assert [int(lane["update"][UPDATES - 1]) for lane in lanes] == [UPDATES - 1] * SEEDS
+
+
+def test_neither_lane_nor_neighbours_matter(start: TrainState, run: Run) -> None:
+    found = run(start, UPDATES)
+    order = np.array([2, 0, 0])  # other lanes, and another neighbour
+    moved = run(jax.tree.map(lambda x: x[order], start), UPDATES)
+    for lane, seed in enumerate(order):
+        _assert_same(_lane(moved, lane), _lane(found, seed))
+
+
+def test_a_broken_seed_leaves_the_others_alone(start: TrainState, run: Run) -> None:
+    def broken(x: jax.Array) -> jax.Array:
+        return x.at[1].set(np.nan)
+
+    params = start.learners.params
+    params = params | {"critic": jax.tree.map(broken, params["critic"])}
+    learners = replace(start.learners, params=params)
+    found, expected = run(replace(start, learners=learners), UPDATES), run(start, UPDATES)
+    assert np.isnan(_lane(found, 1)["policy_loss"][0])
+    for lane in (0, 2):
+        _assert_same(_lane(found, lane), _lane(expected, lane))
+
+
+def test_a_seed_begins_alike_wherever_it_stands(
+    tiny_config: TrainConfig, tiny_world: World, start: TrainState
+) -> None:
+    later = _start(_program(tiny_config, tiny_world, SEEDS, "vmap", first=1))
+    for lane in (0, 1):
+        _assert_same(_lane((later, {}), lane), _lane((start, {}), lane + 1))
+
+
+def test_in_turn_a_seed_is_the_run_that_it_is_alone(
+    tiny_config: TrainConfig, tiny_world: World
+) -> None:
+    together = _program(tiny_config, tiny_world, SEEDS, "map")
+    found = _run(together)(_start(together), UPDATES)
+    alone = _program(tiny_config, tiny_world, 1, "map", first=1)
+    _assert_same(_lane(found, 1), _lane(_run(alone)(_start(alone), UPDATES), 0))
+
+
+def test_one_seed_is_what_the_loop_makes(
+    tiny_config: TrainConfig, tiny_world: World, start: TrainState, run: Run
+) -> None:
+    program = _program(tiny_config, tiny_world, 1, "vmap", first=1)
+    schedule = curriculum.schedule(program.config)
+    first = _start(program)
+    plain = jax.jit(partial(loop.init, program))(schedule)
+    _assert_same(_lane((first, {}), 0), to_leaves(plain))
+    state, metrics = _run(program)(first, UPDATES)
+    chunk = jax.jit(partial(loop.train_chunk, program))
+    expected, rows = chunk(schedule, plain, UPDATES)
+    _assert_same(_lane((state, metrics), 0), to_leaves(expected) | jax.device_get(rows))
+    # Batched matrix products round differently from one seed's, in the last bits of float32
+    # (6e-8): after the two minibatches of four passes 1e-5 leaves room for what they grow to.
+    once, _ = chunk(schedule, plain, np.int32(1))
+    beside, _ = run(start, np.int32(1))
+    for name, leaf in to_leaves(once.learners.params).items():
+        lane = to_leaves(beside.learners.params)[name][1]
+        np.testing.assert_allclose(lane, leaf, rtol=0.0, atol=1e-5, err_msg=name)
+
+
+def test_every_seed_has_a_curriculum_of_its_own(start: TrainState, run: Run) -> None:
+    """At the end of a cohort whose verdict is made up: all, half and none of 10 targets."""
+    stages, cohort, threshold = 2, 2, 0.8
+    reached = np.array([10, 5, 0], np.int32)
+    counts = np.zeros((SEEDS, stages), np.int32)
+    counts[:, 0] = 10
+    hits = counts * 0
+    hits[:, 0] = reached
+    previous = start.curriculum.previous._replace(episodes=counts, targets=counts, reached=hits)
+    before = replace(
+        start.curriculum,
+        cohort=np.full(SEEDS, cohort, np.int32),
+        age=np.full(SEEDS, 1, np.int32),  # of two updates: 16 control steps at 8 each
+        previous=previous,
+    )
+    state, metrics = run(replace(start, curriculum=before), UPDATES)
+    assert np.asarray(metrics["stage"])[:, :UPDATES].tolist() == [[0, 1], [0, 0], [0, 0]]
+    np.testing.assert_array_equal(metrics["stage_success"][:, 0], np.float32([1.0, 0.5, 0.0]))
+    assert [share >= threshold for share in (1.0, 0.5, 0.0)] == [True, False, False]
+    assert np.asarray(state.curriculum.stage).tolist() == [1, 0, 0]
+
+
+def test_what_is_stepped_together_lies_on_one_axis(
+    tiny_config: TrainConfig, tiny_world: World, start: TrainState, side_by_side: Program
+) -> None:
+    flat = seeds.stepped_together(side_by_side, start).qpos
+    held = np.asarray(start.arenas.sim.qpos)
+    assert held.shape[:2] == (SEEDS, tiny_config.arenas)
+    np.testing.assert_array_equal(flat, np.concatenate(list(held)))
+    in_turn = _program(tiny_config, tiny_world, SEEDS, "map")
+    np.testing.assert_array_equal(seeds.stepped_together(in_turn, start).qpos, held[0])
+
+
+@pytest.mark.parametrize(("by", "arenas"), [("vmap", 8 * 3), ("map", 8)])
+def test_warp_has_room_for_the_arenas_that_are_stepped_together(
+    by: Literal["vmap", "map"], arenas: int, tiny_config: TrainConfig
+) -> None:
+    warp = replace(tiny_config, sim=replace(tiny_config.sim, impl="warp"))
+    several = env.load(replace(warp, seeds=SEEDS, seeds_by=by)).physics.template
+    expected = env.load(replace(warp, arenas=arenas)).physics.template
+    assert several._impl.naconmax == expected._impl.naconmax
+    assert several._impl.naconmax >= arenas
+
+
+def test_numbers_count_up_from_the_seed(tiny_config: TrainConfig) -> None:
+    assert list(seeds.numbers(replace(tiny_config, seed=7, seeds=3))) == [7, 8, 9]
+
+
+def test_warp_steps_the_arenas_of_all_seeds_each_with_its_own_model(
+    tiny_config: TrainConfig,
+) -> None:
+    """A robot drives against a box, whose size is a number of the model, in each arena another."""
+    lanes, arenas, steps = 3, 2, 40
+    sim = replace(tiny_config.sim, impl="warp")
+    engine = env.load(replace(tiny_config, sim=sim, seeds=lanes, arenas=arenas)).physics
+    half = np.linspace(0.02, 0.05, lanes * arenas, dtype=np.float32)
+    obstacle = np.zeros((lanes * arenas, 2, 5), np.float32)
+    obstacle[:, 0] = [0.0, 0.1, 0.0, 0.05, 0.0]
+    obstacle[:, 0, 4] = half
+    obstacle[:, 1] = [5.0, 5.0, 0.0, 0.05, 0.05]  # parked
+    pose = np.array([[x, -0.1, np.pi / 2] for x in (-0.2, 0.0, 0.2)], np.float32)
+    wheels = jnp.full((3, 2), 6.0)  # 3.9 mm a control step, 16 cm in all
+
+    def drive(obstacle: jax.Array) -> jax.Array:
+        def step(_: int, data: Any) -> Any:
+            return physics.step(engine, data, jnp.float32(0.8), obstacle, wheels)
+
+        data = physics.unpack(engine, physics.rest(engine, pose))
+        return physics.poses(engine, jax.lax.fori_loop(0, steps, step, data))
+
+    found = jax.jit(jax.vmap(jax.vmap(drive)))(obstacle.reshape(lanes, arenas, 2, 5))
+    met = 0.1 - half - tiny_config.robot.hull_radius
+    # A robot that pushes sinks in by at most 4 mm (docs/design.md, solver).
+    np.testing.assert_allclose(np.ravel(found[:, :, 1, 1]), met, rtol=0.0, atol=4e-3)
+    np.testing.assert_array_equal(found.reshape(-1, 3, 3), jax.jit(jax.vmap(drive))(obstacle))
