@@ -17,7 +17,8 @@ from swarmjax.settings import Section, about
 
 BASELINE = "final"
 HELD_OUT = "expanded"
-HELD_OUT_ROBOTS = 5  # policies that trained with more are not judged on arenas never trained
+GRID_GOAL = "s6"
+HELD_OUT_ROBOTS = 5  # policies that trained with more are judged on their goal alone
 _CHOSEN = {"stage": "goal", "algo.policy": "policies", "curriculum.mode": "arms"}
 _LISTS = ("arms", "policies")
 
@@ -41,6 +42,11 @@ class StudyConfig(Section):
     level_seed: int = field(default=2, metadata=about("of their levels", 0, config.MAX_COUNT))
 
     def _check(self) -> None:
+        if "adaptive-grid" in self.arms and self.goal != GRID_GOAL:
+            raise ConfigError(
+                f"arms holds adaptive-grid, whose last cell is {GRID_GOAL}, but goal is "
+                f"{self.goal}: give goal={GRID_GOAL}, or other arms."
+            )
         if self.label is not None and len(self.arms) > 1:
             raise ConfigError(f"label is {self.label}, but arms has {len(self.arms)}: give one.")
 
@@ -120,8 +126,9 @@ def points(study: StudyConfig, trained: TrainConfig) -> np.ndarray:
 def roles(study: StudyConfig, trained: TrainConfig, words: Sequence[str]) -> dict[str, StageConfig]:
     """The stages that are judged, by what they are judged for."""
     load = partial(_stages, words)
-    found = {"goal": load(study.goal)[-1], "first": load(curriculum_of(study.goal))[0]}
+    found = {"goal": load(study.goal)[-1]}
     if trained.sim.max_robots == HELD_OUT_ROBOTS:
+        found["first"] = load(curriculum_of(study.goal))[0]
         found["held_out"] = load(HELD_OUT)[-1]
     return found
 

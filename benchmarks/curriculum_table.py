@@ -11,7 +11,8 @@ over them (swarmjax.statistics). The columns:
 - `goal`, `1.5 m`: the share at the end, on the goal and in the arena never trained.
 - `to 0.8`, `to 0.9`: arena steps until a seed's share on the goal is first so large.
 - `area`, `area (log)`: mean share on the goal over training, by arena steps and by their logarithm.
-- `forgotten`: the best share on the first stage at any point, less the last one.
+- `forgotten`: the best share on the first stage at any point, less the last one; `-` where the
+  first stage was not judged.
 - `P(end)`, `P(area)`: probability that a seed ends higher than one of the baseline, and that its
   `area` is larger.
 """
@@ -36,6 +37,9 @@ MEASURES = {"targets_reached": "targets reached", "all_reached": "episodes in wh
 THRESHOLDS = (0.8, 0.9)
 COLUMNS = ("arm", "goal", "1.5 m", "to 0.8", "to 0.9", "area", "area (log)", "forgotten")
 _SHARED = ("arena_steps", "levels", "level_seed", "steps", "roles", "robot", "realism")
+_TYPES = {"arm": str, "goal": str, "policy": str, "arenas": int, "budget": int} | dict.fromkeys(
+    ("roles", "judged"), dict
+)
 _TITLES = {"goal": "goal", "held_out": "1.5 m, never trained", "first": "first stage"}
 
 Line = dict[str, Any]
@@ -59,7 +63,7 @@ class Figures(NamedTuple):
       steps: by threshold, arena steps until it was first reached; inf if it never was.
       area: mean share over arena steps.
       log_area: mean share over their logarithm.
-      forgotten: best share on the first stage less the last one.
+      forgotten: best share on the first stage less the last one; None where it was not judged.
     """
 
     goal: np.ndarray
@@ -67,7 +71,7 @@ class Figures(NamedTuple):
     steps: dict[float, np.ndarray]
     area: np.ndarray
     log_area: np.ndarray
-    forgotten: np.ndarray
+    forgotten: np.ndarray | None
 
 
 def tables(lines: Sequence[Line]) -> dict[Key, dict[str, Line]]:
@@ -80,7 +84,8 @@ def tables(lines: Sequence[Line]) -> dict[Key, dict[str, Line]]:
       The arms of each table.
 
     Raises:
-      ConfigError: if an arm is there twice, or arms of a table were judged differently.
+      ConfigError: if an arm is there twice, or arms of a table were judged differently; a role
+        that only some were judged for makes no difference.
     """
     found: dict[Key, dict[str, Line]] = {}
     for line in sorted(lines, key=lambda line: line["arm"] != BASELINE):
@@ -90,13 +95,20 @@ def tables(lines: Sequence[Line]) -> dict[Key, dict[str, Line]]:
             raise ConfigError(f"arm {line['arm']} of {_title(key)} is there twice: leave one out.")
         for name in _SHARED:
             for other in arms.values():
-                if line[name] != other[name]:
+                if _differs(name, line[name], other[name]):
                     raise ConfigError(
                         f"arms {other['arm']} and {line['arm']} of {_title(key)} differ in {name}: "
                         "judge them alike."
                     )
         arms[line["arm"]] = line
     return found
+
+
+def _differs(name: str, one: Any, other: Any) -> bool:
+    """Tells whether two lines differ in what arms share; of roles, in those that both have."""
+    if name != "roles":
+        return one != other
+    return any(one[role] != other[role] for role in one.keys() & other.keys())
 
 
 def figures(line: Line, measure: str) -> Figures:
@@ -111,14 +123,14 @@ def figures(line: Line, measure: str) -> Figures:
     """
     steps = np.array(line["arena_steps"], float)
     curve = {role: np.array(found[measure]) for role, found in line["judged"].items()}
-    goal, first = curve["goal"], curve["first"]
+    goal, first = curve["goal"], curve.get("first")
     return Figures(
         goal=goal[:, -1],
         held_out=curve["held_out"][:, -1] if "held_out" in curve else None,
         steps={share: statistics.steps_to(steps, goal, share) for share in THRESHOLDS},
         area=statistics.area_under(steps, goal),
         log_area=statistics.area_under(np.log10(steps), goal),
-        forgotten=first.max(axis=1) - first[:, -1],
+        forgotten=None if first is None else first.max(axis=1) - first[:, -1],
     )
 
 
@@ -149,7 +161,7 @@ def _title(key: Key) -> str:
 def _cells(mine: Figures) -> Iterator[str]:
     """Words of an arm's own columns."""
     yield _share(mine.goal)
-    yield "-" if mine.held_out is None else _share(mine.held_out)
+    yield _share(mine.held_out)
     for steps in mine.steps.values():
         yield _words(_over_seeds(steps), _count)
     for values in (mine.area, mine.log_area, mine.forgotten):
@@ -171,8 +183,8 @@ def _over_seeds(values: np.ndarray) -> Interval[float]:
     return statistics.bootstrap(values[:, None], statistics.iqm)
 
 
-def _share(values: np.ndarray) -> str:
-    return _words(_over_seeds(values), "{:.3f}".format)
+def _share(values: np.ndarray | None) -> str:
+    return "-" if values is None else _words(_over_seeds(values), "{:.3f}".format)
 
 
 def _count(steps: float) -> str:
@@ -194,7 +206,8 @@ def draw(key: Key, arms: dict[str, Line], measure: str, path: Path) -> None:
       measure: one of `MEASURES`.
       path: of the picture.
     """
-    roles = [role for role in _TITLES if role in next(iter(arms.values()))["judged"]]
+    judged = {role for line in arms.values() for role in line["judged"]}
+    roles = [role for role in _TITLES if role in judged]
     figure = Figure(figsize=(4.5 * len(roles), 3.8), layout="constrained")
     figure.suptitle(_title(key))
     for axes, role in zip(figure.subplots(1, len(roles), squeeze=False)[0], roles, strict=True):
@@ -203,14 +216,15 @@ def draw(key: Key, arms: dict[str, Line], measure: str, path: Path) -> None:
 
 
 def _draw_curves(axes: Axes, arms: dict[str, Line], role: str, measure: str) -> None:
-    """Draws the curves of one judged stage."""
-    for name, line in arms.items():
+    """Draws the curves of one stage, of the arms that were judged on it."""
+    there = {name: line for name, line in arms.items() if role in line["judged"]}
+    for name, line in there.items():
         band = statistics.curve(np.array(line["judged"][role][measure]))
         (drawn,) = axes.plot(line["arena_steps"], band.estimate, label=name)
         axes.fill_between(
             line["arena_steps"], band.low, band.high, color=drawn.get_color(), alpha=0.2, lw=0
         )
-    stage = next(iter(arms.values()))["roles"][role]
+    stage = next(iter(there.values()))["roles"][role]
     axes.set(xscale="log", xlabel="arena steps", ylabel=f"{MEASURES[measure]}, IQM")
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_title(f"{stage} ({_TITLES[role]})")
@@ -222,15 +236,58 @@ def read(path: Path) -> list[Line]:
     """Reads the lines of a file.
 
     Raises:
-      ConfigError: if it cannot be read, or a line is none of `benchmarks.curriculum`.
+      ConfigError: if it cannot be read, or a line is none of `benchmarks.curriculum`, or damaged.
     """
     try:
-        lines = [json.loads(text) for text in path.read_text().splitlines() if text]
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        texts = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} cannot be read: {error}.") from None
-    if not all(isinstance(line, dict) and line.get("benchmark") == "curriculum" for line in lines):
-        raise ConfigError(f"{path} holds other lines than those of benchmarks.curriculum.")
-    return lines
+    return [_line(text, f"{path} in line {n}") for n, text in enumerate(texts, 1) if text]
+
+
+def _line(text: str, where: str) -> Line:
+    """Reads a line, with all that a table takes of it."""
+    try:
+        line = json.loads(text)
+    except ValueError as error:
+        raise ConfigError(f"{where} cannot be read: {error}.") from None
+    if not isinstance(line, dict) or line.get("benchmark") != "curriculum":
+        raise ConfigError(f"{where} is none of the lines of benchmarks.curriculum.")
+    for key in ("arm", *Key._fields, *_SHARED, "judged"):
+        if key not in line:
+            raise ConfigError(f"{where} has no {key}: it is damaged.")
+        if not isinstance(line[key], _TYPES.get(key, object)):
+            raise ConfigError(f"{where} has {key} of another type: it is damaged.")
+    _check_judged(line, where)
+    return line
+
+
+def _check_judged(line: Line, where: str) -> None:
+    """Refuses a line without curves of its goal, or with some that are not whole."""
+    if "goal" not in line["judged"]:
+        raise ConfigError(f"{where} has no judged.goal: it is damaged.")
+    for role, found in line["judged"].items():
+        if role not in line["roles"]:
+            raise ConfigError(f"{where} has no roles.{role}: it is damaged.")
+        for measure in MEASURES:
+            curves = found.get(measure) if isinstance(found, dict) else None
+            if not _are_curves(line["arena_steps"], curves):
+                raise ConfigError(
+                    f"{where} has no curve of each seed over arena_steps as "
+                    f"judged.{role}.{measure}: it is damaged."
+                )
+
+
+def _are_curves(steps: Any, curves: Any) -> bool:
+    """Tells whether curves are [N, P] finite numbers over steps [P] that rise from above 0."""
+    try:
+        at, values = np.array(steps), np.array(curves)
+        if {at.dtype.kind, values.dtype.kind} <= {"i", "f"} and values.ndim == 2:
+            statistics.area_under(at, values)
+            return bool(at[0] > 0)
+    except ValueError:  # of lists that make no array, or of what statistics refuses
+        return False
+    return False
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -242,13 +299,22 @@ def main(arguments: Sequence[str]) -> int:
         raise ConfigError(f"measure is '{measure}': give one of {', '.join(MEASURES)}.")
     if not files:
         raise ConfigError("there is no file: give those that benchmarks.curriculum printed.")
-    for key, arms in tables([line for name in files for line in read(Path(name))]).items():
+    found = tables([line for name in files for line in read(Path(name))])
+    if "out" in given:
+        _draw_all(found, measure, Path(given["out"]))
+    for key, arms in found.items():
         sys.stdout.write(table(key, arms, measure) + "\n\n")
-        if "out" in given:
-            Path(given["out"]).mkdir(parents=True, exist_ok=True)
-            name = "-".join(map(str, (*key, measure)))
-            draw(key, arms, measure, Path(given["out"]) / f"{name}.png")
     return 0
+
+
+def _draw_all(found: dict[Key, dict[str, Line]], measure: str, out: Path) -> None:
+    """Draws the learning curves of every table into a directory, which is made."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for key, arms in found.items():
+            draw(key, arms, measure, out / f"{'-'.join(map(str, (*key, measure)))}.png")
+    except OSError as error:
+        raise ConfigError(f"out is {out}, which cannot be written: {error.strerror}.") from None
 
 
 if __name__ == "__main__":

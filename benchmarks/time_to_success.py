@@ -12,8 +12,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from swarmjax.config import TrainConfig, build, substeps
+from swarmjax import report_rows
+from swarmjax.command import USER_ERROR
+from swarmjax.config import ConfigError, substeps
 from swarmjax.recorder import METRICS
+from swarmjax.report_rows import Row
+
+USAGE = "usage: python -m benchmarks.time_to_success RUN [SHARE]\n"
 
 OF_THE_RUN = (
     "impl",
@@ -27,7 +32,7 @@ OF_THE_RUN = (
 )
 
 
-def lines(run: Path, share: float) -> list[dict]:
+def lines(run: Path, share: float) -> list[Row]:
     """Sums a run up.
 
     Args:
@@ -36,10 +41,13 @@ def lines(run: Path, share: float) -> list[dict]:
 
     Returns:
       A JSON line for each seed; seconds and steps are None if the share was never measured.
+
+    Raises:
+      ConfigError: if a file is missing or damaged.
     """
-    trained = build(TrainConfig, json.loads((run / "config.json").read_text()))
-    summary = json.loads((run / "summary.json").read_text())
-    rows = [json.loads(text) for text in (run / METRICS).read_text().splitlines()]
+    trained = report_rows.read_config(run)
+    summary = _read_summary(run)
+    rows = _read_rows(run, len(trained.stage))
     last = trained.stage[-1]
     found = []
     for seed, reached in zip(summary["seeds"], summary["targets_reached"], strict=True):
@@ -52,7 +60,7 @@ def lines(run: Path, share: float) -> list[dict]:
                 "seed": seed,
                 "seeds": trained.seeds,
                 "share": share,
-                "seconds": there[0]["train_s"] if there else None,
+                "seconds": there[0].get("train_s") if there else None,
                 "arena_steps": there[0]["arena_steps"] if there else None,
                 "final_success": reached.get(last.name),
                 "broken_arenas": sum(row["broken_arenas"] for row in mine),
@@ -66,13 +74,59 @@ def lines(run: Path, share: float) -> list[dict]:
     return found
 
 
+def _read_summary(run: Path) -> Row:
+    """Reads what a run came to; it is there once the run is over."""
+    path = run / report_rows.SUMMARY
+    summary = report_rows.read_object(path)
+    for key in ("seeds", "targets_reached", *OF_THE_RUN):
+        if key not in summary:
+            raise ConfigError(f"{path} has no {key}: it is damaged.")
+    seeds, reached = summary["seeds"], summary["targets_reached"]
+    if not isinstance(seeds, list):
+        raise ConfigError(f"{path} has no list as seeds: it is damaged.")
+    shares = reached if isinstance(reached, list) else []
+    if len(shares) != len(seeds) or not all(isinstance(each, dict) for each in shares):
+        raise ConfigError(f"{path} has no shares of each seed as targets_reached: it is damaged.")
+    return summary
+
+
+def _read_rows(run: Path, stages: int) -> list[Row]:
+    """Reads the metrics of a run, with all that its lines take of them."""
+    found = []
+    for where, row in report_rows.read_lines(run, METRICS):
+        report_rows.check_whole(row, ("seed", "arena_steps", "broken_arenas"), where)
+        report_rows.check_numbers(row, ("train_s",), where)
+        success = row.get("success_by_stage")
+        report_rows.per_stage(success, stages, f"{where} has success_by_stage")
+        found.append(row)
+    return found
+
+
+def _share(text: str) -> float:
+    """Reads a share of the targets."""
+    try:
+        share = float(text)
+    except ValueError:
+        share = -1.0
+    if not 0.0 <= share <= 1.0:
+        raise ConfigError(f"SHARE is {text}: give a number from 0 to 1.")
+    return share
+
+
 def main(arguments: Sequence[str]) -> int:
-    """Runs the command; returns its exit code."""
+    """Runs the command; returns its exit code: 2 for an error of the user's, in one sentence."""
+    if {"-h", "--help"} & set(arguments):
+        sys.stdout.write(USAGE)
+        return 0
     if not 1 <= len(arguments) <= 2:
-        sys.stderr.write("usage: python -m benchmarks.time_to_success RUN [SHARE]\n")
-        return 2
-    run, share = Path(arguments[0]), float(arguments[1]) if len(arguments) > 1 else 0.9
-    sys.stdout.writelines(json.dumps(line) + "\n" for line in lines(run, share))
+        sys.stderr.write(USAGE)
+        return USER_ERROR
+    try:
+        found = lines(Path(arguments[0]), _share(arguments[1]) if len(arguments) > 1 else 0.9)
+    except ConfigError as error:
+        sys.stderr.write(f"benchmarks.time_to_success: error: {error}\n")
+        return USER_ERROR
+    sys.stdout.writelines(json.dumps(line) + "\n" for line in found)
     return 0
 
 

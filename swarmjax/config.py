@@ -693,6 +693,11 @@ class TrainConfig(Section):
     )
 
     def _check(self) -> None:
+        if self.seed + self.seeds - 1 > MAX_COUNT:
+            raise ConfigError(
+                f"seed is {self.seed}, but seeds is {self.seeds} and the last seed may be "
+                f"{MAX_COUNT}: give at most {MAX_COUNT - self.seeds + 1}."
+            )
         self._check_stages()
         if self.arenas % self.algo.minibatches:
             raise ConfigError(

@@ -214,6 +214,23 @@ def schedule(config: TrainConfig) -> Schedule:
     )
 
 
+def last_begins(schedule: Schedule) -> int:
+    """After how many updates the last stage begins at the latest: by the deadlines alone.
+
+    Each decision waits for one step limit after the one before.
+
+    Args:
+      schedule: the curriculum's numbers.
+
+    Returns:
+      Updates; 0 for a single stage, `NEVER` or more where a stage has no deadline.
+    """
+    begins = 0
+    for deadline in np.asarray(schedule.deadline)[:-1].tolist():
+        begins = max(deadline, begins + int(schedule.cohort_updates))
+    return begins
+
+
 def _number(value: float | None, absent: float) -> np.float32:
     return np.float32(absent if value is None else value)
 
@@ -267,7 +284,9 @@ def assign(curriculum: Curriculum, arenas: int) -> Array:
     ends = jnp.cumsum(curriculum.weights)
     inner = (ends / ends[-1])[:-1]
     stage = jnp.searchsorted(inner, point, side="right", method="compare_all")
-    return stage.astype(jnp.int32)
+    # The last point may round to 1, and would fall behind all stages that have weight.
+    last = jnp.max(jnp.where(curriculum.weights > 0.0, jnp.arange(ends.shape[0]), 0))
+    return jnp.minimum(stage, last).astype(jnp.int32)
 
 
 def count(curriculum: Curriculum, ended: Ended) -> Curriculum:

@@ -24,7 +24,7 @@ from swarmjax.sim import gaps
 from swarmjax.task import env, observation
 from swarmjax.task.env import EnvState, World
 
-MAX_ROWS = 4096  # updates a call can report; a longer chunk is several calls
+MAX_ROWS = 4096  # updates that a call can report, over all seeds; a longer chunk is several calls
 
 Metrics = dict[str, Any]
 
@@ -44,7 +44,7 @@ class Program:
     @property
     def rows(self) -> int:
         """Most updates of one call."""
-        return min(self.config.updates, MAX_ROWS)
+        return min(self.config.updates, max(1, MAX_ROWS // self.config.seeds))
 
     @property
     def mode(self) -> Mode:

@@ -12,6 +12,7 @@ from tensorboardX import SummaryWriter
 from swarmjax.sim import gaps
 
 METRICS, DECISIONS = "metrics.jsonl", "curriculum.jsonl"
+BOARDS = 16  # seeds that TensorBoard is written for: a board holds three files open
 
 Row = dict[str, Any]
 
@@ -93,8 +94,8 @@ class Recorder:
     ) -> None:
         """Opens the files, dropping what a stopped run wrote after the checkpoint `update`.
 
-        `arena_steps` is where that checkpoint stands, on TensorBoard's axis. Several seeds have a
-        folder of TensorBoard each.
+        `arena_steps` is where that checkpoint stands, on TensorBoard's axis. Of several seeds the
+        first `BOARDS` have a folder of TensorBoard each.
         """
         run.mkdir(parents=True, exist_ok=True)
         for name in (METRICS, DECISIONS):
@@ -103,7 +104,7 @@ class Recorder:
         self._decisions = (run / DECISIONS).open("a")
         purge = arena_steps + 1 if update else None  # TensorBoard hides what it has from here on
         folder = run / "tensorboard"
-        folders = {k: folder / f"seed{k}" if len(seeds) > 1 else folder for k in seeds}
+        folders = {k: folder / f"seed{k}" if len(seeds) > 1 else folder for k in seeds[:BOARDS]}
         self._boards = {
             seed: SummaryWriter(str(path), purge_step=purge)
             for seed, path in folders.items()
@@ -113,7 +114,7 @@ class Recorder:
     def write(self, found: Sequence[Row], decisions: Iterable[Row], speeds: Row) -> None:
         """Writes the rows of a call; the speeds, of all seeds together, to TensorBoard's first.
 
-        Of N seeds TensorBoard is given every N-th update, so that it costs no more time than one:
+        Of N boards each is given every N-th update, so that they cost no more time than one:
         a row takes it a millisecond, as much as an update of a few arenas.
         """
         self._metrics.writelines(json.dumps(row) + "\n" for row in found)
@@ -123,7 +124,7 @@ class Recorder:
         boards = self._boards
         if boards:
             for row in found:
-                if row["update"] % len(boards) == 0:
+                if row["seed"] in boards and row["update"] % len(boards) == 0:
                     _add_scalars(boards[row["seed"]], row, row["arena_steps"])
             _add_scalars(next(iter(boards.values())), speeds, found[-1]["arena_steps"])
 

@@ -182,7 +182,7 @@ def _reweighings(history: History) -> str:
     """Says how often the arenas of each seed were spread anew, and how they were at last."""
     by_seed: dict[int, list[Row]] = {}
     for row in history.decisions:
-        if isinstance(row.get("weights"), dict):
+        if "weights" in row:
             by_seed.setdefault(row["seed"], []).append(row)
     rows = []
     for seed, found in by_seed.items():

@@ -1,11 +1,15 @@
 """What a run wrote down, read back as arrays for its report. No JAX.
 
 Axes: N seeds, T updates, S stages. What was not measured is nan here and null in the files.
+
+A last line without its newline is being written, or was as the run was killed: it is skipped, so
+that a run can be read at any time. Any other damage is refused, by its file, line and key.
 """
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +33,7 @@ BY_STAGE = (
 )
 _LISTS = ("mix", "weights", *BY_STAGE)
 MANY = 9  # stages from which on each is drawn small
-_SUMMARY = "summary.json"
+SUMMARY = "summary.json"
 _NUMBERS = ("seed", "update", "arena_steps")
 # A verdict takes one cohort in which its episodes begin, and one in which the last of them end.
 _COHORTS_OF_A_VERDICT = 2
@@ -79,18 +83,18 @@ def read(run: Path) -> History:
     """Reads a run directory.
 
     Raises:
-      ConfigError: if a file is missing, cut or damaged, or holds no row of every seed.
+      ConfigError: if a file is missing or damaged, or holds no row of every seed.
     """
-    trained = _read_config(run)
+    trained = read_config(run)
     stages = len(trained.stage)
     by_seed: dict[int, dict[int, Row]] = {}
-    for number, raw in _read_lines(run, recorder.METRICS):
-        row = _checked(raw, stages, f"{run / recorder.METRICS} in line {number}")
+    for where, raw in read_lines(run, recorder.METRICS):
+        row = _checked(raw, stages, where)
         by_seed.setdefault(row["seed"], {})[row["update"]] = row
     updates = sorted(set.intersection(*map(set, by_seed.values()))) if by_seed else []
     if not updates:
         raise ConfigError(f"{run / recorder.METRICS} has no update of every seed: train it first.")
-    summary = _read_json(run / _SUMMARY) if (run / _SUMMARY).exists() else {}
+    summary = read_object(run / SUMMARY) if (run / SUMMARY).exists() else {}
     return _history(trained, by_seed, updates, (_read_decisions(run), summary))
 
 
@@ -183,44 +187,95 @@ def _checked(raw: Row, stages: int, where: str) -> Row:
             raise ConfigError(
                 f"{where} has no {key}: the run is of a version that did not write it."
             )
-    _check_whole(raw, _NUMBERS, where)
-    lists = [_per_stage(raw[key], stages, f"{where} has {key}") for key in _LISTS]
+    check_whole(raw, _NUMBERS, where)
+    check_numbers(raw, ("train_s",), where)
+    lists = [per_stage(raw[key], stages, f"{where} has {key}") for key in _LISTS]
     return {key: raw[key] for key in (*_NUMBERS, "train_s") if key in raw} | {
         "lists": np.array(lists)
     }
 
 
-def _check_whole(raw: Row, keys: Sequence[str], where: str) -> None:
+def check_whole(row: Row, keys: Sequence[str], where: str) -> None:
+    """Refuses a row that lacks whole numbers.
+
+    Args:
+      row: as it was written down.
+      keys: of the numbers.
+      where: names the row, for the sentence.
+
+    Raises:
+      ConfigError: if one is missing or of another type.
+    """
     for key in keys:
-        if not isinstance(raw.get(key), int):
+        if not isinstance(row.get(key), int) or isinstance(row[key], bool):
             raise ConfigError(f"{where} has no whole number as {key}: it is damaged.")
 
 
-def _per_stage(found: object, stages: int, what: str) -> np.ndarray:
-    """Takes a number or null for each stage, [S]."""
-    try:
-        numbers = np.array(found, np.float32)
-    except (TypeError, ValueError):
-        numbers = np.zeros(())
-    if numbers.shape != (stages,):
+def check_numbers(row: Row, keys: Iterable[str], where: str) -> None:
+    """Refuses a row in which something else stands for a finite number; null or none may.
+
+    Args:
+      row: as it was written down.
+      keys: of the numbers.
+      where: names the row, for the sentence.
+
+    Raises:
+      ConfigError: if one is of another type, infinite or nan.
+    """
+    for key in keys:
+        if not _is_number_or_null(row.get(key)):
+            raise ConfigError(f"{where} has no number as {key}: it is damaged.")
+
+
+def per_stage(found: object, stages: int, what: str) -> np.ndarray:
+    """Takes a finite number or null for each stage.
+
+    Args:
+      found: as it was written down.
+      stages: how many there are.
+      what: names it, for the sentence.
+
+    Returns:
+      [S] float32 with nan for null.
+
+    Raises:
+      ConfigError: if it is anything else.
+    """
+    fits = isinstance(found, list) and len(found) == stages and all(map(_is_number_or_null, found))
+    if not fits:
         raise ConfigError(f"{what} that is no list of {stages} numbers, one a stage.")
-    return numbers
+    return np.array(found, np.float32)
 
 
-def _read_config(run: Path) -> TrainConfig:
-    """Reads the config of a run."""
+def _is_number_or_null(value: object) -> bool:
+    """Tells whether a value is None or fits a float; text and truth values are no numbers."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return value is None
+    return abs(value) <= sys.float_info.max  # no nan is
+
+
+def read_config(run: Path) -> TrainConfig:
+    """Reads the config of a run.
+
+    Raises:
+      ConfigError: if there is none, or it is refused.
+    """
     path = run / "config.json"
     if not path.exists():
         raise ConfigError(f"{run} is no run directory: it has no config.json.")
-    stored = _read_json(path)
+    stored = read_object(path)
     try:
         return config.build(TrainConfig, stored)
     except ConfigError as error:
         raise ConfigError(f"{path} does not fit: {error}") from None
 
 
-def _read_json(path: Path) -> Row:
-    """Reads a file that holds one JSON object."""
+def read_object(path: Path) -> Row:
+    """Reads a file that holds one JSON object.
+
+    Raises:
+      ConfigError: if it cannot be read, or holds something else.
+    """
     try:
         found = json.loads(path.read_text())
     except (OSError, ValueError) as error:
@@ -233,31 +288,50 @@ def _read_json(path: Path) -> Row:
 def _read_decisions(run: Path) -> list[Row]:
     """Reads the decisions of the curriculum, by seed and update."""
     found = []
-    for number, row in _read_lines(run, recorder.DECISIONS):
-        _check_whole(row, ("seed", "update"), f"{run / recorder.DECISIONS} in line {number}")
+    for where, row in read_lines(run, recorder.DECISIONS):
+        check_whole(row, ("seed", "update"), where)
+        check_numbers(row, ("targets_reached", "all_reached"), where)
+        weights = row.get("weights", {})
+        if not isinstance(weights, dict):
+            raise ConfigError(f"{where} has no shares by stage as weights: it is damaged.")
+        check_numbers(weights, weights, f"{where}, weights,")
         found.append(row)
     return sorted(found, key=lambda row: (row["seed"], row["update"]))
 
 
-def _read_lines(run: Path, name: str) -> Iterator[tuple[int, Row]]:
-    """Reads a file of a JSON object a line, each with the number of its line."""
+def read_lines(run: Path, name: str) -> Iterator[tuple[str, Row]]:
+    """Reads a file of a JSON object a line, but for a last line that has no newline.
+
+    Args:
+      run: the run directory.
+      name: of the file.
+
+    Yields:
+      Words that name a line, and its object.
+
+    Raises:
+      ConfigError: if the file is missing or cannot be read, or a line holds something else.
+    """
     path = run / name
     if not path.exists():
         raise ConfigError(f"{run} has no {name}: it holds no training yet.")
     try:
         with path.open() as file:
             for number, line in enumerate(file, 1):
-                yield number, _object(line, f"{path} in line {number}")
+                if not line.endswith("\n"):
+                    return
+                where = f"{path} in line {number}"
+                yield where, _object(line, where)
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} cannot be read: {error}.") from None
 
 
 def _object(line: str, where: str) -> Row:
-    """Reads one line; a whole one ends in a newline."""
+    """Reads one line."""
     try:
-        found = json.loads(line) if line.endswith("\n") else None
-    except json.JSONDecodeError:
+        found = json.loads(line)
+    except ValueError:
         found = None
     if not isinstance(found, dict):
-        raise ConfigError(f"{where} is cut off or damaged: go on with the run, or take it out.")
+        raise ConfigError(f"{where} is damaged: go on with the run, or take it out.")
     return found

@@ -22,6 +22,9 @@ from swarmjax.task.env import EnvState, World
 from swarmjax.task.stage import Stage
 
 ACTION_SIZE = 2
+# Cohort of an episode that counts for none: curricula number theirs from 0, and -1 is the one
+# before the first.
+UNCOUNTED = -2
 
 
 class Trajectory(NamedTuple):
@@ -115,7 +118,8 @@ def draw_starts(world: World, stages: Stage, index: Array, cohort: Array, key: A
     """Draws a fresh level for every arena, an episode that waits until the arena is free.
 
     It is drawn once a rollout, not at every step: an arena that ends two episodes in one rollout
-    begins the second and third on the same level.
+    begins both of the next ones on the same level. The second trains, but counts for no cohort:
+    short episodes would be counted more often than long ones.
 
     Args:
       world: the compiled environment.
@@ -156,9 +160,9 @@ def collect(
     step = functools.partial(_step, world, learners, starts, start_value)
     unpack = functools.partial(physics.unpack, world.physics)
     arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
-    carry = (arenas, _values(world, learners, arenas.observation))
+    carry = (arenas, _values(world, learners, arenas.observation), starts.cohort)
     keys = jax.random.split(key, world.config.algo.rollout)
-    (arenas, _), (trajectory, ended) = jax.lax.scan(step, carry, keys)
+    (arenas, *_), (trajectory, ended) = jax.lax.scan(step, carry, keys)
     packed = jax.vmap(physics.pack)(arenas.sim)
     return replace(arenas, sim=packed), trajectory, ended
 
@@ -198,7 +202,7 @@ def batch(trajectory: Trajectory, *, discount: float, gae_lambda: float) -> Batc
     )
 
 
-_Carry = tuple[EnvState, Array]
+_Carry = tuple[EnvState, Array, Array]  # arenas, their values, the cohort that waits for each
 
 
 def _step(
@@ -210,7 +214,7 @@ def _step(
     key: Array,
 ) -> tuple[_Carry, tuple[Trajectory, Ended]]:
     """One control step of all arenas."""
-    arenas, value = carry
+    arenas, value, cohort = carry
     count = value.shape[0]
     mine = to_learners(arenas.observation, count)
     noise = jax.random.normal(key, (*mine.shape[:-1], ACTION_SIZE))
@@ -221,7 +225,7 @@ def _step(
     arenas, came = jax.vmap(functools.partial(env.step, world))(arenas, to_arenas(action))
     next_value = _values(world, learners, came.observation)
     ended = _ended(arenas, came)
-    arenas = restart(arenas, starts, came.done)
+    arenas = restart(arenas, replace(starts, cohort=cohort), came.done)
     over = jnp.broadcast_to(came.done[None, :, None], next_value.shape)
     transition = Trajectory(
         observation=mine,
@@ -234,7 +238,12 @@ def _step(
         truncated=to_learners(came.truncated, count),
         valid=to_learners(came.valid, count),
     )
-    return (arenas, jnp.where(over, start_value, next_value)), (transition, ended)
+    carry = (
+        arenas,
+        jnp.where(over, start_value, next_value),
+        jnp.where(came.done, UNCOUNTED, cohort),
+    )
+    return carry, (transition, ended)
 
 
 def _values(world: World, learners: LearnerState, seen: Array) -> Array:

@@ -1,12 +1,15 @@
 """`start=DIR`: a new run begins with what another one learned, its networks and its normaliser.
 
-Everything else begins afresh: optimiser, learning rate, curriculum, arenas, keys and counters.
+Everything else begins afresh: optimiser, learning rate, curriculum, arenas, keys and counters. Of
+the curriculum the number of robots that have trained is kept, so that a promotion copies no
+learner over another one that has learned already.
 Several seeds begin lane by lane with those of as many, or all with the one that there is.
 """
 
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
 from swarmjax import checkpoint, config, export
@@ -15,6 +18,7 @@ from swarmjax.config import ConfigError, TrainConfig
 from swarmjax.loop import TrainState
 
 _CARRIED = ("params", "normalizer")  # of a learner
+_MET = "curriculum/met"  # robots that have trained: a promotion copies nobody over them
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +66,7 @@ def read(settings: TrainConfig) -> Source | None:
     carried = {
         name: np.repeat(leaf, times, axis=0)
         for name, leaf in leaves.items()
-        if name.startswith(prefixes)
+        if name.startswith(prefixes) or name == _MET
     }
     return Source(run=run, update=update, leaves=carried, skipped=skipped)
 
@@ -76,21 +80,26 @@ def carry(source: Source, state: TrainState, settings: TrainConfig) -> TrainStat
       settings: the config of the new run; `start_std` says whose exploration it begins with.
 
     Returns:
-      The state, with the networks and normalisers of the source.
+      The state, with the networks and normalisers of the source, and a curriculum that knows how
+      many robots have trained them.
 
     Raises:
       ConfigError: if the checkpoint is not of the config beside it.
     """
     fresh = {name: getattr(state.learners, name) for name in _CARRIED}
+    template = {"learners": fresh, "curriculum": {"met": state.curriculum.met}}
     try:
-        carried = checkpoint.from_leaves(source.leaves, {"learners": fresh})["learners"]
+        found = checkpoint.from_leaves(source.leaves, template)
     except CheckpointError as error:
         raise _refused(str(source.run), error) from None
+    carried = found["learners"]
     if settings.start_std == "reset":
         log_std = state.learners.params["actor"]["log_std"]
         actor = carried["params"]["actor"] | {"log_std": log_std}
         carried["params"] = carried["params"] | {"actor": actor}
-    return replace(state, learners=replace(state.learners, **carried))
+    met = jnp.maximum(state.curriculum.met, found["curriculum"]["met"])
+    curriculum = replace(state.curriculum, met=met)
+    return replace(state, learners=replace(state.learners, **carried), curriculum=curriculum)
 
 
 def _read_config(start: str) -> TrainConfig:

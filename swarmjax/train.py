@@ -4,6 +4,7 @@ With no argument it trains the default curriculum. `--help` lists every key.
 """
 
 import json
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import jax
 
-from swarmjax import checkpoint, command, config, export, loop, provenance, seeds, start
+from swarmjax import checkpoint, command, config, curriculum, export, loop, provenance, seeds, start
 from swarmjax.checkpoint import CheckpointError
 from swarmjax.config import ConfigError, TrainConfig
 from swarmjax.curriculum import Schedule
@@ -44,6 +45,8 @@ def main(arguments: Sequence[str]) -> int:
                 f"starting with what {source.run} had learned after {source.update} updates"
             )
         display.say(f"{_opening(settings)}, into {run}; compiling")
+        for sentence in _short_budget(settings, schedule):
+            display.say(sentence)
         try:
             state, tally = train(run, program, schedule, state, display, stop)
         except TrainingError as error:
@@ -114,7 +117,7 @@ def _dry_run(program: Program, schedule: Schedule, template: TrainState) -> int:
     compiled = compile_chunk(program, schedule, template)
     state, work = compiled.state_bytes / 2**20, compiled.work_bytes / 2**20
     sys.stdout.write(
-        f"{_opening(program.config)}\n"
+        f"{'\n'.join([_opening(program.config), *_short_budget(program.config, schedule)])}\n"
         f"compiled in {compiled.seconds:.1f} s; memory: {state:.1f} MiB of state, "
         f"{work:.1f} MiB to work with; nothing was trained (run.dry).\n"
     )
@@ -131,6 +134,21 @@ def _opening(settings: TrainConfig) -> str:
         f"swarmjax: {settings.stage_name} ({names}), {settings.updates:,} updates of {steps:,} "
         f"arena control steps ({settings.arenas:,} arenas){several} on {provenance.device()}"
     )
+
+
+def _short_budget(settings: TrainConfig, schedule: Schedule) -> list[str]:
+    """Says where stages need more of the budget than they are to have, in no or one sentence."""
+    share = settings.curriculum.budget_share
+    begins = curriculum.last_begins(schedule)
+    if share is None or begins <= math.ceil(share * settings.updates):
+        return []
+    when = f"begin as late as update {begins:,}" if begins < settings.updates else "never begin"
+    return [
+        f"the budget is short: a stage takes at least {schedule.cohort_updates} updates (one step "
+        f"limit), so that {settings.stage[-1].name}, the last, may {when}, where "
+        f"curriculum.budget_share={share} asks for {math.ceil(share * settings.updates):,} at the "
+        "latest: give more budget, fewer arenas or fewer stages."
+    ]
 
 
 def _write_results(run: Path, program: Program, state: TrainState, tally: Tally) -> None:

@@ -22,10 +22,14 @@ hypothesis.settings.load_profile("swarmjax")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Keeps compiled programs in `.pytest_cache`, so that a second run compiles nothing."""
+    """Keeps compiled programs in `.pytest_cache`, so that a second run compiles less.
+
+    Each process has its own: one may read what another has half written.
+    """
     cache = getattr(config, "cache", None)  # absent with -p no:cacheprovider
     if cache is not None:
-        jax.config.update("jax_compilation_cache_dir", str(cache.mkdir("jax")))
+        process = os.environ.get("PYTEST_XDIST_WORKER", "alone")
+        jax.config.update("jax_compilation_cache_dir", str(cache.mkdir(f"jax-{process}")))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 

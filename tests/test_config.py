@@ -247,6 +247,8 @@ def test_import_needs_neither_jax_nor_hydra():
         (["sim.max_obstacles=2"], "stage s6: obstacles is 3, but sim.max_obstacles is 2: give 0 "
          "to 2."),
         (["seeds=0"], "seeds is 0: give 1 to 4096."),
+        (["seed=2147483647", "seeds=2"], "seed is 2147483647, but seeds is 2 and the last seed "
+         "may be 2147483647: give at most 2147483646."),
         (["seeds_by=pmap"], "seeds_by is 'pmap': give vmap or map."),
         (["arenas=100"], "arenas is 100, but algo.minibatches is 8: give a multiple of 8."),
         (["budget=4095"], "budget is 4095, but one update takes arenas x algo.rollout = 4096 "

@@ -234,6 +234,14 @@ def test_a_point_on_the_border_is_of_the_stage_that_begins_there(schedule: Sched
     assert found.tolist() == [0, 1, 1, 2]
 
 
+def test_a_point_that_rounds_to_one_is_of_the_last_stage_that_has_weight(
+    schedule: Schedule,
+) -> None:
+    # In cohort 377 u is 0.9995, and (65535 + u) / 65536 is 1 in float32.
+    found = curriculum.assign(_weighed(schedule, [1.0, 0.0, 0.0], 377), 65536)
+    assert not found.any()
+
+
 def test_many_arenas_stay_on_their_stage(schedule: Schedule) -> None:
     weights = [0.2, 0.3, 0.5]
     found = [curriculum.assign(_weighed(schedule, weights, cohort), 1000) for cohort in range(20)]
@@ -468,6 +476,18 @@ def test_deadline(schedule: Schedule) -> None:
     assert [row.reason for row in rows] == expected
     assert [row.stage for row in rows] == [0] * 4 + [1] * 5 + [2] * 3
     assert math.isnan(rows[4].success)
+
+
+@pytest.mark.parametrize(
+    ("deadline", "begins"),
+    # Cohorts of 2 updates: 6 and 9 leave room for them, 1 and 2 do not (2, then 4).
+    [([6, 9], 9), ([1, 2], 4), ([5, 6], 7)],
+)
+def test_the_last_stage_begins_by_the_deadlines_at_the_latest(
+    schedule: Schedule, deadline: list[int], begins: int
+) -> None:
+    numbers = schedule._replace(deadline=np.array([*deadline, curriculum.NEVER], np.int32))
+    assert curriculum.last_begins(numbers) == begins
 
 
 def test_deadline_reports_what_was_measured(schedule: Schedule) -> None:

@@ -1,6 +1,7 @@
 """The study of curricula: its arms and points, what it measures, and its tables, by hand."""
 
 import json
+import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,7 @@ from sentences import refusal
 from benchmarks import curriculum, curriculum_arms, curriculum_table
 from benchmarks.curriculum_arms import StudyConfig
 from benchmarks.curriculum_table import Key
-from swarmjax import config, evaluate_mjx
+from swarmjax import command, config, evaluate_mjx
 from swarmjax.config import TrainConfig
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
@@ -124,7 +125,16 @@ def test_the_held_out_arena_is_for_swarms_of_its_size() -> None:
         "held_out": ("expanded", (1.5, 1.5)),
     }
     ten = config.load_train([*ROOM, "stage=crowd"])
-    assert curriculum_arms.roles(StudyConfig(goal="crowd"), ten, ROOM).keys() == {"goal", "first"}
+    # Nor is the first stage: the baseline has trained with ten robots alone.
+    assert curriculum_arms.roles(StudyConfig(goal="crowd"), ten, ROOM).keys() == {"goal"}
+
+
+def test_the_grid_is_for_its_own_goal() -> None:
+    sentence = refusal(curriculum_arms.parse, ["goal=dense", "arms=adaptive-grid"])
+    assert sentence == (
+        "arms holds adaptive-grid, whose last cell is s6, but goal is dense: give goal=s6, or "
+        "other arms."
+    )
 
 
 # --- measuring
@@ -204,6 +214,11 @@ def _line(arm: str, goal: list = GOAL, **rest: Any) -> dict[str, Any]:
     }
 
 
+def _without_first(arm: str) -> dict[str, Any]:
+    judged = {"goal": _line(arm)["judged"]["goal"]}
+    return _line(arm, roles={"goal": "s6"}, judged=judged)
+
+
 def test_figures_by_hand() -> None:
     found = curriculum_table.figures(_line("mixed"), "targets_reached")
     np.testing.assert_allclose(found.goal, [1.0, 0.8, 0.6, 0.9])
@@ -216,6 +231,7 @@ def test_figures_by_hand() -> None:
     np.testing.assert_allclose(found.area[0], (0.4 + 10 * 0.8) / 11)
     # Of one decade each.
     np.testing.assert_allclose(found.log_area, [0.6, 0.45, 0.25, 0.725])
+    assert found.forgotten is not None
     np.testing.assert_allclose(found.forgotten, [0.3, 0.0, 0.1, 0.1])
     other = curriculum_table.figures(_line("mixed"), "all_reached")
     np.testing.assert_allclose(other.goal, [0.7, 1.0, 0.9, 0.5])
@@ -242,12 +258,42 @@ def test_table_by_hand() -> None:
     assert mixed[8:] == ["1.00 (1.00 to 1.00)"] * 2
 
 
+def test_arms_that_were_not_judged_on_the_first_stage_have_a_dash() -> None:
+    without = _without_first("final")
+    arms = curriculum_table.tables([_line("mixed"), without])[KEY]
+    assert curriculum_table.figures(without, "targets_reached").forgotten is None
+    text = curriculum_table.table(KEY, arms, "targets_reached").splitlines()
+    forgotten = {row.split("|")[1].strip(): row.split("|")[8].strip() for row in text[4:]}
+    assert forgotten["final"] == "-"
+    assert forgotten["mixed"].startswith("0.100")  # of 0.3, 0, 0.1 and 0.1 the middle two
+    axes = Figure().subplots()
+    curriculum_table._draw_curves(axes, arms, "first", "targets_reached")
+    assert [line.get_label() for line in axes.get_lines()] == ["mixed"]
+    assert axes.get_title() == "s1 (first stage)"
+
+
+def test_all_judged_stages_are_drawn_whichever_arm_comes_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+    monkeypatch.setattr(
+        curriculum_table, "_draw_curves", lambda axes, arms, role, measure: drawn.append(role)
+    )
+    arms = curriculum_table.tables([_line("mixed"), _without_first("final")])[KEY]
+    curriculum_table.draw(KEY, arms, "targets_reached", tmp_path / "a.png")
+    assert drawn == ["goal", "first"]
+
+
 def test_lines_that_do_not_compare_are_refused() -> None:
     twice = refusal(curriculum_table.tables, [_line("mixed"), _line("mixed")])
     assert "arm mixed of s6, shared" in twice
     others = refusal(curriculum_table.tables, [_line("final"), _line("mixed", levels=5)])
     assert "final and mixed" in others
     assert "levels" in others
+    roles = {"goal": "s6", "first": "s2"}
+    assert "differ in roles" in refusal(
+        curriculum_table.tables, [_line("final"), _line("mixed", roles=roles)]
+    )
     apart = [_line("final"), _line("final", budget=5)]
     assert len(curriculum_table.tables(apart)) == 2
 
@@ -272,7 +318,57 @@ def test_the_command_reads_files_and_draws(
     drawn = tmp_path / "figures" / "s6-shared-16-1000000-targets_reached.png"
     assert drawn.read_bytes()[:4] == b"\x89PNG"
     path.write_text('{"benchmark": "other"}\n')
-    assert "holds other lines" in refusal(curriculum_table.main, [str(path)])
+    other = refusal(curriculum_table.main, [str(path)])
+    assert other == f"{path} in line 1 is none of the lines of benchmarks.curriculum."
     assert "cannot be read" in refusal(curriculum_table.main, [str(tmp_path / "none.jsonl")])
     assert "there is no file" in refusal(curriculum_table.main, [])
     assert "measure is 'time'" in refusal(curriculum_table.main, [str(path), "measure=time"])
+
+
+def _run(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["curriculum_table", *words])
+    return command.run("curriculum_table", curriculum_table.main, TrainConfig)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "what"),
+    [
+        ("arm", None, "has arm of another type: it is damaged."),
+        ("budget", "1e6", "has budget of another type: it is damaged."),
+        ("judged", {}, "has no judged.goal: it is damaged."),
+        ("roles", {"goal": "s6"}, "has no roles.first: it is damaged."),
+        ("arena_steps", [1, 2], "judged.goal.targets_reached: it is damaged."),
+        ("arena_steps", [0, 1, 2], "judged.goal.targets_reached: it is damaged."),
+        ("judged", {"goal": {}}, "judged.goal.targets_reached: it is damaged."),
+        (
+            "judged",
+            {"goal": {"targets_reached": GOAL, "all_reached": [["0", "0", "1"]]}},
+            "over arena_steps as judged.goal.all_reached: it is damaged.",
+        ),
+    ],
+)
+def test_a_damaged_line_is_named(key: str, value: object, what: str, tmp_path: Path) -> None:
+    path = tmp_path / "lines.jsonl"
+    path.write_text(json.dumps(_line("final")) + "\n" + json.dumps(_line("mixed") | {key: value}))
+    sentence = refusal(curriculum_table.read, path)
+    assert sentence.startswith(f"{path} in line 2 has ")
+    assert sentence.endswith(what)
+
+
+def test_errors_of_the_table_are_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, file = tmp_path / "lines.jsonl", tmp_path / "file"
+    file.write_text("")
+    path.write_text(json.dumps(_line("final")))
+    assert _run(monkeypatch, str(path), f"out={file}/x") == 2
+    said = capsys.readouterr()
+    # The tables are no half of an answer: nothing is printed.
+    expected = f"out is {file}/x, which cannot be written: Not a directory.\n"
+    assert (said.out, said.err) == ("", f"swarmjax.curriculum_table: error: {expected}")
+    line = _line("final")
+    del line["arm"]
+    path.write_text(json.dumps(line))
+    assert _run(monkeypatch, str(path)) == 2
+    expected = f"{path} in line 1 has no arm: it is damaged.\n"
+    assert capsys.readouterr().err == f"swarmjax.curriculum_table: error: {expected}"

@@ -1,5 +1,6 @@
 """`swarmjax.report` from its command line."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -41,11 +42,22 @@ def test_a_report_is_written_where_it_is_wanted(
     assert (out / "report.html").read_bytes() == first
 
 
+def test_a_report_of_a_run_that_was_killed_leaves_its_unfinished_line_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, out = write(tmp_path / "run", [row(0), row(1)]), tmp_path / "out"
+    with (run / "metrics.jsonl").open("a") as file:
+        file.write(json.dumps(row(2))[:-20])
+    assert _run(monkeypatch, f"run={run}", f"out={out}") == 0
+    assert "2 of 20 updates" in (out / "report.html").read_text()
+
+
 @pytest.mark.parametrize(
     ("words", "what"),
     [
         (["run=gone"], "gone is no run directory: it has no config.json."),
-        (["run=cut"], "cut/metrics.jsonl in line 2 is cut off or damaged: "),
+        (["run=cut"], "cut/metrics.jsonl in line 1 is damaged: go on with the run, or take it"),
+        (["run=text"], "text/metrics.jsonl in line 1 has no number as train_s: it is damaged."),
         (["run=empty"], "empty/metrics.jsonl has no update of every seed: train it first."),
         (["run=good", "out=file"], "out is file, which cannot be written: File exists."),
         ([], "run is missing and has no default: give it."),
@@ -60,10 +72,10 @@ def test_errors_are_one_sentence(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for name, rows in (("good", [row(0)]), ("cut", [row(0), row(1)]), ("empty", [])):
+    for name, rows in (("good", [row(0)]), ("empty", []), ("text", [row(0, train_s="1")])):
         write(Path(name), rows)
-    text = Path("cut/metrics.jsonl").read_text()
-    Path("cut/metrics.jsonl").write_text(text[:-20])
+    good = (write(Path("cut"), [row(0)]) / "metrics.jsonl").read_text()
+    Path("cut/metrics.jsonl").write_text(good[:-20] + "\n" + good)
     Path("file").write_text("")
     assert _run(monkeypatch, *words) == 2
     sentence = capsys.readouterr().err

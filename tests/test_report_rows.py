@@ -109,11 +109,13 @@ def test_a_file_that_is_not_there_is_named(file: str, what: str, tmp_path: Path)
     ("file", "content", "what"),
     [
         ("metrics.jsonl", "", " has no update of every seed: train it first."),
-        ("metrics.jsonl", '{"seed": 0, "upd', " in line 1 is cut off or damaged: "),
-        ("metrics.jsonl", "[]\n", " in line 1 is cut off or damaged: "),
+        ("metrics.jsonl", '{"seed": 0, "upd', " has no update of every seed: train it first."),
+        ("metrics.jsonl", '{"seed": 0, "upd\n{}\n', " in line 1 is damaged: go on with the run"),
+        ("metrics.jsonl", "[]\n", " in line 1 is damaged: go on with the run, or take it out."),
+        ("metrics.jsonl", "\n", " in line 1 is damaged: go on with the run, or take it out."),
         ("metrics.jsonl", "\xff\xfe\n", " cannot be read: "),
         ("metrics.jsonl", '{"seed": 0, "update": 0}\n', " in line 1 has no arena_steps: the run"),
-        ("curriculum.jsonl", '{"seed": 0, "update": 3}', " in line 1 is cut off or damaged: "),
+        ("curriculum.jsonl", '{"seed": 0, "upd\n', " in line 1 is damaged: go on with the run"),
         ("curriculum.jsonl", '{"seed": 0}\n', " in line 1 has no whole number as update: it is"),
         ("config.json", "{", " cannot be read: "),
         ("config.json", "[]", " holds no keys and values: it is damaged."),
@@ -132,6 +134,10 @@ def test_a_damaged_file_is_named_with_its_line(
     ("given", "what"),
     [
         ({"seed": None}, " has no whole number as seed: it is damaged."),
+        ({"update": True}, " has no whole number as update: it is damaged."),
+        ({"train_s": "30.0"}, " has no number as train_s: it is damaged."),
+        ({"train_s": NAN}, " has no number as train_s: it is damaged."),
+        ({"mix": ["8", "0"]}, " has mix that is no list of 2 numbers, one a stage."),
         ({"mix": [8]}, " has mix that is no list of 2 numbers, one a stage."),
         ({"weights": "x"}, " has weights that is no list of 2 numbers, one a stage."),
         (
@@ -144,6 +150,36 @@ def test_a_row_that_does_not_fit_is_named(given: dict, what: str, tmp_path: Path
     write(tmp_path, [row(0), row(1) | given])
     sentence = refusal(report_rows.read, tmp_path)
     assert sentence == f"{tmp_path / 'metrics.jsonl'} in line 2{what}"
+
+
+@pytest.mark.parametrize(
+    ("given", "what"),
+    [
+        ({"targets_reached": "0.5"}, " has no number as targets_reached: it is damaged."),
+        ({"all_reached": [0.5]}, " has no number as all_reached: it is damaged."),
+        ({"weights": [1.0, 0.0]}, " has no shares by stage as weights: it is damaged."),
+        ({"weights": {"pair": "1"}}, ", weights, has no number as pair: it is damaged."),
+    ],
+)
+def test_a_decision_that_does_not_fit_is_named(given: dict, what: str, tmp_path: Path) -> None:
+    whole = {"seed": 0, "update": 0, "targets_reached": None, "all_reached": 1}
+    write(tmp_path, [row(0)], [whole, {"seed": 0, "update": 1} | given])
+    sentence = refusal(report_rows.read, tmp_path)
+    assert sentence == f"{tmp_path / 'curriculum.jsonl'} in line 2{what}"
+
+
+@pytest.mark.parametrize("cut", [1, 20])
+def test_an_unfinished_last_line_is_skipped(cut: int, tmp_path: Path) -> None:
+    # Only its newline is missing, or more: it counts as not written in either case.
+    found = [{"seed": 0, "update": update, "why": "threshold"} for update in range(3)]
+    write(tmp_path, [row(0), row(1), row(2)], found)
+    for name in ("metrics.jsonl", "curriculum.jsonl"):
+        text = (tmp_path / name).read_text()
+        (tmp_path / name).write_text(text[:-cut])
+    history = report_rows.read(tmp_path)
+    assert history.updates.tolist() == [0, 1]
+    assert history.seconds == 60.0
+    assert history.decisions == found[:2]
 
 
 def test_a_config_that_is_refused_is_named(tmp_path: Path) -> None:

@@ -301,6 +301,22 @@ def test_a_broken_arena_starts_afresh_and_nothing_of_it_is_learnt(run: Run) -> N
     assert run.after.clock[BROKEN] == 7
 
 
+def test_a_level_counts_once_a_rollout(tiny_world: World, run: Run) -> None:
+    # Episodes end at 16 control steps: those that run at once, those that wait after three more.
+    before = dataclasses.replace(run.before, clock=jnp.full(ARENAS, 15, jnp.int32))
+    starts = dataclasses.replace(run.starts, clock=jnp.full(ARENAS, 13, jnp.int32))
+    collect = jax.jit(functools.partial(rollout.collect, tiny_world))
+    after, _, ended = collect(run.learners, before, starts, jax.random.key(2))
+    uncounted = rollout.UNCOUNTED
+    none = [-1, -1]
+    expected = [NOW, *none, NEXT, *none, uncounted, -1]
+    for arena in range(ARENAS):
+        if arena not in (BROKEN, ARRIVES):
+            assert ended.cohort[:, arena].tolist() == expected
+            assert ended.episodes[:, arena].tolist() == [1, 0, 0, 1, 0, 0, 1, 0]  # they train on
+            assert after.cohort[arena] == uncounted
+
+
 def _recount(run: Run, replay: Replay, arena: int) -> dict[int, dict[str, object]]:
     """What ended in which step of an arena, counted from the replay."""
     found, begin, clock, cohort, level = {}, 0, CLOCK[arena], NOW, _at(run.before.level, arena)

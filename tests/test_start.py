@@ -123,6 +123,13 @@ def test_networks_and_normaliser_are_carried_and_nothing_else(trained: Path) -> 
     assert (learned["update"].tolist(), found["update"].tolist()) == ([UPDATES], [0])
 
 
+def test_it_is_known_how_many_robots_have_trained(trained: Path) -> None:
+    # A promotion copies no learner over one that has learned: two robots trained, one begins.
+    source, state, settings = _load(["stage.robots=1", f"start={trained}"])
+    assert state.curriculum.met.tolist() == [1]
+    assert start.carry(source, state, settings).curriculum.met.tolist() == [2]
+
+
 def test_exploration_is_reset_only_where_that_is_said(trained: Path) -> None:
     words = [f"start={trained}", "algo.initial_std=0.25"]
     source, state, keeping = _load(words)

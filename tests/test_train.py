@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarmjax import checkpoint, command, config, export, policy, train
+from swarmjax import checkpoint, command, config, curriculum, export, policy, train
 from swarmjax.checkpoint import CheckpointError, Checkpoints, digest
 from swarmjax.config import ExportConfig, TrainConfig
 
@@ -174,6 +174,20 @@ def test_several_seeds_resume_exactly(several: Path, tmp_path: Path) -> None:
     kept = json.loads((several / "summary.json").read_text())
     for name in ("arena_steps", "transitions", "targets_reached", "decisions"):
         assert summary[name] == kept[name], name
+
+
+@pytest.mark.parametrize(
+    ("updates", "said"),
+    # A step limit of 8 is two updates of 4, the least that s1 takes; half of 3 updates, rounded
+    # up, is as much, half of 2 is not; and after 2 of 2 there is no update left.
+    [(3, ""), (2, "s2, the last, may never begin, where curriculum.budget_share=0.5 asks for 1")],
+)
+def test_a_budget_too_short_for_its_stages_is_said(updates: int, said: str) -> None:
+    words = [*TINY, "stage=curriculum", "stage.sequence=[s1,s2]", "task.step_limit=8"]
+    settings = config.load_train([*words, "arenas=4", "algo.rollout=4", f"budget={16 * updates}"])
+    sentence = " ".join(train._short_budget(settings, curriculum.schedule(settings)))
+    assert said in sentence
+    assert bool(said) == bool(sentence)
 
 
 def test_what_is_shown_names_the_seed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
