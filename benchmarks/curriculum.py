@@ -27,7 +27,7 @@ import numpy as np
 
 from benchmarks import curriculum_arms
 from benchmarks.curriculum_arms import StudyConfig
-from swarmjax import command, config, evaluate_mjx, loop, provenance, seeds
+from swarmjax import command, config, evaluate_mjx, loop, provenance, seeds, trainer
 from swarmjax.config import StageConfig, TrainConfig
 from swarmjax.loop import Program, TrainState
 from swarmjax.ppo.learner import LearnerState
@@ -116,7 +116,8 @@ def measure(trained: TrainConfig, at: np.ndarray, judge: Judge) -> Curves:
     """
     program, schedule = loop.load(trained)
     state = jax.jit(partial(seeds.init, program))(schedule)
-    compile_s, call = _timed(partial(_compile, program, schedule, state))
+    compiled = trainer.compile_chunk(program, schedule, state)
+    call = partial(compiled.call, schedule)
     # Warp builds its kernels at its first step, which is no part of training either.
     judge_compile_s, _ = _timed(partial(judge, state.learners))
     rows, train_s, judge_s = [], [], 0.0
@@ -138,7 +139,7 @@ def measure(trained: TrainConfig, at: np.ndarray, judge: Judge) -> Curves:
         broken_arenas=int(sum(row["broken_arenas"] for row in rows)),
         train_s=train_s,
         judge_s=judge_s,
-        compile_s=compile_s,
+        compile_s=compiled.seconds,
         judge_compile_s=judge_compile_s,
     )
 
@@ -153,12 +154,6 @@ def _timed[T](call: Callable[[], T]) -> tuple[float, T]:
     began = time.perf_counter()
     result = jax.block_until_ready(call())
     return time.perf_counter() - began, result
-
-
-def _compile(program: Program, schedule: Any, state: TrainState) -> Callable[..., Any]:
-    """Compiles training; the schedule, which is fixed from here on, is bound."""
-    train = jax.jit(partial(seeds.train_chunk, program), donate_argnums=1)
-    return partial(train.lower(schedule, state, np.int32(1)).compile(), schedule)
 
 
 def _train(

@@ -8,7 +8,7 @@ from math import comb
 import jax
 import numpy as np
 
-from swarmjax import loop, seeds
+from swarmjax import loop, seeds, trainer
 from swarmjax.config import TrainConfig
 
 
@@ -25,10 +25,9 @@ class Arm:
         program, schedule = loop.load(settings)
         self.settings = settings
         self._state = jax.jit(partial(seeds.init, program))(schedule)
-        began = time.perf_counter()
-        train = jax.jit(partial(seeds.train_chunk, program, schedule), donate_argnums=0)
-        self._train = train.lower(self._state, np.int32(1)).compile()
-        self.compile_s = time.perf_counter() - began
+        compiled = trainer.compile_chunk(program, schedule, self._state)
+        self._train = partial(compiled.call, schedule)
+        self.compile_s = compiled.seconds
         self.transitions = 0
 
     def time(self, updates: int) -> float:

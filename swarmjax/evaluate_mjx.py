@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from swarmjax import evaluate, rollout
 from swarmjax.config import ConfigError, StageConfig
@@ -69,31 +70,30 @@ def draw_levels(world: World, stage: StageConfig, seed: int, episodes: int) -> L
             )
     one = task_stage.select(task_stage.stack([stage]), np.intp(0))
     spacing = world.spacing._replace(robots=stage.robots, obstacles=stage.obstacles)
-    drawn = [evaluate.draw_level(one, spacing, seed, episode) for episode in range(episodes)]
-    stacked = Level(*(np.stack(fields) for fields in zip(*drawn, strict=True)))
-    return _make_room(stacked, world.spacing)
+    drawn = [
+        _make_room(evaluate.draw_level(one, spacing, seed, episode), world.spacing)
+        for episode in range(episodes)
+    ]
+    return Level(*(np.stack(fields) for fields in zip(*drawn, strict=True)))
 
 
-def _make_room(levels: Level, spacing: Spacing) -> Level:
-    """Adds robots and obstacles to levels [E] that are absent, each parked at its own place."""
-    line = level.PARKING + level.PARKING_SPACING * np.arange(max(spacing.robots, spacing.obstacles))
-    away = np.stack([line, np.full_like(line, level.PARKING)], axis=-1).astype(np.float32)
-    away = np.tile(away, (len(levels.side), 1, 1))
-    robot = away[:, levels.present.shape[1] : spacing.robots]
-    box = -away[:, levels.obstacle_present.shape[1] : spacing.obstacles]
-    # Whatever is parked has edges too; these nobody meets.
-    half = np.full_like(box, level.MARGIN)
-    more = {
-        "present": np.zeros(robot.shape[:2], bool),
-        "start": np.concatenate([robot, 0 * robot[..., :1]], axis=-1),
-        "target": robot,
-        "obstacle_present": np.zeros(box.shape[:2], bool),
-        "obstacle": np.concatenate([box, 0 * box[..., :1], half], axis=-1),
-    }
-    wider = {
-        name: np.concatenate([getattr(levels, name), added], axis=1) for name, added in more.items()
-    }
-    return levels._replace(**wider)
+def _make_room(drawn: Level, spacing: Spacing) -> Level:
+    """Adds absent robots and obstacles to a level, and parks them."""
+    robots = spacing.robots - len(drawn.present)
+    obstacles = spacing.obstacles - len(drawn.obstacle_present)
+
+    def widened(x: np.ndarray, more: int, fill: ArrayLike = 0) -> np.ndarray:
+        return np.concatenate([x, np.full((more, *x.shape[1:]), fill, x.dtype)])
+
+    wider = drawn._replace(
+        present=widened(drawn.present, robots),
+        start=widened(drawn.start, robots),
+        target=widened(drawn.target, robots),
+        obstacle_present=widened(drawn.obstacle_present, obstacles),
+        # Whatever is parked has edges too; these nobody meets.
+        obstacle=widened(drawn.obstacle, obstacles, (0, 0, 0, level.MARGIN, level.MARGIN)),
+    )
+    return level.park(wider, np)
 
 
 def outcomes(world: World, learners: LearnerState, levels: Level, steps: int) -> Outcomes:

@@ -156,7 +156,8 @@ def _kept(path: Path, update: int) -> list[Row]:
     """Reads the rows before `update`."""
     if not path.exists():
         return []
-    return [json.loads(line) for line in path.read_text().splitlines() if _update_of(line) < update]
+    found = map(_parsed, path.read_text().splitlines())
+    return [row for row in found if row.get("update", math.inf) < update]
 
 
 def _truncate(path: Path, update: int) -> None:
@@ -165,9 +166,9 @@ def _truncate(path: Path, update: int) -> None:
         path.write_text("".join(json.dumps(row) + "\n" for row in _kept(path, update)))
 
 
-def _update_of(line: str) -> float:
-    """Returns the update of a row; a line that a crash cut off counts as later than all."""
+def _parsed(line: str) -> Row:
+    """Reads a row; one that a crash cut off is empty."""
     try:
-        return json.loads(line)["update"]
-    except (json.JSONDecodeError, KeyError):
-        return math.inf
+        return json.loads(line)
+    except json.JSONDecodeError:
+        return {}

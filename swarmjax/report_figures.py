@@ -140,10 +140,7 @@ def cells_of(stages: tuple[StageConfig, ...]) -> Mapping[Cell, int] | None:
     They do if no two share a cell, two axes at least have several values, and at least half of all
     cells are there: a grid lacks those that are too small for what they would hold.
     """
-    cells = {
-        (stage.robots, stage.obstacles, report_rows.span(stage.side)): i
-        for i, stage in enumerate(stages)
-    }
+    cells = {(stage.robots, stage.obstacles, stage.sides): i for i, stage in enumerate(stages)}
     lengths = [len(set(axis)) for axis in zip(*cells, strict=True)]
     several = sum(length > 1 for length in lengths)
     whole = len(cells) == len(stages) and 2 * len(cells) >= math.prod(lengths)

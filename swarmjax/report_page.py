@@ -203,7 +203,7 @@ def _stages(history: History) -> str:
             stage.name,
             stage.robots,
             stage.obstacles,
-            report_rows.side_text(stage.side),
+            report_rows.side_text(stage.sides),
             _percent(share[i]),
             _percent(last["success_by_stage"][0][i]),
             _percent(last["complete_by_stage"][0][i]),

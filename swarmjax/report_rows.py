@@ -143,14 +143,9 @@ def among(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array(mean), there.sum(axis=0)
 
 
-def span(side: float | tuple[float, float]) -> tuple[float, float]:
-    """Smallest and largest side of a stage, m."""
-    return side if isinstance(side, tuple) else (side, side)
-
-
-def side_text(side: float | tuple[float, float]) -> str:
-    """Writes a side, or the range it is drawn from, without its unit."""
-    low, high = span(side)
+def side_text(sides: tuple[float, float]) -> str:
+    """Writes the smallest and the largest side of a stage as one, or as a range, without unit."""
+    low, high = sides
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 

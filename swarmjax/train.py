@@ -139,14 +139,16 @@ def _opening(settings: TrainConfig) -> str:
 def _short_budget(settings: TrainConfig, schedule: Schedule) -> list[str]:
     """Says where stages need more of the budget than they are to have, in no or one sentence."""
     share = settings.curriculum.budget_share
-    begins = curriculum.last_begins(schedule)
-    if share is None or begins <= math.ceil(share * settings.updates):
+    if share is None:
+        return []
+    begins, latest = curriculum.last_begins(schedule), math.ceil(share * settings.updates)
+    if begins <= latest:
         return []
     when = f"begin as late as update {begins:,}" if begins < settings.updates else "never begin"
     return [
         f"the budget is short: a stage takes at least {schedule.cohort_updates} updates (one step "
         f"limit), so that {settings.stage[-1].name}, the last, may {when}, where "
-        f"curriculum.budget_share={share} asks for {math.ceil(share * settings.updates):,} at the "
+        f"curriculum.budget_share={share} asks for {latest:,} at the "
         "latest: give more budget, fewer arenas or fewer stages."
     ]
 

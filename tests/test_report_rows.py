@@ -9,7 +9,7 @@ from runs import CONFIG, row, write
 from sentences import refusal
 
 from swarmjax import report_rows
-from swarmjax.config import CurriculumConfig
+from swarmjax.config import CurriculumConfig, StageConfig
 
 NAN = np.nan
 
@@ -86,9 +86,9 @@ def test_seeds_without_a_value_are_left_out_and_counted() -> None:
 
 
 def test_sides_are_written_as_points_and_ranges() -> None:
-    assert report_rows.side_text(1.0) == "1"
+    assert report_rows.side_text((1.0, 1.0)) == "1"
     assert report_rows.side_text((0.5, 1.25)) == "0.5 to 1.25"
-    assert report_rows.span(0.7) == (0.7, 0.7)
+    assert StageConfig(name="one", robots=2, side=0.7).sides == (0.7, 0.7)
 
 
 @pytest.mark.parametrize(

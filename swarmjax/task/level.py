@@ -118,7 +118,7 @@ def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     random = _random(drawn, stage, spacing, xp)
     fixed = _fixed(drawn, stage, spacing, xp)
     level = [xp.where(stage.fixed, f, r) for f, r in zip(fixed, random, strict=True)]
-    return _park(Level(*level), xp)
+    return park(Level(*level), xp)
 
 
 def _split(uniforms: Array, spacing: Spacing) -> _Uniforms:
@@ -239,8 +239,16 @@ def _fixed(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     )
 
 
-def _park(level: Level, xp: Any) -> Level:
-    """Moves what is absent outside, each thing to a place of its own."""
+def park(level: Level, xp: Any) -> Level:
+    """Moves what is absent outside, each thing to a place of its own.
+
+    Args:
+      level: of one arena; where absent things stand in it makes no difference.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      The level, absent robots with heading 0; edges and angles of obstacles stay.
+    """
     robots, obstacles = level.present.shape[0], level.obstacle_present.shape[0]
     line = PARKING + PARKING_SPACING * np.arange(max(robots, obstacles), dtype=np.float32)
     away = np.stack([line, line * 0 + PARKING], axis=-1)
