@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from swarmjax import evaluate, rollout
+from swarmjax import evaluate_c, rollout
 from swarmjax.config import ConfigError, StageConfig
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
@@ -71,7 +71,7 @@ def draw_levels(world: World, stage: StageConfig, seed: int, episodes: int) -> L
     one = task_stage.select(task_stage.stack([stage]), np.intp(0))
     spacing = world.spacing._replace(robots=stage.robots, obstacles=stage.obstacles)
     drawn = [
-        _make_room(evaluate.draw_level(one, spacing, seed, episode), world.spacing)
+        _make_room(evaluate_c.draw_level(one, spacing, seed, episode), world.spacing)
         for episode in range(episodes)
     ]
     return Level(*(np.stack(fields) for fields in zip(*drawn, strict=True)))

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from swarmjax import command, config, evaluate, policy
+from swarmjax import command, config, evaluate, evaluate_c, policy
 from swarmjax.config import (
     ConfigError,
     EvaluateConfig,
@@ -25,7 +25,7 @@ from swarmjax.config import (
     TaskConfig,
     TrainConfig,
 )
-from swarmjax.evaluate import Arenas, Judge, Outcome
+from swarmjax.evaluate_c import Arenas, Judge, Outcome
 from swarmjax.policy import PolicyError
 from swarmjax.sim import gaps, infrared, model, physics
 from swarmjax.task import env, observation, senses
@@ -88,14 +88,14 @@ def _stage(
 def _judge(tmp_path: Path, stage: StageConfig, drive: tuple = STEER, **rest: Any) -> Judge:
     path = _policy(tmp_path / "policy.npz", drive)
     config = EvaluateConfig(policy=str(path), stage=stage, **rest)
-    return evaluate.load(config, policy.load(path))
+    return evaluate_c.load(config, policy.load(path))
 
 
 def _start(
     judge: Judge, pose: list, target: list | None = None, obstacle: list | None = None
 ) -> Arenas:
     """Starts one arena by hand; without a target it lies far ahead, out of reach."""
-    return evaluate.start(judge, [_level(judge, pose, target, obstacle)])
+    return evaluate_c.start(judge, [_level(judge, pose, target, obstacle)])
 
 
 def _level(
@@ -121,7 +121,7 @@ def _level(
 
 def _run(judge: Judge, arenas: Arenas, steps: int) -> Arenas:
     for _ in range(steps):
-        arenas = evaluate.step(judge, arenas)
+        arenas = evaluate_c.step(judge, arenas)
     return arenas
 
 
@@ -234,7 +234,9 @@ def test_a_control_step_is_that_many_steps_of_mujoco(tmp_path: Path) -> None:
     pose = [[-0.1, 0.02, 0.1], [0.1, 0.0, 2.5]]
     box = [[0.0, 0.15, 0.3, 0.05, 0.05]]
     arenas = _run(judge, _start(judge, pose, obstacle=box), 50)
-    data = evaluate.place(judge, judge.model, np.array(pose, np.float32), np.array(box, np.float32))
+    data = evaluate_c.place(
+        judge, judge.model, np.array(pose, np.float32), np.array(box, np.float32)
+    )
     data.ctrl = [SPEED, 0.0, 0.0] * 2
     # Float32 rounds the policy's action, which contacts do not magnify here.
     mujoco.mj_step(judge.model, data, 150)
@@ -251,7 +253,7 @@ def test_touching_is_a_gap_below_zero(tmp_path: Path) -> None:
     box[..., 2] *= 8.0
     box[..., 3:] = 0.05
     data = np.empty(count, object)
-    data[:] = [evaluate.place(judge, judge.model, *each) for each in zip(pose, box, strict=True)]
+    data[:] = [evaluate_c.place(judge, judge.model, *each) for each in zip(pose, box, strict=True)]
     gap = np.stack(
         [
             gaps.gaps(p.astype(float), judge.stage.side, b.astype(float), 0.037, np)
@@ -259,7 +261,7 @@ def test_touching_is_a_gap_below_zero(tmp_path: Path) -> None:
         ]
     )
     assert np.abs(gap).min() > 1e-7  # float32 in the walls' quaternions moves them by 1e-8 m
-    touching = evaluate.touching(judge, data)
+    touching = evaluate_c.touching(judge, data)
     assert touching.mean(axis=(0, 1)).min() > 0.1  # every kind occurs
     np.testing.assert_array_equal(touching, gap <= 0.0)
 
@@ -267,14 +269,14 @@ def test_touching_is_a_gap_below_zero(tmp_path: Path) -> None:
 def test_the_walls_stand_where_the_level_says(tmp_path: Path) -> None:
     """Of arenas whose side is drawn: a robot 5 mm away sees it, one 1 mm inside touches it."""
     judge = _judge(tmp_path, _stage(robots=1, side=(0.6, 1.4)))
-    drawn = [evaluate.draw_level(judge.stage, judge.spacing, 1, i) for i in range(20)]
+    drawn = [evaluate_c.draw_level(judge.stage, judge.spacing, 1, i) for i in range(20)]
     sides = [level.side for level in drawn]
     assert max(sides) - min(sides) > 0.4
     for gap in (0.005, -0.001):
         wall = [np.array([[0.5 * side - 0.037 - gap, 0.0, 0.0]], np.float32) for side in sides]
         levels = [level._replace(start=x) for level, x in zip(drawn, wall, strict=True)]
-        arenas = evaluate.start(judge, levels)
-        touched = evaluate.touching(judge, arenas.data)
+        arenas = evaluate_c.start(judge, levels)
+        touched = evaluate_c.touching(judge, arenas.data)
         assert (touched.any(axis=(1, 2)) == (gap < 0)).all()
         if gap > 0:
             nearest = arenas.observation[:, 0, :8].min(axis=-1)
@@ -286,8 +288,8 @@ def test_the_judge_counts_what_the_training_environment_counts(tmp_path: Path) -
     stage = _stage(robots=3, side=0.7, obstacles=1)
     judge = _judge(tmp_path, stage)
     # An episode in which robots meet one another and the obstacle, and all arrive.
-    drawn = evaluate.draw_level(judge.stage, judge.spacing, 1, 65)
-    arenas = evaluate.start(judge, [drawn])
+    drawn = evaluate_c.draw_level(judge.stage, judge.spacing, 1, 65)
+    arenas = evaluate_c.start(judge, [drawn])
     sim = SimConfig(impl="jax", max_robots=3, max_obstacles=1)
     world = env.load(TrainConfig(stage=(stage,), sim=sim))
     zero = jnp.zeros((), jnp.int32)
@@ -300,7 +302,7 @@ def test_the_judge_counts_what_the_training_environment_counts(tmp_path: Path) -
     for _ in range(168):
         state, came = step(state, policy.mean_action(judge.policy, np.asarray(seen)))
         seen = np.asarray(came.observation)
-        arenas = evaluate.step(judge, arenas)
+        arenas = evaluate_c.step(judge, arenas)
         np.testing.assert_allclose(seen, arenas.observation[0], atol=1e-3)
         np.testing.assert_array_equal(state.arrived, arenas.outcome.arrived[0])
     assert arenas.outcome.arrived.all()
@@ -345,12 +347,12 @@ def engines(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
         return dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
 
     step = jax.jit(lambda state, action: env.step(world, state, action))
-    return Engines(evaluate.load(judged, policy.load(path)), world, jax.jit(reset), step)
+    return Engines(evaluate_c.load(judged, policy.load(path)), world, jax.jit(reset), step)
 
 
 def _draw(engines: Engines) -> Level:
     """An episode in which robots meet one another and the obstacle."""
-    return evaluate.draw_level(engines.judge.stage, engines.judge.spacing, 1, 65)
+    return evaluate_c.draw_level(engines.judge.stage, engines.judge.spacing, 1, 65)
 
 
 def _train(engines: Engines, drawn: Level, steps: int) -> tuple[list[EnvState], list[np.ndarray]]:
@@ -368,7 +370,7 @@ def _train(engines: Engines, drawn: Level, steps: int) -> tuple[list[EnvState], 
 def test_judge_and_training_see_the_same_and_count_the_same(engines: Engines) -> None:
     drawn, steps = _draw(engines), 64
     states, seen = _train(engines, drawn, steps)
-    arenas = evaluate.start(engines.judge, [drawn])
+    arenas = evaluate_c.start(engines.judge, [drawn])
     for theirs, mine in zip(states[0].factors, arenas.factors, strict=True):
         assert (theirs is None) == (mine is None)
         if theirs is not None and mine is not None:
@@ -389,7 +391,7 @@ def test_judge_and_training_see_the_same_and_count_the_same(engines: Engines) ->
         np.testing.assert_array_equal(state.episode.contacts, arenas.outcome.contacts[0])
         np.testing.assert_array_equal(state.arrived, arenas.outcome.arrived[0])
         touched = bool(arenas.outcome.contacts.any())
-        arenas = evaluate.step(engines.judge, arenas)
+        arenas = evaluate_c.step(engines.judge, arenas)
     assert touched
     assert (seen[-1][:, :8] < 0.04).any()
 
@@ -401,7 +403,8 @@ def test_a_level_replays_exactly(engines: Engines) -> None:
     np.testing.assert_array_equal(seen, seen_again)
     np.testing.assert_array_equal(states[-1].sim.qpos, again[-1].sim.qpos)
     first, second = (
-        _run(engines.judge, evaluate.start(engines.judge, [drawn, drawn]), steps) for _ in range(2)
+        _run(engines.judge, evaluate_c.start(engines.judge, [drawn, drawn]), steps)
+        for _ in range(2)
     )
     np.testing.assert_array_equal(first.observation, second.observation)
     np.testing.assert_array_equal(first.observation[0], first.observation[1])
@@ -410,7 +413,7 @@ def test_a_level_replays_exactly(engines: Engines) -> None:
     # What is random about it comes from its seed, and nothing else does.
     other = drawn._replace(seed=drawn.seed ^ np.uint32(1))
     _, elsewhere = _train(engines, other, steps)
-    judged = _run(engines.judge, evaluate.start(engines.judge, [other]), steps)
+    judged = _run(engines.judge, evaluate_c.start(engines.judge, [other]), steps)
     is_random = engines.world.config.realism.name == "real"
     assert (np.array(elsewhere) != np.array(seen)).any() == is_random
     assert (judged.observation[0] != first.observation[0]).any() == is_random
@@ -435,7 +438,7 @@ def _tour(tmp_path: Path, body: BodyName, **realism: Any) -> tuple[np.ndarray, n
     arenas = _start(judge, CROWD, obstacle=BOX)
     path, seen = [], [arenas.observation[0]]
     for _ in range(12):
-        arenas = evaluate.step(judge, arenas)
+        arenas = evaluate_c.step(judge, arenas)
         path.append(model.BODIES[body].pose(arenas.data[0].qpos.copy(), np))
         seen.append(arenas.observation[0])
     return np.array(path), np.array(seen)
@@ -539,16 +542,16 @@ def test_the_judge_sees_how_bright_each_thing_is(tmp_path: Path) -> None:
         reflectance_robot=shade,
     )
     judge = _judge(tmp_path, _stage(robots=3, side=0.7, obstacles=2), realism=real)
-    levels = [evaluate.draw_level(judge.stage, judge.spacing, 1, n) for n in range(200)]
+    levels = [evaluate_c.draw_level(judge.stage, judge.spacing, 1, n) for n in range(200)]
     # Closer together than they would ever start.
     levels = [drawn._replace(start=drawn.start * np.float32([1.0, 0.7, 1.0])) for drawn in levels]
-    arenas = evaluate.start(judge, levels)
+    arenas = evaluate_c.start(judge, levels)
     pose, side, box = (
         np.array([getattr(drawn, name) for drawn in levels], np.float64)
         for name in ("start", "side", "obstacle")
     )
     args = (arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)
-    sight, shades = evaluate.look(judge, *args), senses.reflectance(arenas.factors)
+    sight, shades = evaluate_c.look(judge, *args), senses.reflectance(arenas.factors)
     assert shades is not None
     assert sight.reflectance is not None
     ray, bright = infrared.sights(pose, side, box, 0.037, 0.1, shades, None, np)
@@ -569,7 +572,7 @@ def test_each_arena_has_robots_of_its_own(tmp_path: Path, body: BodyName) -> Non
     levels = [
         _level(judge, [[-0.04, 0.0, 0.0], [0.04, 0.0, math.pi]], seed=seed) for seed in range(6)
     ]
-    arenas = evaluate.start(judge, levels)
+    arenas = evaluate_c.start(judge, levels)
     mass = arenas.factors.mass
     assert mass is not None
     for one, found in zip(arenas.model, mass, strict=True):
@@ -585,10 +588,10 @@ def test_each_arena_has_robots_of_its_own(tmp_path: Path, body: BodyName) -> Non
 
 def test_an_episode_does_not_depend_on_those_beside_it(tmp_path: Path) -> None:
     judge = _judge(tmp_path, _stage(robots=3, side=0.7, obstacles=1), steps=150)
-    together = evaluate.simulate(judge, range(8))
+    together = evaluate_c.simulate(judge, range(8))
     assert len(set(together.clock.tolist())) > 2  # arenas leave at different times
     for episode in (0, 5, 7):
-        alone = evaluate.simulate(judge, [episode])
+        alone = evaluate_c.simulate(judge, [episode])
         for one, all_ in zip(alone, together, strict=True):
             np.testing.assert_array_equal(one[0], all_[episode])
 
@@ -613,10 +616,10 @@ def test_a_result_does_not_depend_on_batches_and_workers(
 def test_seed_and_number_alone_decide_the_level(tmp_path: Path) -> None:
     judge = _judge(tmp_path, _stage(robots=2, obstacles=2))
     again, other, next_ = (
-        evaluate.draw_level(judge.stage, judge.spacing, seed, episode)
+        evaluate_c.draw_level(judge.stage, judge.spacing, seed, episode)
         for seed, episode in ((1, 4), (2, 4), (1, 5))
     )
-    first = evaluate.draw_level(judge.stage, judge.spacing, 1, 4)
+    first = evaluate_c.draw_level(judge.stage, judge.spacing, 1, 4)
     np.testing.assert_array_equal(first.start, again.start)
     assert (first.start != other.start).any()
     assert (first.start != next_.start).any()
@@ -663,7 +666,7 @@ def test_the_policy_says_how_fast_it_may_ask_for(tmp_path: Path) -> None:
     limits = {"low": [0.0, -1.0], "high": [0.05, 1.0]}
     names = {"names": ["speed", "turn_rate"], "units": ["m/s", "rad/s"]}
     path = _policy(tmp_path / "policy.npz", AHEAD, action=names | limits)
-    judge = evaluate.load(EvaluateConfig(policy=str(path), stage=_stage()), policy.load(path))
+    judge = evaluate_c.load(EvaluateConfig(policy=str(path), stage=_stage()), policy.load(path))
     arenas = _run(judge, _start(judge, [[0.0, 0.0, 0.0]]), 10)
     assert _pose(arenas)[0, 0, 0] == pytest.approx(10 * 0.05 * STEP, abs=1e-7)  # float32 action
 
@@ -676,7 +679,7 @@ def test_physics_that_breaks_down_is_refused(
     arenas = _start(judge, [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])
     arenas.data[0].qvel[3] = np.nan
     with pytest.raises(ConfigError, match=r"^the physics broke down.*substeps of more than 1.*\.$"):
-        evaluate.step(judge, arenas)
+        evaluate_c.step(judge, arenas)
 
 
 def test_summarize_by_hand() -> None:
@@ -788,6 +791,8 @@ def test_a_policy_of_three_judges_three(tmp_path: Path) -> None:
     path = _policy(tmp_path / "policy.npz", learners=3, policy="independent")
     config = EvaluateConfig(policy=str(path), stage=_stage(robots=4))
     with pytest.raises(PolicyError, match=r"each of 3 robots, but stage\.robots is 4"):
-        evaluate.load(config, policy.load(path))
+        evaluate_c.load(config, policy.load(path))
     config = EvaluateConfig(policy=str(path), stage=_stage(robots=3), task=TaskConfig(), steps=2)
-    assert evaluate.simulate(evaluate.load(config, policy.load(path)), [0]).clock.tolist() == [2]
+    assert evaluate_c.simulate(evaluate_c.load(config, policy.load(path)), [0]).clock.tolist() == [
+        2
+    ]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from sentences import refusal
 
-from swarmjax import evaluate, evaluate_mjx, policy
+from swarmjax import evaluate, evaluate_c, evaluate_mjx, policy
 from swarmjax.config import (
     AlgoConfig,
     EvaluateConfig,
@@ -128,7 +128,7 @@ def test_levels_are_those_of_the_other_judge(
     one = task_stage.select(task_stage.stack([stage]), np.intp(0))
     spacing = level.Spacing(stage.robots, stage.obstacles, 0.037, 0.05)
     for episode in (0, 7, EPISODES - 1):
-        drawn = evaluate.draw_level(one, spacing, SEED, episode)
+        drawn = evaluate_c.draw_level(one, spacing, SEED, episode)
         for name in ("present", "start", "target"):
             found = getattr(levels, name)[episode, : stage.robots]
             np.testing.assert_array_equal(found, getattr(drawn, name), err_msg=name)

@@ -26,8 +26,9 @@ LAYERS = (
     {"command", "report_figures", "report_page", "trainer"},
     {"export"},
     {"start"},
-    {"report", "train", "evaluate"},
+    {"evaluate_c"},
     {"evaluate_mjx"},
+    {"report", "train", "evaluate"},
 )
 # These stand alone: the learner knows nothing of robots, a policy file needs only NumPy.
 ONLY = {"ppo": {"config"}, "policy": set(), "epuck": set(), "settings": set()}

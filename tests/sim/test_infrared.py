@@ -11,9 +11,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from swarmjax import evaluate
+from swarmjax import evaluate_c
 from swarmjax.config import EvaluateConfig, StageConfig
-from swarmjax.evaluate import Judge
+from swarmjax.evaluate_c import Judge
 from swarmjax.policy import Layer, Policy
 from swarmjax.sim import infrared
 from swarmjax.task import observation
@@ -261,7 +261,7 @@ def _judge(stage: StageConfig) -> Judge:
         observation_std=size + 1.0,
         meta=meta,
     )
-    return evaluate.load(EvaluateConfig(policy="", stage=stage), policy)
+    return evaluate_c.load(EvaluateConfig(policy="", stage=stage), policy)
 
 
 ROBOTS, BOXES, ARENAS = 5, 2, 200
@@ -304,8 +304,10 @@ def test_distances_are_those_of_mujoco_at_1000_random_poses(xp: ModuleType) -> N
     judge = _judge(StageConfig(name="test", robots=ROBOTS, side=SIDE, obstacles=BOXES))
     pose, box = _scenes()
     data = np.empty(ARENAS, object)
-    data[:] = [evaluate.place(judge, judge.model, *scene) for scene in zip(pose, box, strict=True)]
-    seen_by_mujoco, _ = evaluate.cast_rays(judge, data, pose.astype(float), box.astype(float))
+    data[:] = [
+        evaluate_c.place(judge, judge.model, *scene) for scene in zip(pose, box, strict=True)
+    ]
+    seen_by_mujoco, _ = evaluate_c.cast_rays(judge, data, pose.astype(float), box.astype(float))
     found = np.array(_distances(pose, box, xp))
     # Rays that meet something, and rays that start inside something.
     assert (seen_by_mujoco < RANGE).sum() > 1000
