@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from swarmjax import command, config, epuck, evaluate, policy, provenance
+from swarmjax import command, config, epuck, evaluate, policy_file, provenance
 from swarmjax.config import EvaluateConfig
 from swarmjax.task import observation
 
@@ -58,11 +58,21 @@ def write(path: Path, ahead: Sequence[float], *sides: Sequence[float]) -> None:
             "low": [0.0, -turn],
             "high": [epuck.MAX_SPEED, turn],
         },
+        "robot": {
+            "preset": "planar",
+            "body": "planar",
+            "wheel_radius": epuck.WHEEL_RADIUS,
+            "track": epuck.TRACK,
+            "max_wheel_speed": epuck.MAX_WHEEL_SPEED,
+        },
+        "sensors": {"preset": "ideal", "response": "ideal", "range": epuck.SENSOR_RANGE},
+        "task": {"control_step": 0.032, "target_radius": 0.05},
+        "seed": 0,
         "config": {},
         "versions": provenance.versions(),
         "update": 0,
     }
-    policy.save(path, arrays, meta)
+    policy_file.write(path, arrays, meta)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -72,8 +82,9 @@ def main(arguments: Sequence[str]) -> int:
             path = Path(folder) / f"{name}.npz"
             write(path, *actions)
             settings = config.load_evaluate([*arguments, f"policy={path}"])
-            result = evaluate.evaluate(settings, policy.load(path))
-        line = {"benchmark": "baselines", **result, "policy": name, "commit": provenance.commit()}
+            result = evaluate.evaluate(settings).result
+        del result["policies"]  # written a moment ago, to a folder that is gone
+        line = {"benchmark": "baselines", "policy": name, **result, "commit": provenance.commit()}
         sys.stdout.write(json.dumps(line) + "\n")
         sys.stdout.flush()
     return 0

@@ -1,23 +1,22 @@
 """What does a policy lose on the wheeled body, and under a realism that it was not trained with?
 
 `python -m benchmarks.transfer policies=ideal:a.npz+b.npz,real:c.npz [key=value ...]` takes the keys
-of `swarmjax.evaluate` but `policy`, and judges every policy (`label:` files of several seeds, `+`
-between them) in MuJoCo C on the same levels in each world of `WORLDS`. It prints a JSON line for
-each label and world: means with 95 % intervals, and paired differences to the label's first world
-(`_change`) and to the same body's ideal one (`_realism_change`). Intervals are of a bootstrap that
-draws whole levels, for all seeds alike: they hold for these policies on other levels; how far seeds
-differ is in `targets_reached_by_seed`.
+of `swarmjax.evaluate` but `policy` and `suite`, and judges every policy (`label:` files of several
+seeds, `+` between them) in MuJoCo C on the same levels in each world of `WORLDS`. It prints a JSON
+line for each label and world: means with 95 % intervals, and paired differences to the label's
+first world (`_change`) and to the same body's ideal one (`_realism_change`). Intervals are of a
+bootstrap that draws whole levels, for all seeds alike: they hold for these policies on other
+levels; how far seeds differ is in `targets_reached_by_seed`.
 """
 
 import json
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from swarmjax import command, config, evaluate, policy, provenance, statistics
+from swarmjax import cells, command, config, evaluate_run, policy_file, provenance, statistics
 from swarmjax.config import ConfigError, EvaluateConfig
 
 WORLDS = (("planar", "ideal"), ("wheeled", "ideal"), ("wheeled", "webots"), ("wheeled", "real"))
@@ -34,12 +33,10 @@ def judge(settings: EvaluateConfig, files: Sequence[str]) -> dict[str, np.ndarra
     Returns:
       [seeds, levels] of each measure.
     """
-    rows = []
-    for name in files:
-        mine = replace(settings, policy=name)
-        outcome = evaluate.outcomes(mine, policy.load(name))
-        rows.append(evaluate.per_level(outcome, settings.task.control_step))
-    return {name: np.stack([row[name] for row in rows]) for name in MEASURES}
+    (trial,) = evaluate_run.run(
+        settings, cells.load(settings).cells, evaluate_run.read_policies(files)
+    )
+    return {name: trial.found[name] for name in MEASURES}
 
 
 def summarize(
@@ -76,6 +73,11 @@ def results(words: Sequence[str], policies: dict[str, list[str]]) -> Iterator[di
         for body, realism in WORLDS:
             given = [f"policy={some}", *words, f"robot={body}", f"realism={realism}"]
             settings = config.load_evaluate(given)
+            if settings.suite is not None:
+                raise ConfigError(
+                    f"suite is '{settings.suite}', but worlds are compared on levels of one stage: "
+                    "give stage, shape, episodes and seed."
+                )
             worlds[body, realism] = judge(settings, files)
             yield {
                 "benchmark": "transfer",
@@ -86,7 +88,7 @@ def results(words: Sequence[str], policies: dict[str, list[str]]) -> Iterator[di
                 "levels": settings.episodes,
                 "seeds": len(files),
                 **summarize(worlds[body, realism], worlds[WORLDS[0]], worlds[body, "ideal"]),
-                "digests": [policy.load(name).digest[:12] for name in files],
+                "digests": [policy_file.read(name).digest[:12] for name in files],
                 "device": provenance.device(),
                 "versions": provenance.versions(),
                 "commit": provenance.commit(),

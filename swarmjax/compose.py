@@ -43,11 +43,11 @@ def compose(
         _check_choice(key, choice, key)
     for key in words.keys() - groups.keys():
         _parse(words[key])
-    chosen = defaults(command) | groups
-    for group, choice in chosen.items():
+    for group, choice in (defaults(command) | groups).items():
         _read_yaml(f"{group}/{choice}")  # names a broken file, where Hydra would not
     forced = [word if key in groups else f"++{word}" for key, word in words.items()]
-    return _resolve(_hydra(command, forced)), chosen
+    composed, chosen = _hydra(command, forced)
+    return _resolve(composed), chosen
 
 
 def stages(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
@@ -162,18 +162,61 @@ def _config_dir() -> Path:
 
 def _read_yaml(name: str) -> dict[str, Any]:
     """Read one file of configs/ as it stands."""
+    return read_yaml(_config_dir() / f"{name}.yaml")
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read a file of keys and values as it stands.
+
+    Raises:
+        ConfigError: it cannot be read, or is nothing of the kind.
+    """
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError
 
-    path = _config_dir() / f"{name}.yaml"
     try:
         mapping = OmegaConf.to_container(OmegaConf.load(path))
-    except (OSError, YAMLError, OmegaConfBaseException) as error:
+    except (OSError, UnicodeError, YAMLError, OmegaConfBaseException) as error:
         raise ConfigError(f"{path} cannot be read: {_first_line(error)}.") from None
     if not isinstance(mapping, dict):
         raise ConfigError(f"{path} is no list of keys and values: write key: value.")
     return {str(key): value for key, value in mapping.items()}
+
+
+def read_stage(choice: str) -> dict[str, Any]:
+    """Read a file of configs/stage/ that is a single stage.
+
+    Raises:
+        ConfigError: there is none of this name, or it stands for several.
+    """
+    _check_choice("stage", choice, "stage")
+    if is_sequence(choice) or is_grid(choice):
+        raise ConfigError(f"stage is {choice}, which stands for several: give single stages.")
+    return _read_yaml(f"stage/{choice}")
+
+
+def read_preset(group: str, choice: str) -> dict[str, Any]:
+    """Read a file of a group that stands for itself, such as `realism` and `real`.
+
+    Raises:
+        ConfigError: there is none of this name.
+    """
+    _check_choice(group, choice, group)
+    return _read_yaml(f"{group}/{choice}")
+
+
+def suite_path(choice: str) -> Path:
+    """Return the file of a suite: of this name in configs/suites/, or at this path.
+
+    Raises:
+        ConfigError: there is no such suite.
+    """
+    path = Path(choice)
+    if path.suffix == ".yaml":
+        return path
+    _check_choice("suites", choice, "suite")
+    return _config_dir() / "suites" / f"{choice}.yaml"
 
 
 def _example(group: str) -> str:
@@ -276,11 +319,15 @@ def _parse(word: str) -> object:
 # Hydra
 
 
-def _hydra(command: str, overrides: list[str]) -> "DictConfig":
-    """Compose in a Hydra of our own, and leave one that the caller may have as it was."""
+def _hydra(command: str, overrides: list[str]) -> tuple["DictConfig", dict[str, str]]:
+    """Compose in a Hydra of our own, and leave one that the caller may have as it was.
+
+    The choice of each group comes from Hydra too: a file may choose those of other groups.
+    """
     import hydra
     from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
+    from omegaconf import open_dict
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError
 
@@ -288,11 +335,15 @@ def _hydra(command: str, overrides: list[str]) -> "DictConfig":
     GlobalHydra.instance().clear()
     try:
         with hydra.initialize_config_dir(config_dir=str(_config_dir()), version_base="1.3"):
-            return hydra.compose(command, overrides=overrides)
+            composed = hydra.compose(command, overrides=overrides, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
         raise ConfigError(f"the settings do not fit together: {_first_line(error)}.") from None
     finally:
         GlobalHydra.instance().hydra = outer
+    chosen = {group: composed.hydra.runtime.choices[group] for group in defaults(command)}
+    with open_dict(composed):
+        del composed["hydra"]
+    return composed, chosen
 
 
 def _resolve(config: "DictConfig") -> dict[str, Any]:

@@ -18,6 +18,9 @@ from swarmjax import compose, epuck, settings
 from swarmjax.settings import ConfigError, Section, about, build, show, to_dict
 
 MAX_COUNT = 2**31 - 1  # counts and seeds are int32 on the device
+# Seeds of a suite's levels begin here, so that none is drawn by hand, or by a benchmark, which
+# take small ones. Training draws from another generator altogether, JAX's.
+SUITE_SEED = 1_000_000
 
 # The room that a random level asks for. A start and a target each take a square of 0.15 m (two
 # hulls of 0.074 m side by side); an obstacle takes the square about its circumscribed circle,
@@ -43,6 +46,15 @@ _MODE_OPTIONS: dict[str, tuple[tuple[str, ...], float | str | None]] = {
     "exploration": (_STEPWISE, "keep"),
     "newcomers": (_STEPWISE, "copy"),
 }
+# The options of the algorithm that belong to one choice: whose, which, and what null stands for.
+_ALGO_OPTIONS: dict[str, tuple[str, str, float | int]] = {
+    "gae_lambda": ("returns", "gae", 0.95),
+    "std_decrement": ("exploration", "scheduled", 0.05),
+    "std_interval": ("exploration", "scheduled", 250_000),
+    "std_floor": ("exploration", "scheduled", 0.1),
+}
+# What the step limit may be to a return, the default first.
+_TIME_OUTS = {"gae": ("bootstrap", "terminal"), "monte_carlo": ("terminal", "leak")}
 # What is counted has no meaning for sensors that report metres.
 COUNTED = (
     "infrared_noise",
@@ -55,6 +67,8 @@ COUNTED = (
 
 
 _Cell = tuple[int, int, float | tuple[float, float]]  # robots, obstacles, side
+# What obstacles of a random level may look like where a policy is judged; training knows boxes.
+Shape = Literal["box", "bar", "cross", "ell", "pillar"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,15 +270,15 @@ class RobotConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class RewardConfig(Section):
-    """Weights of the named terms of the reward; the defaults are equation 3 of the paper."""
+    """Weights of the named terms of the reward: equation 3 of the paper, and prices."""
 
     progress: float = field(default=1.0, metadata=about("per metre nearer to the target"))
     proximity: float = field(
         default=-0.001, metadata=about("per control step with something in infrared range")
     )
     arrival: float = field(default=0.0, metadata=about("once, on arrival"))
-    contact: float = field(default=0.0, metadata=about("per contact event"))
-    time: float = field(default=0.0, metadata=about("per control step"))
+    contact: float = field(default=-0.02, metadata=about("per contact event"))
+    time: float = field(default=-0.001, metadata=about("per control step until arrival"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -293,9 +307,15 @@ class TaskConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class AlgoConfig(Section):
-    """PPO; clip, learning rates, discount and initial deviation are Table 1 of the paper."""
+    """PPO; what stands in Table 1 of the paper has its name from there in quotes.
 
-    name: Literal["ppo"] = field(default="ppo", metadata=about("algorithm"))
+    An option of one choice only, as its meaning says, is null with the others and may be null with
+    its own, where it then takes its default.
+    """
+
+    name: Literal["ppo", "paper"] = field(
+        default="ppo", metadata=about("preset that the numbers started from", derived=True)
+    )
     policy: Literal["shared", "independent"] = field(
         default="shared", metadata=about("one policy for all robots, or one for each")
     )
@@ -305,35 +325,136 @@ class AlgoConfig(Section):
     activation: Literal["tanh", "relu", "swish"] = field(
         default="tanh", metadata=about("activation of the hidden layers")
     )
+    output: Literal["linear", "tanh"] = field(
+        default="linear", metadata=about("of the mean action; tanh: within the range of commands")
+    )
+    initialization: Literal["orthogonal", "uniform"] = field(
+        default="orthogonal",
+        metadata=about("of the layers; uniform: within 1 / sqrt(inputs), biases too, as PyTorch's"),
+    )
+    normalize_observations: bool = field(
+        default=True,
+        metadata=about("by running mean and deviation; false: as they are, within +-10"),
+    )
     rollout: int = field(default=32, metadata=about("control steps per update", 1, MAX_COUNT))
-    epochs: int = field(default=4, metadata=about("passes over each rollout", 1, MAX_COUNT))
+    epochs: int = field(
+        default=4, metadata=about("passes over each rollout: 'PPO K epochs'", 1, MAX_COUNT)
+    )
     minibatches: int = field(
         default=8, metadata=about("gradient steps per pass; divides arenas", 1, MAX_COUNT)
     )
-    discount: float = field(default=0.99, metadata=about("per control step", 0.0, 1.0))
-    gae_lambda: float = field(default=0.95, metadata=about("of the advantages", 0.0, 1.0))
-    clip: float = field(default=0.2, metadata=about("of the probability ratio", above=0.0))
+    discount: float = field(
+        default=0.99, metadata=about("per control step: 'discount factor (gamma)'", 0.0, 1.0)
+    )
+    returns: Literal["gae", "monte_carlo"] = field(
+        default="gae",
+        metadata=about(
+            "gae: bootstrapped, advantages normalised; monte_carlo: summed to the end of episode "
+            "or rollout and normalised, for the critic and for advantages"
+        ),
+    )
+    gae_lambda: float | None = field(
+        default=None, metadata=about("of the advantages; null: 0.95 [returns=gae]", 0.0, 1.0)
+    )
+    time_out: Literal["bootstrap", "terminal", "leak"] | None = field(
+        default=None,
+        metadata=about(
+            "a return at the step limit; bootstrap: goes on with the value [gae], terminal: ends, "
+            "leak: goes on into the next episode [monte_carlo]; null: the first that is possible"
+        ),
+    )
+    clip: float = field(
+        default=0.2, metadata=about("of the probability ratio: 'PPO epsilon clip'", above=0.0)
+    )
     actor_learning_rate: float = field(
-        default=3e-4, metadata=about("of the policy", above=0.0, high=1.0)
+        default=3e-4,
+        metadata=about("of the policy: 'optimizer learning rate actor'", above=0.0, high=1.0),
     )
     critic_learning_rate: float = field(
-        default=1e-3, metadata=about("of the value", above=0.0, high=1.0)
+        default=1e-3,
+        metadata=about("of the value: 'optimizer learning rate critic'", above=0.0, high=1.0),
     )
     learning_rate_schedule: Literal["constant", "linear"] = field(
         default="linear", metadata=about("linear falls to 0 at the end of the budget")
     )
-    max_grad_norm: float = field(
-        default=0.5, metadata=about("norm at which gradients are clipped", above=0.0)
+    adam_epsilon: float = field(
+        default=1e-5, metadata=about("added to the root of Adam's second moment", above=0.0)
     )
-    value_cost: float = field(default=0.5, metadata=about("weight of the value loss", 0.0))
+    max_grad_norm: float | None = field(
+        default=0.5,
+        metadata=about("norm at which gradients are clipped; null: they are not", above=0.0),
+    )
+    value_cost: float = field(
+        default=0.5, metadata=about("weight of the value loss, half the mean squared error", 0.0)
+    )
     entropy_cost: float = field(default=0.0, metadata=about("weight of the entropy", 0.0))
+    exploration: Literal["learned", "scheduled"] = field(
+        default="learned",
+        metadata=about("deviation of the action: learned, or falling in steps whatever is learned"),
+    )
     initial_std: float = field(
-        default=0.6, metadata=about("initial deviation of the action", above=0.0)
+        default=0.6,
+        metadata=about("at first: 'starting std of action distribution'", above=0.0),
+    )
+    std_decrement: float | None = field(
+        default=None,
+        metadata=about(
+            "what a step takes off: 'the decay rate of std of action distribution'; null: 0.05 "
+            "[exploration=scheduled]",
+            above=0.0,
+        ),
+    )
+    std_interval: int | None = field(
+        default=None,
+        metadata=about(
+            "control steps of all arenas together between two: 'decay frequency of std of action "
+            "distribution'; null: 250000 [exploration=scheduled]",
+            1,
+            MAX_COUNT,
+        ),
+    )
+    std_floor: float | None = field(
+        default=None,
+        metadata=about(
+            "where it stops: 'minimum std of action distribution'; null: 0.1 "
+            "[exploration=scheduled]",
+            above=0.0,
+        ),
     )
 
     def _check(self) -> None:
         if not self.hidden:
             raise ConfigError("hidden is []: give at least one layer, as in [64,64].")
+        for key, (selector, choice, default) in _ALGO_OPTIONS.items():
+            value, chosen = getattr(self, key), getattr(self, selector)
+            if chosen != choice and value is not None:
+                raise ConfigError(
+                    f"{key} is {show(value)}, but {selector} is {chosen}: {key} is an option of "
+                    f"{choice}, so give null or {selector}={choice}."
+                )
+            if chosen == choice and value is None:
+                object.__setattr__(self, key, default)
+        self._check_time_out()
+        if self.std_floor is not None and self.std_floor > self.initial_std:
+            raise ConfigError(
+                f"std_floor is {show(self.std_floor)}, but initial_std is "
+                f"{show(self.initial_std)}: give at most {show(self.initial_std)}."
+            )
+        if self.output == "tanh" and self.activation != "tanh":
+            raise ConfigError(
+                f"output is tanh, but activation is {self.activation}, and a policy's file has one "
+                "for all layers: give activation=tanh or output=linear."
+            )
+
+    def _check_time_out(self) -> None:
+        allowed = _TIME_OUTS[self.returns]
+        if self.time_out is None:
+            object.__setattr__(self, "time_out", allowed[0])
+        elif self.time_out not in allowed:
+            raise ConfigError(
+                f"time_out is {self.time_out}, but returns is {self.returns}: "
+                f"give {' or '.join(allowed)}."
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -345,7 +466,7 @@ class CurriculumConfig(Section):
     """
 
     mode: Literal["sequential", "mixed", "adaptive"] = field(
-        default="sequential",
+        default="mixed",
         metadata=about(
             "sequential: all on the newest stage; mixed: some on earlier ones; adaptive: on all "
             "stages, most where most is learned"
@@ -706,6 +827,7 @@ class TrainConfig(Section):
             )
         self._check_budget()
         self._check_counts()
+        self._check_algo()
         _check_realism(self.realism, self.robot, self.task, self.task.step_limit)
         names = [stage.name for stage in self.stage]
         if len(names) == 1 or not self.stage_name:
@@ -738,6 +860,18 @@ class TrainConfig(Section):
                 f"give at most {most}."
             )
 
+    def _check_algo(self) -> None:
+        if self.algo.exploration == "scheduled" and self.budget > MAX_COUNT:
+            raise ConfigError(
+                f"budget is {self.budget}, but algo.exploration is scheduled by control steps that "
+                f"are counted in 32 bits: give at most {MAX_COUNT}."
+            )
+        if self.curriculum.normalizer == "relearn" and not self.algo.normalize_observations:
+            raise ConfigError(
+                "curriculum.normalizer is relearn, but algo.normalize_observations is false: "
+                "give keep or algo.normalize_observations=true."
+            )
+
     def _check_budget(self) -> None:
         update = self.arenas * self.algo.rollout
         if self.updates < 1:
@@ -765,15 +899,28 @@ class TrainConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig(Section):
-    """Everything that fixes an evaluation of a policy."""
+    """Everything that fixes an evaluation of policies."""
 
-    policy: str = field(metadata=about("path of a policy.npz"))
+    policy: str | None = field(
+        default=None,
+        metadata=about("policy.npz, or several of one recipe: a.npz,b.npz or a pattern"),
+    )
+    compare: str | None = field(
+        default=None,
+        metadata=about("two instead, level by level: a.npz,b.npz; each may be a pattern"),
+    )
     stage: StageConfig
-    robot: RobotConfig = field(default_factory=RobotConfig)
+    robot: RobotConfig = field(default_factory=lambda: RobotConfig(body="wheeled"))
     task: TaskConfig = field(default_factory=TaskConfig)
-    suite: None = field(default=None, metadata=about("a list of stages; not built yet"))
+    suite: str | None = field(
+        default=None,
+        metadata=about("instead of a stage: a name of configs/suites/, or a file .yaml or .npz"),
+    )
+    shape: Shape = field(default="box", metadata=about("of the obstacles of a random level"))
     realism: RealismConfig = field(default_factory=RealismConfig)
-    engine: Literal["c"] = field(default="c", metadata=about("MuJoCo's C engine"))
+    engine: Literal["c", "mjx"] = field(
+        default="c", metadata=about("c: MuJoCo's C engine; mjx: the one that trains")
+    )
     steps: int = field(
         default=1500, metadata=about("control steps of an episode; Table 1", 1, MAX_COUNT)
     )
@@ -786,26 +933,141 @@ class EvaluateConfig(Section):
         default=None,
         metadata=about("physics steps per control step; null: those of the body", 1, 1000),
     )
-    out: str | None = field(default=None, metadata=about("JSON file of the result"))
+    out: str | None = field(
+        default=None,
+        metadata=about("folder for result.json, levels.csv and plots, or a file .json alone"),
+    )
 
     def _check(self) -> None:
+        if (self.policy is None) == (self.compare is None):
+            raise ConfigError(
+                f"policy is {show(self.policy)} and compare is {show(self.compare)}: give one of "
+                "them, policy=FILE or compare=FILE,FILE."
+            )
+        if self.shape != "box" and self.stage.level == "fixed":
+            raise ConfigError(
+                f"shape is {self.shape}, but stage.level is fixed, with obstacles of its own: "
+                "give shape=box."
+            )
         _check_realism(self.realism, self.robot, self.task, self.steps)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportConfig(Section):
-    """Which policy of which run leaves as one NumPy file."""
+class CellConfig(Section):
+    """Levels of one kind that a suite judges policies on."""
 
-    run: str = field(metadata=about("run directory"))
+    name: str = field(metadata=about("of the cell"))
+    stage: StageConfig
+    levels: int = field(default=1000, metadata=about("how many", 1, 1_000_000))
+    seed: int = field(metadata=about("of the levels", SUITE_SEED, MAX_COUNT))
+    episodes: tuple[int, ...] = field(
+        default=(),
+        metadata=about("numbers of the levels; none: from 0 on, as many as levels", 0, MAX_COUNT),
+    )
+    realism: Literal["ideal", "webots", "real"] | None = field(
+        default=None, metadata=about("preset; null: that of the command")
+    )
+    shape: Shape = field(default="box", metadata=about("of the obstacles"))
+    digest: str | None = field(
+        default=None, metadata=about("SHA-256 of the levels; null: not drawn yet")
+    )
+
+    def _check(self) -> None:
+        if not re.fullmatch(r"[\w-]+", self.name):
+            raise ConfigError(f"name is {show(self.name)}: give letters, digits, _ and - only.")
+        if self.episodes and len(self.episodes) != self.levels:
+            raise ConfigError(
+                f"levels is {self.levels}, but episodes are {len(self.episodes)}: give as many."
+            )
+        if len(set(self.episodes)) != len(self.episodes):
+            raise ConfigError("episodes holds a number twice: give each once.")
+        if self.digest is not None and not re.fullmatch(r"[0-9a-f]{64}", self.digest):
+            raise ConfigError(f"digest is {show(self.digest)}: give 64 hexadecimal digits.")
+        if self.shape != "box" and self.stage.level == "fixed":
+            raise ConfigError(
+                f"shape is {self.shape}, but the stage's level is fixed: give shape=box."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuiteFileConfig(Section):
+    """A suite: levels to judge policies on, never trained on."""
+
+    name: str = field(metadata=about("of the suite, that of its file"))
+    cells: tuple[CellConfig, ...]
+
+    def _check(self) -> None:
+        names = [cell.name for cell in self.cells]
+        if not names:
+            raise ConfigError("cells is []: give at least one cell.")
+        for name in names:
+            if names.count(name) > 1:
+                raise ConfigError(f"cells names {name} more than once: give each name once.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuiteConfig(Section):
+    """Which suite is drawn, and what becomes of it."""
+
+    suite: str = field(metadata=about("a name of configs/suites/, or a file .yaml"))
+    out: str | None = field(default=None, metadata=about("file .npz for all of its levels"))
+    write: bool = field(
+        default=False,
+        metadata=about("put digests, and episodes that were chosen, into the suite's file"),
+    )
+    policies: str | None = field(
+        default=None,
+        metadata=about("choose the levels that these fail most: a.npz,b.npz or a pattern"),
+    )
+    pool: int = field(default=20_000, metadata=about("levels drawn to choose from", 1, 1_000_000))
+    steps: int = field(default=1500, metadata=about("control steps of an episode", 1, MAX_COUNT))
+    workers: int | None = field(
+        default=None, metadata=about("processes; null: one a core", 1, 1024)
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportConfig(Section):
+    """Which policy leaves in which form, and where to."""
+
+    run: str | None = field(default=None, metadata=about("run directory; this or policy"))
+    policy: str | None = field(default=None, metadata=about("path of a policy.npz; this or run"))
+    format: Literal["npz", "onnx", "c", "webots"] = field(
+        default="npz", metadata=about("of what is written: a file of npz or onnx, or a folder")
+    )
     step: int | None = field(
         default=None,
-        metadata=about("update of the checkpoint; null: the newest sound one", 0, MAX_COUNT),
+        metadata=about("update of the run's checkpoint; null: the newest sound", 0, MAX_COUNT),
     )
     seed: int | None = field(
-        default=None, metadata=about("of the policy; null: all of the run", 0, MAX_COUNT)
+        default=None, metadata=about("of the run's policies; null: all of them", 0, MAX_COUNT)
     )
-    out: str | None = field(default=None, metadata=about("file; null: <run>/policy.npz"))
-    format: Literal["npz"] = field(default="npz", metadata=about("of the file"))
+    out: str | None = field(
+        default=None,
+        metadata=about("file or folder; null: in run or beside policy, by format and step"),
+    )
+    sensors: Literal["webots", "real"] = field(
+        default="webots",
+        metadata=about("what answers the webots controller: simulated e-pucks, or real ones"),
+    )
+
+    def _check(self) -> None:
+        if (self.run is None) == (self.policy is None):
+            raise ConfigError(
+                f"run is {show(self.run)} and policy is {show(self.policy)}: give one of them, "
+                "as in run=runs/a or policy=policy.npz."
+            )
+        for key in ("step", "seed"):
+            if self.run is None and getattr(self, key) is not None:
+                raise ConfigError(
+                    f"{key} is {getattr(self, key)}, but policy is one file: give {key} with run."
+                )
+        if self.sensors != "webots" and self.format != "webots":
+            raise ConfigError(
+                f"sensors is {self.sensors}, but format is {self.format}: give format=webots."
+            )
+        if self.out is None and self.run is None and self.format == "npz":
+            raise ConfigError("out is null, but policy is given already: give out=FILE.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -814,6 +1076,115 @@ class ReportConfig(Section):
 
     run: str = field(metadata=about("run directory"))
     out: str | None = field(default=None, metadata=about("directory; null: <run>/report"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayConfig(Section):
+    """Which episodes of which policies are shown, and where to."""
+
+    policy: str = field(
+        metadata=about("path of a policy.npz; of two for a comparison, as in a.npz,b.npz")
+    )
+    stage: StageConfig
+    suite: str | None = field(
+        default=None,
+        metadata=about("instead of a stage: a name of configs/suites/, or a file .yaml or .npz"),
+    )
+    cell: str | None = field(
+        default=None, metadata=about("of the suite; null: all of them, which only worst takes")
+    )
+    robot: RobotConfig = field(default_factory=lambda: RobotConfig(body="wheeled"))
+    task: TaskConfig = field(default_factory=TaskConfig)
+    realism: RealismConfig = field(default_factory=RealismConfig)
+    shape: Shape = field(default="box", metadata=about("of the obstacles of a random level"))
+    level: str | None = field(
+        default=None,
+        metadata=about("numbers of the levels, as in 0,7,12; null: 0, unless worst is given"),
+    )
+    worst: int | None = field(
+        default=None,
+        metadata=about("replay this many of the episodes, those that went worst", 1, 100),
+    )
+    steps: int = field(default=1500, metadata=about("control steps of an episode", 1, MAX_COUNT))
+    episodes: int = field(
+        default=1000, metadata=about("how many levels there are to choose from", 1, MAX_COUNT)
+    )
+    seed: int = field(default=1, metadata=about("random seed of the levels", 0, MAX_COUNT))
+    workers: int | None = field(
+        default=None, metadata=about("processes that worst runs; null: one a core", 1, 1024)
+    )
+    substeps: int | None = field(
+        default=None,
+        metadata=about("physics steps per control step; null: those of the body", 1, 1000),
+    )
+    out: str = field(default="replay.html", metadata=about("HTML file of the replay"))
+    video: str | None = field(default=None, metadata=about("MP4 file of the scene in 3-D"))
+    video_speed: float = field(
+        default=1.0,
+        metadata=about("seconds of the episode in a second of the video", 0.05, 100.0),
+    )
+
+    def _check(self) -> None:
+        _check_realism(self.realism, self.robot, self.task, self.steps)
+        if not 1 <= len(self.policies) <= 2 or not all(self.policies):
+            raise ConfigError(
+                f"policy is {show(self.policy)}: give one file, or two with a comma between them."
+            )
+        if self.level is not None and self.worst is not None:
+            raise ConfigError(
+                f"level is {self.level}, but worst is {self.worst}: give one of the two."
+            )
+        if self.cell is not None and self.suite is None:
+            raise ConfigError(f"cell is {show(self.cell)}, but suite is null: give suite=NAME.")
+        if self.suite is None and self.worst is not None and self.worst > self.episodes:
+            raise ConfigError(
+                f"worst is {self.worst}, but episodes is {self.episodes}: "
+                f"give 1 to {self.episodes}."
+            )
+        self._check_levels()
+
+    def _check_levels(self) -> None:
+        if self.level is not None and not re.fullmatch(r"\d{1,10}(,\d{1,10})*", self.level):
+            raise ConfigError(
+                f"level is {show(self.level)}: give whole numbers with commas between them, "
+                "as in 0,7,12."
+            )
+        if len(set(self.levels)) < len(self.levels) or len(self.levels) > 100:
+            raise ConfigError(f"level is {show(self.level)}: give each level once, 100 at most.")
+        if self.suite is None and max(self.levels) >= self.episodes:
+            raise ConfigError(
+                f"level is {self.level}, but episodes is {self.episodes}: "
+                f"give 0 to {self.episodes - 1}."
+            )
+
+    @property
+    def policies(self) -> tuple[str, ...]:
+        """The policies' paths."""
+        return tuple(self.policy.split(","))
+
+    @property
+    def levels(self) -> tuple[int, ...]:
+        """The numbers of the levels that are named."""
+        return (0,) if self.level is None else tuple(int(each) for each in self.level.split(","))
+
+    @property
+    def evaluation(self) -> EvaluateConfig:
+        """The evaluation that the episodes are part of."""
+        return EvaluateConfig(
+            policy=self.policy,
+            stage=self.stage,
+            suite=self.suite,
+            robot=self.robot,
+            task=self.task,
+            realism=self.realism,
+            shape=self.shape,
+            steps=self.steps,
+            # Of levels that are named no more are drawn than needed.
+            episodes=max(self.levels) + 1 if self.worst is None else self.episodes,
+            seed=self.seed,
+            workers=self.workers,
+            substeps=self.substeps,
+        )
 
 
 def load_train(overrides: Sequence[str]) -> TrainConfig:
@@ -848,15 +1219,73 @@ def load_evaluate(overrides: Sequence[str]) -> EvaluateConfig:
         ConfigError: see the module.
     """
     mapping, chosen = compose.compose(EvaluateConfig, "evaluate", overrides)
-    stage = chosen["stage"]
-    if compose.is_grid(stage):
-        raise ConfigError(f"stage is {stage}, a grid: give one stage, as in stage=s6.")
-    stages = compose.stages(mapping.get("stage", {}), stage)
-    if compose.is_sequence(stage):
+    _check_suite_alone(EvaluateConfig, mapping.get("suite"), overrides)
+    stage = _one_stage(mapping.get("stage", {}), chosen["stage"])
+    return build(EvaluateConfig, mapping | {"stage": stage})
+
+
+def _one_stage(stage: dict[str, Any], choice: str) -> dict[str, Any]:
+    """Return the stage that a choice of the group `stage` stands for, if it is one alone."""
+    if compose.is_grid(choice):
+        raise ConfigError(f"stage is {choice}, a grid: give one stage, as in stage=s6.")
+    stages = compose.stages(stage, choice)
+    if compose.is_sequence(choice):
         raise ConfigError(
-            f"stage is {stage}, a curriculum: give one stage, as in stage={stages[-1]['name']}."
+            f"stage is {choice}, a curriculum: give one stage, as in stage={stages[-1]['name']}."
         )
-    return build(EvaluateConfig, mapping | {"stage": stages[0]})
+    return stages[0]
+
+
+def _check_suite_alone(cls: type[Section], suite: object, overrides: Sequence[str]) -> None:
+    """Refuse what a suite's file says itself."""
+    if suite is None:
+        return
+    for key in compose.split_words(cls, overrides):
+        if key.partition(".")[0] in ("stage", "shape", "episodes", "seed"):
+            raise ConfigError(
+                f"{key} cannot be given with suite={suite}, which says what its levels are: "
+                f"leave {key} or suite out."
+            )
+
+
+def load_suite(overrides: Sequence[str]) -> SuiteConfig:
+    """Make the configuration of `swarmjax.suite` from its `key=value` words.
+
+    Raises:
+        ConfigError: see the module.
+    """
+    mapping, _ = compose.compose(SuiteConfig, "suite", overrides)
+    return build(SuiteConfig, mapping)
+
+
+def read_suite(choice: str) -> SuiteFileConfig:
+    """Read the file of a suite.
+
+    Args:
+        choice: a name of configs/suites/, or the path of a .yaml file.
+
+    Raises:
+        ConfigError: there is no such file, or it is unsound.
+    """
+    path = compose.suite_path(choice)
+    mapping = compose.read_yaml(path)
+    cells = mapping.get("cells")
+    if isinstance(cells, list):
+        mapping = mapping | {"cells": [_cell(cell) for cell in cells]}
+    try:
+        return build(SuiteFileConfig, {"name": path.stem} | mapping)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def _cell(cell: Any) -> Any:
+    """Give a cell of a suite's file the numbers of the stage that it names."""
+    stage = cell.get("stage") if isinstance(cell, Mapping) else None
+    if isinstance(stage, str):
+        return {**cell, "stage": compose.stages(compose.read_stage(stage), stage)[0]}
+    if isinstance(stage, Mapping):
+        return {**cell, "stage": {"name": cell.get("name"), **stage}}
+    return cell
 
 
 def load_export(overrides: Sequence[str]) -> ExportConfig:
@@ -877,6 +1306,18 @@ def load_report(overrides: Sequence[str]) -> ReportConfig:
     """
     mapping, _ = compose.compose(ReportConfig, "report", overrides)
     return build(ReportConfig, mapping)
+
+
+def load_replay(overrides: Sequence[str]) -> ReplayConfig:
+    """Make the configuration of `swarmjax.replay` from its `key=value` words.
+
+    Raises:
+        ConfigError: see the module.
+    """
+    mapping, chosen = compose.compose(ReplayConfig, "replay", overrides)
+    _check_suite_alone(ReplayConfig, mapping.get("suite"), overrides)
+    stage = _one_stage(mapping.get("stage", {}), chosen["stage"])
+    return build(ReplayConfig, mapping | {"stage": stage})
 
 
 def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainConfig:
@@ -916,7 +1357,11 @@ def help_text(cls: type[Section], command: str) -> str:
         Lines for a terminal, without a newline at the end.
     """
     lines = [f"usage: python -m {command} key=value ..."]
-    files: dict[type[Section], str] = {TrainConfig: "train", EvaluateConfig: "evaluate"}
+    files: dict[type[Section], str] = {
+        TrainConfig: "train",
+        EvaluateConfig: "evaluate",
+        ReplayConfig: "replay",
+    }
     groups = compose.describe_groups(files[cls]) if cls in files else []
     if groups:
         lines += ["", "Groups, each a folder of configs/:", *groups]

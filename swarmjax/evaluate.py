@@ -1,244 +1,198 @@
-"""`python -m swarmjax.evaluate policy=FILE stage=s6`: judges a policy in MuJoCo's C engine.
+"""`python -m swarmjax.evaluate policy=FILE suite=stages`: judges policies on levels never seen.
 
-`evaluate_c.py` runs the episodes; here they are split over processes, summed up and shown.
+`cells.py` says which levels, `evaluate_run.py` runs the episodes, `evaluate_summary.py` sums them
+up; here they are put together, and the result is written and shown.
 """
 
 import json
-import math
 import os
-import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from functools import partial
-from multiprocessing import get_context
+from glob import glob
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
-from rich import box
 from rich.console import Console
 from rich.progress import Progress
-from rich.table import Table
 
-from swarmjax import command, config, evaluate_c, policy, provenance
+from swarmjax import (
+    cells,
+    command,
+    config,
+    evaluate_judge,
+    evaluate_run,
+    evaluate_summary,
+    evaluate_table,
+)
+from swarmjax.cells import Suite
 from swarmjax.config import ConfigError, EvaluateConfig
-from swarmjax.evaluate_c import Outcome
-from swarmjax.policy import Policy
-from swarmjax.sim import gaps
+from swarmjax.evaluate_run import Entrant, Trial
+from swarmjax.settings import show
 
-BATCH = 64  # arenas that share NumPy's cost per call; more gain little
+PLAIN_WIDTH = 160  # columns of a table that goes to a file
 
 
-def evaluate(
-    config: EvaluateConfig, trained: Policy, report: Callable[[int], None] = lambda _: None
+class Evaluation(NamedTuple):
+    """What an evaluation found.
+
+    Attributes:
+        result: Plain data for JSON; docs/interface.md lists it.
+        entrants: The policies, those of both sides of a comparison.
+        trials: What they came to, a cell each; rows as `entrants`.
+    """
+
+    result: dict[str, Any]
+    entrants: list[Entrant]
+    trials: list[Trial]
+
+
+def evaluate(settings: EvaluateConfig, progress: Progress | None = None) -> Evaluation:
+    """Judges policies.
+
+    Args:
+        settings: Of the evaluation.
+        progress: To show how far it is; None shows nothing.
+
+    Returns:
+        What it found.
+
+    Raises:
+        PolicyError: If a policy is unsound, or does not fit the levels.
+        ConfigError: If a file is missing, a suite unsound, or the physics breaks down.
+    """
+    sides = [evaluate_run.read_policies(each) for each in _sides(settings)]
+    entrants = [each for side in sides for each in side]
+    for stage in cells.stages(settings):  # before levels are drawn, which takes a while
+        for path, trained in entrants:
+            evaluate_judge.check_policy(stage, path, trained)
+    suite = cells.load(settings)
+    total = len(entrants) * sum(len(cell.episodes) for cell in suite.cells)
+    progress = progress or Progress(disable=True)
+    bar = progress.add_task("episodes", total=total)
+    report = partial(progress.advance, bar)
+    trials = evaluate_run.run(settings, suite.cells, entrants, report)
+    return Evaluation(_sum_up(settings, suite, sides, trials), entrants, trials)
+
+
+def _sum_up(
+    settings: EvaluateConfig, suite: Suite, sides: list[list[Entrant]], trials: list[Trial]
 ) -> dict[str, Any]:
-    """Judges a policy.
+    if settings.compare is None:
+        return evaluate_summary.result(settings, suite.name, sides[0], trials)
+    first, second = sides
+    part = len(first)
+    pair = ([_rows(t, slice(part)) for t in trials], [_rows(t, slice(part, None)) for t in trials])
+    return evaluate_summary.comparison(settings, suite.name, (first, second), pair)
+
+
+def _rows(trial: Trial, rows: slice) -> Trial:
+    """Keeps some of the policies of a trial."""
+    found = {name: table[rows] for name, table in trial.found.items()}
+    return trial._replace(found=found, arrival=trial.arrival[rows])
+
+
+def _sides(settings: EvaluateConfig) -> list[list[str]]:
+    """Lists the files to judge: of one recipe, or of the two that are compared."""
+    if settings.policy is not None:
+        return [list_files("policy", settings.policy)]
+    parts = (settings.compare or "").split(",")
+    if len(parts) != 2 or not all(parts):
+        raise ConfigError(
+            f"compare is {show(settings.compare)}: give two files or patterns, as in a.npz,b.npz."
+        )
+    sides = [list_files("compare", part) for part in parts]
+    first, second = map(len, sides)
+    if first != second:
+        raise ConfigError(
+            f"compare is {show(settings.compare)}, which is {first} against {second}: give as many "
+            "policies on both sides, those of the same seeds in the same order."
+        )
+    return sides
+
+
+def list_files(key: str, text: str) -> list[str]:
+    """Lists the files that a word of the command line names.
 
     Args:
-        config: Of the evaluation.
-        trained: The policy.
-        report: Told how many more episodes are over, now and then.
+        key: Of the word.
+        text: Paths and patterns such as `runs/a-seed*.npz`, with commas between them.
 
     Returns:
-        The result, plain data for JSON; `docs/interface.md` lists it.
+        Paths, those of a pattern in alphabetical order.
 
     Raises:
-        PolicyError: If the policy does not fit the stage.
-        ConfigError: If the physics breaks down.
+        ConfigError: If a pattern matches nothing, or a file is named twice.
     """
-    outcome = outcomes(config, trained, report)
-    return summarize(outcome, config.task.control_step) | {
-        "episodes": config.episodes,
-        "engine": config.engine,
-        "robot": config.robot.body,
-        "realism": config.realism.name,
-        "stage": config.stage.name,
-        "steps": config.steps,
-        "seed": config.seed,
-        "policy": config.policy,
-        "policy_digest": trained.digest,
-        "versions": provenance.versions(),
-    }
-
-
-def outcomes(
-    config: EvaluateConfig, trained: Policy, report: Callable[[int], None] = lambda _: None
-) -> Outcome:
-    """Runs all episodes of an evaluation.
-
-    Args:
-        config: Of the evaluation.
-        trained: The policy.
-        report: Told how many more episodes are over, now and then.
-
-    Returns:
-        What they came to, in their order.
-
-    Raises:
-        PolicyError: If the policy does not fit the stage.
-        ConfigError: If the physics breaks down.
-    """
-    parts = []
-    for part in _simulate_all(config, trained):
-        parts.append(part)
-        report(len(part.clock))
-    return Outcome(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
-
-
-def _simulate_all(config: EvaluateConfig, trained: Policy) -> Iterator[Outcome]:
-    """Runs all episodes in batches, by as many processes as are useful."""
-    workers = config.workers or provenance.cores()
-    size = min(BATCH, math.ceil(config.episodes / workers))
-    batches = [
-        range(first, min(first + size, config.episodes))
-        for first in range(0, config.episodes, size)
-    ]
-    workers = min(workers, len(batches))
-    work = partial(_simulate_batch, config, trained)
-    if workers == 1:
-        yield from map(work, batches)
-        return
-    # Ctrl-C ends the others at once and without a word; this process says what happened.
-    end = (signal.SIGINT, signal.SIG_DFL)
-    with ProcessPoolExecutor(workers, get_context("spawn"), signal.signal, end) as pool:
-        yield from pool.map(work, batches)
-
-
-def _simulate_batch(config: EvaluateConfig, trained: Policy, episodes: range) -> Outcome:
-    return evaluate_c.simulate(evaluate_c.load(config, trained), episodes)
-
-
-def summarize(outcome: Outcome, control_step: float) -> dict[str, Any]:
-    """Sums episodes up.
-
-    Args:
-        outcome: Of all episodes.
-        control_step: s.
-
-    Returns:
-        Shares (0..1) of targets reached and of episodes in which all were, with the standard
-        errors of these means over episodes (null for a single one); contacts a robot and episode;
-        share of robot steps before arrival with anything in infrared range; mean times of an
-        episode and of an arrival (s, null where none arrived).
-    """
-    level_by_level = per_level(outcome, control_step)
-    reached, complete = level_by_level["targets_reached"], level_by_level["all_reached"]
-    contacts = outcome.contacts.mean(axis=(0, 1))
-    arrivals = outcome.arrival[outcome.arrived]
-    return {
-        "targets_reached": float(reached.mean()),
-        "targets_reached_se": _standard_error(reached),
-        "all_reached": float(complete.mean()),
-        "all_reached_se": _standard_error(complete),
-        "contacts_per_robot": float(contacts.sum()),
-        "contacts_per_robot_by_kind": dict(zip(gaps.KINDS, contacts.tolist(), strict=True)),
-        "ir_steps_share": float(outcome.sensed.sum() / outcome.moving.sum()),
-        "episode_time_s": float(level_by_level["episode_time_s"].mean()),
-        "arrival_time_s": float(arrivals.mean() * control_step) if len(arrivals) else None,
-    }
-
-
-def per_level(outcome: Outcome, control_step: float) -> dict[str, np.ndarray]:
-    """What each episode came to.
-
-    Args:
-        outcome: Of all episodes.
-        control_step: s.
-
-    Returns:
-        [A] each: share of targets reached, whether all were, contacts a robot, and time (s).
-    """
-    return {
-        "targets_reached": outcome.arrived.mean(axis=-1),
-        "all_reached": outcome.arrived.all(axis=-1).astype(float),
-        "contacts_per_robot": outcome.contacts.sum(axis=-1).mean(axis=-1),
-        "episode_time_s": outcome.clock * control_step,
-    }
-
-
-def _standard_error(values: np.ndarray) -> float | None:
-    """Estimates the standard error of the mean of independent values; none for one alone."""
-    if len(values) < 2:
-        return None
-    return float(np.std(values, ddof=1) / math.sqrt(len(values)))
+    found: list[str] = []
+    for part in [text] if os.path.isfile(text) else text.split(","):
+        matches = sorted(glob(part)) if set(part) & set("*?[") else [part]
+        if not matches or not part:
+            raise ConfigError(f"{key} is {show(text)}, and {show(part)} matches no file.")
+        found += matches
+    for file in found:
+        if found.count(file) > 1:
+            raise ConfigError(f"{key} is {show(text)}, which names {file} twice: give it once.")
+    return found
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings = config.load_evaluate(arguments)
-    trained = policy.load(settings.policy)
-    if settings.out is not None:
-        _check_out(Path(settings.out))
+    out = None if settings.out is None else Path(settings.out)
+    if out is not None:
+        _check_out(out)
     progress = Progress(console=Console(stderr=True), transient=True)
     progress.disable = not progress.console.is_terminal
     try:
         with progress:
-            bar = progress.add_task("episodes", total=settings.episodes)
-            result = evaluate(settings, trained, partial(progress.advance, bar))
+            found = evaluate(settings, progress)
     except KeyboardInterrupt:
         sys.stderr.write("swarmjax.evaluate: interrupted, nothing was written.\n")
         return command.INTERRUPTED
-    if settings.out is not None:
-        _write(Path(settings.out), result)
-    _print(Console(), result)
+    if out is not None:
+        _write(out, found, settings.steps * settings.task.control_step)
+    console = Console()
+    if not console.is_terminal:
+        console.width = PLAIN_WIDTH
+    evaluate_table.show(console, found.result)
     return 0
 
 
 def _check_out(path: Path) -> None:
     """Makes the folder of the result, before there is one to lose."""
+    is_file = path.suffix == ".json"
+    folder = path.parent if is_file else path
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise _unwritable(path, error.strerror) from None
-    if path.is_dir():
+    if is_file and path.is_dir():
         raise _unwritable(path, "it is a folder")
-    if not os.access(path if path.exists() else path.parent, os.W_OK):
+    if not os.access(path if path.exists() else folder, os.W_OK):
         raise _unwritable(path, "permission denied")
 
 
-def _write(path: Path, result: dict[str, Any]) -> None:
+def _write(path: Path, found: Evaluation, limit: float) -> None:
+    """Writes a JSON file, or a folder with all there is; `limit` is that of an episode, s."""
+    text = json.dumps(found.result, indent=2, allow_nan=False) + "\n"
     try:
-        path.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n")
+        if path.suffix == ".json":
+            path.write_text(text)
+            return
+        (path / "result.json").write_text(text)
+        evaluate_table.write_levels(path / "levels.csv", found.entrants, found.trials)
+        if "policies" in found.result:
+            from swarmjax import evaluate_figures  # Matplotlib, a second in every process
+
+            for name, content in evaluate_figures.draw(found.result, found.trials, limit).items():
+                (path / f"{name}.png").write_bytes(content)
     except OSError as error:
         raise _unwritable(path, error.strerror) from None
 
 
 def _unwritable(path: Path, reason: str | None) -> ConfigError:
     return ConfigError(f"out is {path}, which cannot be written: {reason}.")
-
-
-def _print(console: Console, result: dict[str, Any]) -> None:
-    """Prints a table, plain where it is not for a terminal."""
-    title = f"{result['policy']} on {result['stage']}, {result['episodes']:,} episodes"
-    console.print(title, highlight=False, markup=False, soft_wrap=True)
-    table = Table(box=box.SIMPLE if console.is_terminal else None, show_header=False)
-    table.add_column()
-    table.add_column(justify="right")
-    for row in _rows(result):
-        table.add_row(*row)
-    console.print(table)
-
-
-def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
-    """Words of the table; shares with the 95 % interval of a normal mean, 1.96 standard errors."""
-    kinds = result["contacts_per_robot_by_kind"]
-    arrival = result["arrival_time_s"]
-    return [
-        ("targets reached", _share(result, "targets_reached")),
-        ("all robots reached", _share(result, "all_reached")),
-        ("contacts per robot", f"{result['contacts_per_robot']:.2f}"),
-        *((f"  with {kind}", f"{contacts:.2f}") for kind, contacts in kinds.items()),
-        ("steps with infrared", f"{100 * result['ir_steps_share']:.1f} %"),
-        ("episode time", f"{result['episode_time_s']:.1f} s"),
-        ("arrival time", "-" if arrival is None else f"{arrival:.1f} s"),
-    ]
-
-
-def _share(result: dict[str, Any], key: str) -> str:
-    error = result[f"{key}_se"]
-    interval = "" if error is None else f" ± {196 * error:.1f}"
-    return f"{100 * result[key]:.1f}{interval} %"
 
 
 if __name__ == "__main__":

@@ -6,9 +6,11 @@ sensors and its few solver steps, and MuJoCo C stays the judge that results are 
 costs little, which is what a study needs that asks again and again while its policies learn.
 """
 
+import functools
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -17,19 +19,31 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from swarmjax import evaluate_c, rollout
-from swarmjax.config import ConfigError, StageConfig
+from swarmjax import evaluate_judge, measures, rollout
+from swarmjax.config import (
+    AlgoConfig,
+    ConfigError,
+    EvaluateConfig,
+    SimConfig,
+    StageConfig,
+    TrainConfig,
+)
+from swarmjax.measures import Outcome
+from swarmjax.policy import Policy
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.sim import physics
-from swarmjax.task import env, level
+from swarmjax.task import env, level, senses
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
 from swarmjax.task.level import Level, Spacing
 
+LARGEST_BOX = 0.3  # m; the largest that a stage takes
+_ACTIVATIONS = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}
+
 
 class Outcomes(NamedTuple):
-    """What episodes came to, [E] each; the first four as `evaluate.per_level` names them.
+    """What episodes came to, [E] each; the first four as `measures.per_level` names them.
 
     Attributes:
       targets_reached: share of targets reached, 0..1.
@@ -71,7 +85,7 @@ def draw_levels(world: World, stage: StageConfig, seed: int, episodes: int) -> L
     one = task_stage.select(task_stage.stack([stage]), np.intp(0))
     spacing = world.spacing._replace(robots=stage.robots, obstacles=stage.obstacles)
     drawn = [
-        _make_room(evaluate_c.draw_level(one, spacing, seed, episode), world.spacing)
+        _make_room(evaluate_judge.draw_level(one, spacing, seed, episode), world.spacing)
         for episode in range(episodes)
     ]
     return Level(*(np.stack(fields) for fields in zip(*drawn, strict=True)))
@@ -96,6 +110,125 @@ def _make_room(drawn: Level, spacing: Spacing) -> Level:
     return level.park(wider, np)
 
 
+def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
+    """Compiles the environment for levels of one kind, in physics steps of the judge's length.
+
+    Args:
+      config: of the evaluation.
+      half: [M, 2] half edges of the boxes in the levels, m.
+      arenas: how many levels are judged together.
+
+    Returns:
+      The world; a policy's limits and encoding are not in it yet.
+
+    Raises:
+      ConfigError: if a box is larger than the engine may be compiled for.
+    """
+    stage = config.stage if config.stage.level == "fixed" else _largest(config.stage, half)
+    return env.load(
+        TrainConfig(
+            stage=(stage,),
+            robot=config.robot,
+            task=config.task,
+            realism=config.realism,
+            algo=AlgoConfig(rollout=1, minibatches=1),
+            sim=SimConfig(
+                max_robots=stage.robots,
+                max_obstacles=len(half),
+                substeps=evaluate_judge.substeps(config),
+            ),
+            arenas=arenas,
+            budget=arenas,
+        )
+    )
+
+
+def _largest(stage: StageConfig, half: np.ndarray) -> StageConfig:
+    """A stage with as many robots and boxes as large: all that the program depends on."""
+    largest = 2.0 * float(half.max(initial=0.05))  # without boxes any will do
+    if largest > LARGEST_BOX:
+        raise ConfigError(
+            f"stage {stage.name}: a box is {largest:g} m long, but engine=mjx takes up to "
+            f"{LARGEST_BOX:g} m: give engine=c."
+        )
+    return StageConfig(name=stage.name, robots=stage.robots, side=4.0, obstacle_size=largest)
+
+
+def play(world: World, levels: Level, trained: Policy, steps: int) -> Outcome:
+    """Runs an episode of each level by a policy file's policy.
+
+    Args:
+      world: of `load`.
+      levels: [E] with all robots and obstacles that the world has room for.
+      trained: the policy.
+      steps: control steps of an episode.
+
+    Returns:
+      [E] what they came to, as NumPy arrays; impulses are nan, since contacts are analytic here.
+
+    Raises:
+      ConfigError: if the physics of an episode breaks down.
+    """
+    run = _program(
+        world,
+        steps,
+        trained.encoding,
+        (trained.max_speed, trained.max_turn_rate),
+        trained.meta["activation"],
+        trained.meta["observation"]["limit"],
+    )
+    outcome, broken = run((trained.layers, trained.mean, trained.std), levels)
+    if np.any(broken):
+        raise ConfigError(
+            f"the physics of {int(np.sum(broken))} of {len(levels.side)} episodes broke down, with "
+            f"positions that are not finite: give substeps of more than {world.physics.substeps}."
+        )
+    return Outcome(**{name: np.asarray(field) for name, field in outcome.items()})
+
+
+@functools.lru_cache(maxsize=4)
+def _program(
+    world: World,
+    steps: int,
+    encoding: senses.Encoding,
+    limits: tuple[float, float],
+    activation: str,
+    limit: float,
+) -> Callable[[Any, Level], tuple[dict[str, Array], Array]]:
+    """The compiled program of policies that differ in their weights alone."""
+    config, (speed, turn_rate) = world.config, limits
+    mine = replace(
+        world,
+        drive=world.drive._replace(max_speed=speed, max_turn_rate=turn_rate),
+        electronics=senses.load(config.task, config.realism, encoding),
+    )
+
+    def play(weights: Any, levels: Level) -> tuple[dict[str, Array], Array]:
+        act = partial(_mean_action, activation, limit, weights)
+        arenas, counts, broken = _run(mine, act, levels, steps)
+        return _outcome(arenas, counts), broken
+
+    return jax.jit(play)
+
+
+def _mean_action(activation: str, limit: float, weights: Any, observation: Array) -> Array:
+    """What `policy.mean_action` says, [E, R, U]: in full precision, where a GPU has less."""
+    layers, mean, std = weights
+    robots = slice(observation.shape[-2])
+    x = jnp.clip((observation - mean[robots]) / std[robots], -limit, limit)
+    *hidden, last = layers
+    for layer in hidden:
+        x = _ACTIVATIONS[activation](_dense(x, layer, robots))
+    return _dense(x, last, robots)
+
+
+def _dense(x: Array, layer: tuple[ArrayLike, ArrayLike], robots: slice) -> Array:
+    """One dense layer [E, R, in] -> [E, R, out] of one learner, or of one for each robot."""
+    kernel, bias = (jnp.asarray(part)[robots] for part in layer)
+    kernel = jnp.broadcast_to(kernel, (x.shape[-2], *kernel.shape[1:]))
+    return jnp.einsum("eri,rio->ero", x, kernel, precision=jax.lax.Precision.HIGHEST) + bias
+
+
 def outcomes(world: World, learners: LearnerState, levels: Level, steps: int) -> Outcomes:
     """Runs an episode of each level, every robot driven by the mean of its policy.
 
@@ -114,31 +247,102 @@ def outcomes(world: World, learners: LearnerState, levels: Level, steps: int) ->
       [E] what they came to. An episode whose physics breaks ends there, its robots where they
       were.
     """
+    arenas, _, broken = _run(world, partial(_mode, world, learners), levels, steps)
+    return _sum_up(arenas, broken, world.config.task.control_step)
+
+
+def _mode(world: World, learners: LearnerState, observation: Array) -> Array:
+    """The learners' most likely actions [E, R, U]."""
+    seen = rollout.to_learners(observation, len(jax.tree.leaves(learners)[0]))
+    action = jax.vmap(partial(ppo.mode, config=world.config.algo))(learners, observation=seen)
+    return rollout.to_arenas(action)
+
+
+class _Counts(NamedTuple):
+    """What `Outcome` has and training has no use for, [E, R, ...]; `anchor` as in the judge."""
+
+    arrival: Array
+    touched: Array
+    path: Array
+    anchor: Array
+    still: Array
+
+
+def _run(
+    world: World, act: Callable[[Array], Array], levels: Level, steps: int
+) -> tuple[EnvState, _Counts, Array]:
+    """Runs an episode of each level; returns how the arenas end, and which of them broke."""
     robots, obstacles = world.spacing.robots, world.spacing.obstacles
     chex.assert_shape(levels.present, (None, robots))
     chex.assert_shape(levels.obstacle, (len(levels.side), obstacles, 5))
+    levels = jax.tree.map(jnp.asarray, levels)
     zero = jnp.zeros((), jnp.int32)
     arenas = jax.vmap(lambda each: env.reset(world, each, zero, zero))(levels)
     unpack = partial(physics.unpack, world.physics)
     arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
+    none = jnp.zeros(levels.present.shape, jnp.int32)
+    touched = jnp.zeros(arenas.apart.shape, jnp.int32)
+    counts = _Counts(none, touched, none.astype(jnp.float32), levels.start[..., :2], none)
     unbroken = jnp.zeros(len(levels.side), bool)
-    step = partial(_step, world, learners)
-    (arenas, broken), _ = jax.lax.scan(step, (arenas, unbroken), length=steps)
-    return _sum_up(arenas, broken, world.config.task.control_step)
+    step = partial(_step, world, act)
+    (arenas, counts, broken), _ = jax.lax.scan(step, (arenas, counts, unbroken), length=steps)
+    return arenas, counts, broken
 
 
 def _step(
-    world: World, learners: LearnerState, carry: tuple[EnvState, Array], _: None
-) -> tuple[tuple[EnvState, Array], None]:
+    world: World,
+    act: Callable[[Array], Array],
+    carry: tuple[EnvState, _Counts, Array],
+    _: None,
+) -> tuple[tuple[EnvState, _Counts, Array], None]:
     """Moves the arenas [E] on by a control step whose episodes are not over."""
-    arenas, broken = carry
-    seen = rollout.to_learners(arenas.observation, len(jax.tree.leaves(learners)[0]))
-    action = jax.vmap(partial(ppo.mode, config=world.config.algo))(learners, observation=seen)
-    moved, came = jax.vmap(partial(env.step, world))(arenas, rollout.to_arenas(action))
+    arenas, counts, broken = carry
+    action = act(arenas.observation)
+    moved, came = jax.vmap(partial(env.step, world))(arenas, action)
     over = broken | _all_arrived(arenas)
     broken = broken | (~over & ~came.sound)
+    stays = over | broken
     held = replace(arenas, sim=jax.vmap(physics.pack)(arenas.sim))
-    return (rollout.restart(moved, held, over | broken), broken), None
+    counted = _count(world, counts, arenas, moved)
+    counts = _Counts(
+        *(
+            jnp.where(stays.reshape(-1, *[1] * (new.ndim - 1)), old, new)
+            for old, new in zip(counts, counted, strict=True)
+        )
+    )
+    return (rollout.restart(moved, held, stays), counts, broken), None
+
+
+def _count(world: World, counts: _Counts, before: EnvState, after: EnvState) -> _Counts:
+    """Adds a control step up, as the judge does."""
+    poses = jax.vmap(partial(physics.poses, world.physics))
+    start, place = poses(before.sim)[..., :2], poses(after.sim)[..., :2]
+    driven = jnp.linalg.norm(place - start, axis=-1)
+    active = before.level.present & ~before.arrived
+    away = jnp.linalg.norm(place - counts.anchor, axis=-1) > measures.STILL_RADIUS
+    return _Counts(
+        arrival=jnp.where(after.arrived & active, after.clock[:, None], counts.arrival),
+        touched=counts.touched + ((after.apart == 0.0) & before.level.present[..., None]),
+        path=counts.path + jnp.where(active, driven, 0.0),
+        anchor=jnp.where(away[..., None], place, counts.anchor),
+        still=jnp.where(away, 0, counts.still + 1),
+    )
+
+
+def _outcome(arenas: EnvState, counts: _Counts) -> dict[str, Array]:
+    """Puts together what the judge's `Outcome` holds, of arenas whose robots are all present."""
+    return {
+        "clock": arenas.clock,
+        "arrived": arenas.arrived,
+        "arrival": counts.arrival,
+        "contacts": arenas.episode.contacts,
+        "touched": counts.touched,
+        "impulse": jnp.full(counts.touched.shape, jnp.nan),
+        "sensed": arenas.episode.sensed,
+        "moving": arenas.episode.moving,
+        "path": counts.path,
+        "still": counts.still,
+    }
 
 
 def _all_arrived(arenas: EnvState) -> Array:
@@ -147,7 +351,7 @@ def _all_arrived(arenas: EnvState) -> Array:
 
 
 def _sum_up(arenas: EnvState, broken: Array, control_step: float) -> Outcomes:
-    """Sums episodes up as `evaluate.per_level` does."""
+    """Sums episodes up as `measures.per_level` does."""
     present = arenas.level.present
     robots = jnp.sum(present, axis=-1)
     reached = jnp.sum(present & arenas.arrived, axis=-1)

@@ -1,25 +1,45 @@
-"""`python -m swarmjax.export run=DIR`: a checkpoint becomes `policy.npz`, for NumPy alone.
+"""`python -m swarmjax.export run=DIR`: a checkpoint becomes `policy.npz`, ONNX, C or for Webots.
 
-Usage: python -m swarmjax.export run=runs/NAME [step=UPDATE] [seed=SEED] [out=FILE]
+Usage: python -m swarmjax.export run=runs/NAME [format=onnx] [step=UPDATE] [seed=SEED] [out=FILE]
+       python -m swarmjax.export policy=policy.npz format=c [out=FOLDER]
 
 A run of several seeds gives `policy-seed0.npz` and so on, or that of one `seed`.
 """
 
 import json
+import re
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from swarmjax import checkpoint, command, config, policy, provenance, seeds
+from swarmjax import (
+    checkpoint,
+    command,
+    compose,
+    config,
+    export_c,
+    export_folder,
+    export_onnx,
+    export_webots,
+    policy_file,
+    provenance,
+    seeds,
+)
 from swarmjax.checkpoint import CheckpointError, Leaves
-from swarmjax.config import ConfigError, ExportConfig, TrainConfig
+from swarmjax.config import AlgoConfig, ConfigError, ExportConfig, RobotConfig, TrainConfig
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import normalizer
 from swarmjax.task import observation
 
 POLICY = "policy.npz"
+_DRIVE = ("wheel_radius", "track", "max_wheel_speed")
+# What each format is called where `out` does not say.
+_NAMES = {"npz": POLICY, "onnx": "policy.onnx", "c": "policy_c", "webots": "swarmjax_epuck"}
+# A controller of such a name would be imported in the place of what it or NumPy needs.
+_IMPORTED = sys.stdlib_module_names | {"policy", "controller", "numpy"}
 
 
 def policy_arrays(leaves: Leaves) -> dict[str, np.ndarray]:
@@ -43,7 +63,16 @@ def policy_arrays(leaves: Leaves) -> dict[str, np.ndarray]:
 
 
 def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
-    """Describes a policy: its layout with units, the config it was trained with, versions."""
+    """Describes a policy: its layout with units, the config it was trained with, versions.
+
+    Args:
+      trained: the run's config.
+      update: that the policy is from, 0 or more.
+      seed: of the policy.
+
+    Returns:
+      The `meta` of the `policy.npz` format, all of it but `format`, in SI units.
+    """
     robot = trained.robot
     encoding = config.encoding(trained.task, trained.realism)
     return {
@@ -52,11 +81,21 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
         "activation": trained.algo.activation,
         "observation": observation.describe(encoding) | {"limit": ppo.OBSERVATION_LIMIT},
         "action": {
-            "names": ["speed", "turn_rate"],
-            "units": ["m/s", "rad/s"],
+            "names": list(policy_file.ACTION_NAMES),
+            "units": list(policy_file.ACTION_UNITS),
             "low": [0.0, -robot.max_turn_rate],
             "high": [robot.max_speed, robot.max_turn_rate],
         },
+        "robot": {
+            "preset": _robot_preset(robot),
+            **{key: getattr(robot, key) for key in ("body", *_DRIVE)},
+        },
+        "sensors": {
+            "preset": trained.realism.name,
+            "response": trained.realism.infrared,
+            "range": trained.task.sensor_range,
+        },
+        "task": {key: getattr(trained.task, key) for key in ("control_step", "target_radius")},
         "config": config.to_dict(trained),
         "versions": provenance.versions(),
         "update": update,
@@ -64,9 +103,38 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
     }
 
 
-def policy_file(file: Path, trained: TrainConfig, seed: int) -> Path:
-    """Names the file of a seed's policy: `file`, or one beside it where there are several seeds."""
-    return file if trained.seeds == 1 else file.with_stem(f"{file.stem}-seed{seed}")
+def _robot_preset(robot: RobotConfig) -> str:
+    """Names the file of configs/robot/ that a robot's numbers are those of, or `custom`."""
+    for name in compose.choices("robot"):
+        if config.build(RobotConfig, compose.read_preset("robot", name)) == robot:
+            return name
+    return "custom"
+
+
+def seed_path(path: Path, trained: TrainConfig, seed: int) -> Path:
+    """Names the policy of a seed.
+
+    Args:
+      path: of the policy of a run of one seed.
+      trained: the run's config.
+      seed: one of the run's.
+
+    Returns:
+      `path`, or one beside it where there are several seeds.
+    """
+    return path if trained.seeds == 1 else path.with_stem(f"{path.stem}-seed{seed}")
+
+
+def _squashed(arrays: dict[str, np.ndarray], algo: AlgoConfig) -> dict[str, np.ndarray]:
+    """Writes an output of tanh as one more hidden layer, before a last one that changes nothing."""
+    if algo.output == "linear":
+        return arrays
+    parts = ("kernel", "bias")
+    last = {f"actor/hidden_{len(algo.hidden)}/{p}": arrays[f"actor/mean/{p}"] for p in parts}
+    learners, actions = arrays["actor/mean/bias"].shape
+    mean = np.tile(np.eye(actions, dtype=np.float32), (learners, 1, 1))
+    zero = np.zeros((learners, actions), np.float32)
+    return arrays | last | {"actor/mean/kernel": mean, "actor/mean/bias": zero}
 
 
 def write_policy(path: Path, leaves: Leaves, trained: TrainConfig, update: int, seed: int) -> None:
@@ -94,50 +162,117 @@ def write_policy(path: Path, leaves: Leaves, trained: TrainConfig, update: int, 
             f"the checkpoint holds {found[0]} learners of layers {list(widths)}, but the config "
             f"says {trained.learners} of {list(trained.algo.hidden)}: it is of another run."
         )
-    policy.save(path, arrays, policy_meta(trained, update, seed))
+    policy_file.write(path, _squashed(arrays, trained.algo), policy_meta(trained, update, seed))
 
 
 def read_config(run: Path) -> dict:
     """Reads the config that a run directory was trained with.
 
+    Args:
+      run: the directory.
+
+    Returns:
+      The config as plain data, unchecked.
+
     Raises:
-      ConfigError: if there is none, or it is not JSON.
+      ConfigError: if there is none, or it is no JSON object.
     """
     path = run / "config.json"
     try:
-        return json.loads(path.read_text())
+        found = json.loads(path.read_text())
     except FileNotFoundError:
         raise ConfigError(f"{run} is no run directory: it has no config.json.") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path} cannot be read: {error}.") from None
+    if not isinstance(found, dict):
+        raise ConfigError(f"{path} is no run's config: it holds no JSON object.")
+    return found
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings = config.load_export(arguments)
-    run = Path(settings.run)
+    if settings.policy is not None:
+        out = _target(settings, Path(settings.policy).parent)
+        _convert(settings, Path(settings.policy), out)
+        sys.stdout.write(f"{out}: the policy of {settings.policy}.\n")
+        return 0
+    run = Path(settings.run or "")
     trained = config.build(TrainConfig, read_config(run))
-    files = _files(settings, trained)
+    targets = _targets(settings, trained)
     leaves, update, skipped = checkpoint.restore(run, settings.step)
     for sentence in skipped:
         sys.stderr.write(f"swarmjax.export: {sentence}: it was passed over.\n")
-    for seed, file in files.items():
-        write_policy(file, leaves, trained, update, seed)
-        sys.stdout.write(f"{file}: the policy of {run} after {update} updates.\n")
+    for seed, out in targets.items():
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / POLICY
+            write_policy(file, leaves, trained, update, seed)
+            _convert(settings, file, out)
+        sys.stdout.write(f"{out}: the policy of {run} after {update} updates.\n")
     return 0
 
 
-def _files(settings: ExportConfig, trained: TrainConfig) -> dict[int, Path]:
+def _targets(settings: ExportConfig, trained: TrainConfig) -> dict[int, Path]:
     """Says which seeds are exported, and where to."""
     every, seed = seeds.numbers(trained), settings.seed
     if seed is not None and seed not in every:
         several = f"seeds {every[0]} to {every[-1]}: give one of them."
         has = several if len(every) > 1 else f"seed {every[0]}: give {every[0]}."
         raise ConfigError(f"seed is {seed}, but {settings.run} was trained with {has}")
+    out = _target(settings, Path(settings.run or ""))
     if settings.out and seed is not None:
-        return {seed: Path(settings.out)}
-    file = Path(settings.out) if settings.out else Path(settings.run) / POLICY
-    return {k: policy_file(file, trained, k) for k in (every if seed is None else [seed])}
+        return {seed: out}
+    return {k: seed_path(out, trained, k) for k in (every if seed is None else [seed])}
+
+
+def _target(settings: ExportConfig, folder: Path) -> Path:
+    """Where to, where there is one policy; what is there already is not looked at."""
+    out = Path(settings.out) if settings.out else folder / _default(settings)
+    if out.name in ("", ".."):
+        raise ConfigError(f"out is {out}, which others use too: give a name of its own.")
+    ending = Path(_NAMES[settings.format]).suffix
+    if out.suffix != ending and ending:
+        raise ConfigError(f"out is {out}, but format is {settings.format}: end it in {ending}.")
+    if settings.format == "webots":
+        _check_controller(out)
+    return out
+
+
+def _default(settings: ExportConfig) -> str:
+    """What is written where `out` does not say; a `step` leaves the final policy alone."""
+    name = Path(_NAMES[settings.format])
+    return str(
+        name if settings.step is None else name.with_stem(f"{name.stem}-step{settings.step}")
+    )
+
+
+def _check_controller(out: Path) -> None:
+    """Refuses a folder whose name cannot be that of the module of a controller."""
+    if not re.fullmatch(r"[A-Za-z_][\w-]*", out.name, re.ASCII):
+        raise ConfigError(
+            f"out is {out}, whose name is also the controller's: give letters, digits, _ and - "
+            "only, as in swarmjax_epuck."
+        )
+    if out.name in _IMPORTED:
+        raise ConfigError(
+            f"out is {out}, whose name is also the controller's, and that of a module that it "
+            "imports: give another, as in swarmjax_epuck."
+        )
+
+
+def _convert(settings: ExportConfig, source: Path, out: Path) -> None:
+    """Writes a policy file in another form."""
+    trained = policy_file.read(source)
+    content = source.read_bytes()
+    if settings.format == "npz":
+        export_folder.write_file(out, content)
+    elif settings.format == "onnx":
+        export_folder.write_file(out, export_onnx.render(trained))
+    elif settings.format == "c":
+        export_folder.write_folder(out, export_c.render(trained))
+    else:
+        files = export_webots.render(trained, content, settings.sensors, out.name)
+        export_folder.write_folder(out, files)
 
 
 if __name__ == "__main__":

@@ -142,17 +142,18 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     """
     config, world = program.config, program.world
     key, level_key, rollout_key, learn_key = jax.random.split(state.key, 4)
-    index = curricula.assign(state.curriculum, config.arenas)
+    index = jnp.tile(
+        curricula.assign(state.curriculum, config.arenas), rollout.waiting(config.algo.rollout)
+    )
     starts = rollout.draw_starts(world, schedule.stages, index, state.curriculum.cohort, level_key)
     arenas, trajectory, ended = rollout.collect(
         world, state.learners, state.arenas, starts, rollout_key
     )
-    batch = rollout.batch(
-        trajectory, discount=config.algo.discount, gae_lambda=config.algo.gae_lambda
-    )
+    batch = rollout.batch(trajectory, config.algo)
+    explored = rollout.explore(world, state.learners, config.algo.rollout)
     learners, learned = jax.vmap(
         lambda learner, b, k: ppo.update(learner, config.algo, b, k, config.updates)
-    )(state.learners, batch, jax.random.split(learn_key, config.learners))
+    )(explored, batch, jax.random.split(learn_key, config.learners))
     counted = curricula.count(state.curriculum, ended)
     curriculum, decision = curricula.advance(
         counted, schedule, config.curriculum, program.mode, state.update

@@ -1,6 +1,5 @@
 """What a promotion does to the learners, as the config says."""
 
-import math
 from dataclasses import replace
 
 import jax
@@ -9,6 +8,7 @@ import optax
 from jax import Array
 
 from swarmjax.config import TrainConfig
+from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
 
 
@@ -42,7 +42,7 @@ def carry_over(
         unweighted = replace(carried.normalizer, count=jnp.zeros_like(carried.normalizer.count))
         carried = replace(carried, normalizer=unweighted)
     if options.exploration == "reset":
-        carried = replace(carried, params=_explorative(carried.params, config.algo.initial_std))
+        carried = ppo.explore_anew(carried, config.algo)
     if carried is learners:
         return learners
     return jax.tree.map(lambda new, old: jnp.where(promoted, new, old), carried, learners)
@@ -69,9 +69,3 @@ def _forgotten(state: optax.OptState) -> optax.OptState:
         return jax.tree.map(jnp.zeros_like, part) if is_adam(part) else part
 
     return jax.tree.map(forget, state, is_leaf=is_adam)
-
-
-def _explorative(params: dict, std: float) -> dict:
-    """Sets the policy's standard deviation to what a new one begins with."""
-    log_std = jnp.full_like(params["actor"]["log_std"], math.log(std))
-    return params | {"actor": params["actor"] | {"log_std": log_std}}

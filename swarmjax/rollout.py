@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from swarmjax.ppo import gae
+from swarmjax.config import AlgoConfig
+from swarmjax.ppo import gae, monte_carlo
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.sim import physics
@@ -25,6 +26,9 @@ ACTION_SIZE = 2
 # Cohort of an episode that counts for none: curricula number theirs from 0, and -1 is the one
 # before the first.
 UNCOUNTED = -2
+# Control steps of a rollout for which one episode of each arena is drawn; the shortest that the
+# six stages have take 23.
+_STEPS_PER_EPISODE = 32
 
 
 class Trajectory(NamedTuple):
@@ -114,22 +118,27 @@ def to_arenas(x: Array) -> Array:
     return jnp.moveaxis(x[:, :, 0], 0, 1)
 
 
-def draw_starts(world: World, stages: Stage, index: Array, cohort: Array, key: Array) -> EnvState:
-    """Draws a fresh level for every arena, an episode that waits until the arena is free.
+def waiting(rollout: int) -> int:
+    """How many episodes are drawn for each arena ahead of a rollout of that many control steps."""
+    return max(1, rollout // _STEPS_PER_EPISODE)
 
-    It is drawn once a rollout, not at every step: an arena that ends two episodes in one rollout
-    begins both of the next ones on the same level. The second trains, but counts for no cohort:
-    short episodes would be counted more often than long ones.
+
+def draw_starts(world: World, stages: Stage, index: Array, cohort: Array, key: Array) -> EnvState:
+    """Draws fresh levels: episodes that wait until their arena is free.
+
+    They are drawn ahead of a rollout, not at every step, `waiting` for each arena. An arena that
+    ends more episodes than that begins the rest on the last of its levels. Those train, but count
+    for no cohort: short episodes would be counted more often than long ones.
 
     Args:
       world: the compiled environment.
       stages: [S].
-      index: [A] stage of each arena's next episode.
+      index: [W A] stage of each episode: the first of every arena, then the second, and so on.
       cohort: [] the curriculum's cohort.
       key: random key, consumed.
 
     Returns:
-      [A] the episodes that wait, packed.
+      [W A] the episodes that wait, packed.
     """
     uniforms = jax.random.uniform(key, (*index.shape, level.uniform_count(world.spacing)))
     stages = jax.tree.map(jnp.asarray, stages)
@@ -150,42 +159,43 @@ def collect(
       world: the compiled environment.
       learners: [L].
       arenas: [A], packed.
-      starts: [A] episodes that wait, packed.
+      starts: [W A] episodes that wait, as `draw_starts` orders them, packed.
       key: random key, consumed.
 
     Returns:
       The arenas, packed; the trajectory; the episodes that ended.
     """
-    start_value = _values(world, learners, starts.observation)
-    step = functools.partial(_step, world, learners, starts, start_value)
+    waits = _Waiting(starts, _values(world, learners, starts.observation))
+    step = functools.partial(_step, world, learners, waits)
     unpack = functools.partial(physics.unpack, world.physics)
     arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
-    carry = (arenas, _values(world, learners, arenas.observation), starts.cohort)
-    keys = jax.random.split(key, world.config.algo.rollout)
-    (arenas, *_), (trajectory, ended) = jax.lax.scan(step, carry, keys)
+    begun = jnp.zeros_like(arenas.clock)
+    carry = (arenas, _values(world, learners, arenas.observation), begun)
+    steps = world.config.algo.rollout
+    keys = jax.random.split(key, steps)
+    (arenas, *_), (trajectory, ended) = jax.lax.scan(step, carry, (keys, 1 + jnp.arange(steps)))
     packed = jax.vmap(physics.pack)(arenas.sim)
     return replace(arenas, sim=packed), trajectory, ended
 
 
-def batch(trajectory: Trajectory, *, discount: float, gae_lambda: float) -> Batch:
+def explore(world: World, learners: LearnerState, steps: Array | int) -> LearnerState:
+    """Moves the learners [L] on along the schedule of exploration, by steps of every arena."""
+    config, arenas = world.config.algo, world.config.arenas
+    return jax.vmap(lambda learner: ppo.explore(learner, config, steps * arenas))(learners)
+
+
+def batch(trajectory: Trajectory, config: AlgoConfig) -> Batch:
     """Turns a rollout into what the learners learn from.
 
     Args:
       trajectory: [T, L, A, N, ...].
-      discount: per control step.
-      gae_lambda: 0..1.
+      config: says what a return is.
 
     Returns:
       [L] batches of A groups of T * N samples.
     """
-    advantages, returns = gae.generalized_advantages(
-        trajectory.reward,
-        trajectory.value,
-        trajectory.next_value,
-        trajectory.terminated,
-        trajectory.truncated,
-        discount=discount,
-        gae_lambda=gae_lambda,
+    advantages, returns = {"gae": _bootstrapped, "monte_carlo": _monte_carlo}[config.returns](
+        trajectory, config
     )
 
     def group(x: Array) -> Array:
@@ -202,30 +212,74 @@ def batch(trajectory: Trajectory, *, discount: float, gae_lambda: float) -> Batc
     )
 
 
-_Carry = tuple[EnvState, Array, Array]  # arenas, their values, the cohort that waits for each
+def _bootstrapped(trajectory: Trajectory, config: AlgoConfig) -> tuple[Array, Array]:
+    """Returns the advantages and returns of generalised advantage estimation."""
+    assert config.gae_lambda is not None  # the config has filled it in
+    terminated = trajectory.terminated
+    if config.time_out == "terminal":
+        terminated = terminated | _timed_out(trajectory)
+    return gae.generalized_advantages(
+        trajectory.reward,
+        trajectory.value,
+        trajectory.next_value,
+        terminated,
+        trajectory.truncated,
+        discount=config.discount,
+        gae_lambda=config.gae_lambda,
+    )
+
+
+def _monte_carlo(trajectory: Trajectory, config: AlgoConfig) -> tuple[Array, Array]:
+    """Returns what the normalised Monte-Carlo returns have above the values, and themselves."""
+    boundary = trajectory.terminated | trajectory.truncated
+    if config.time_out == "leak":
+        boundary = boundary & ~_timed_out(trajectory)
+    returns = monte_carlo.monte_carlo_returns(trajectory.reward, boundary, discount=config.discount)
+    normal = jax.vmap(monte_carlo.normalize, in_axes=1, out_axes=1)(returns, trajectory.valid)
+    return normal - trajectory.value, normal
+
+
+def _timed_out(trajectory: Trajectory) -> Array:
+    """Tells where the step limit cut, not physics that broke, whose step is not valid."""
+    return trajectory.truncated & trajectory.valid
+
+
+class _Waiting(NamedTuple):
+    """Episodes that wait.
+
+    Attributes:
+      starts: [W A], packed.
+      value: [L, W A, N] of their first observations.
+    """
+
+    starts: EnvState
+    value: Array
+
+
+_Carry = tuple[EnvState, Array, Array]  # arenas, their values, how many episodes each has begun
 
 
 def _step(
     world: World,
     learners: LearnerState,
-    starts: EnvState,
-    start_value: Array,
+    waits: _Waiting,
     carry: _Carry,
-    key: Array,
+    now: tuple[Array, Array],
 ) -> tuple[_Carry, tuple[Trajectory, Ended]]:
-    """One control step of all arenas."""
-    arenas, value, cohort = carry
+    """One control step of all arenas, the first of a rollout being 1."""
+    (arenas, value, begun), (key, number) = carry, now
     count = value.shape[0]
     mine = to_learners(arenas.observation, count)
     noise = jax.random.normal(key, (*mine.shape[:-1], ACTION_SIZE))
     config = world.config.algo
     action, log_prob = jax.vmap(lambda learner, o, n: ppo.act(learner, config, o, n))(
-        learners, mine, noise
+        explore(world, learners, number), mine, noise
     )
     arenas, came = jax.vmap(functools.partial(env.step, world))(arenas, to_arenas(action))
     next_value = _values(world, learners, came.observation)
     ended = _ended(arenas, came)
-    arenas = restart(arenas, replace(starts, cohort=cohort), came.done)
+    starts, start_value = _next(waits, begun)
+    arenas = restart(arenas, starts, came.done)
     over = jnp.broadcast_to(came.done[None, :, None], next_value.shape)
     transition = Trajectory(
         observation=mine,
@@ -238,12 +292,19 @@ def _step(
         truncated=to_learners(came.truncated, count),
         valid=to_learners(came.valid, count),
     )
-    carry = (
-        arenas,
-        jnp.where(over, start_value, next_value),
-        jnp.where(came.done, UNCOUNTED, cohort),
-    )
+    carry = (arenas, jnp.where(over, start_value, next_value), begun + came.done)
     return carry, (transition, ended)
+
+
+def _next(waits: _Waiting, begun: Array) -> tuple[EnvState, Array]:
+    """Picks the episode [A] that each arena begins next, and its value [L, A, N]."""
+    arenas = begun.shape[0]
+    count = waits.starts.cohort.shape[0] // arenas
+    starts, value = waits
+    if count > 1:
+        index = jnp.minimum(begun, count - 1) * arenas + jnp.arange(arenas)
+        starts, value = jax.tree.map(lambda x: x[index], starts), value[:, index]
+    return replace(starts, cohort=jnp.where(begun < count, starts.cohort, UNCOUNTED)), value
 
 
 def _values(world: World, learners: LearnerState, seen: Array) -> Array:

@@ -18,6 +18,7 @@ from swarmjax.config import ConfigError, TrainConfig
 from swarmjax.loop import TrainState
 
 _CARRIED = ("params", "normalizer")  # of a learner
+_EXPLORED = "explored"  # likewise, of one whose exploration is scheduled
 _MET = "curriculum/met"  # robots that have trained: a promotion copies nobody over them
 
 
@@ -61,7 +62,7 @@ def read(settings: TrainConfig) -> Source | None:
         leaves, update, skipped = checkpoint.restore(run)
     except CheckpointError as error:
         raise _refused(settings.start, error) from None
-    prefixes = tuple(f"learners/{name}/" for name in _CARRIED)
+    prefixes = (*(f"learners/{name}/" for name in _CARRIED), f"learners/{_EXPLORED}")
     times = settings.seeds // stored.seeds
     carried = {
         name: np.repeat(leaf, times, axis=0)
@@ -87,6 +88,8 @@ def carry(source: Source, state: TrainState, settings: TrainConfig) -> TrainStat
       ConfigError: if the checkpoint is not of the config beside it.
     """
     fresh = {name: getattr(state.learners, name) for name in _CARRIED}
+    if settings.start_std == "keep" and f"learners/{_EXPLORED}" in source.leaves:
+        fresh[_EXPLORED] = state.learners.explored
     template = {"learners": fresh, "curriculum": {"met": state.curriculum.met}}
     try:
         found = checkpoint.from_leaves(source.leaves, template)
@@ -127,11 +130,13 @@ def _check_alike(start: str, stored: TrainConfig, settings: TrainConfig) -> None
     if stored.algo.policy == "independent":
         policy += f" sim.max_robots={stored.sim.max_robots}"
     hidden, activation = config.show(stored.algo.hidden), stored.algo.activation
+    output = stored.algo.output
     seen, needed = (config.encoding(each.task, each.realism) for each in (stored, settings))
     for name, held, wanted, remedy in (
         ("number of learners", stored.learners, settings.learners, policy),
         ("algo.hidden", hidden, config.show(settings.algo.hidden), f"algo.hidden={hidden}"),
         ("algo.activation", activation, settings.algo.activation, f"algo.activation={activation}"),
+        ("algo.output", output, settings.algo.output, f"algo.output={output}"),
         ("encoding of observations", seen, needed, f"task.encoding={seen}"),
     ):
         if held != wanted:

@@ -37,7 +37,7 @@ Nothing here turns inf into nan; what would have to is refused, as are nan and -
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -49,7 +49,8 @@ LEAST_DRAWN = 3
 _LAST_TWO = (-2, -1)
 
 type RunDraw = Literal["runs_per_task", "runs"]
-type Draw = RunDraw | Literal["tasks_per_run", "tasks", "runs_then_tasks", "runs_and_tasks"]
+type SharedDraw = Literal["tasks", "runs_and_tasks"]
+type Draw = RunDraw | SharedDraw | Literal["tasks_per_run", "runs_then_tasks"]
 # How runs and tasks are taken: kept as they are, drawn whole, or drawn for each of the other.
 _DRAWS = {
     "runs_per_task": ("each", "kept"),
@@ -147,6 +148,7 @@ def bootstrap(
     statistic: Statistic,
     *,
     draw: Draw = "runs_per_task",
+    strata: Sequence[int] | None = None,
     confidence: float = 0.95,
     resamples: int = 2000,
     seed: int = 0,
@@ -163,6 +165,8 @@ def bootstrap(
       values: [runs, tasks] of any unit, at least three of what is drawn.
       statistic: called as `statistic(x, axis=(-2, -1))` on x [..., runs, tasks].
       draw: what is drawn, and so what the interval is about.
+      strata: numbers of tasks, in their order, among which tasks are drawn (Efron & Tibshirani
+        1993, section 8.3); None draws among all of them.
       confidence: of the interval, above 0 and below 1.
       resamples: how many, enough for one beyond either end of the interval.
       seed: of the draws.
@@ -175,7 +179,8 @@ def bootstrap(
     """
     table = _table("values", values, draw)
     _check_resampling(confidence, resamples)
-    draws = _distributions((table,), statistic, draw, resamples, seed)[0]
+    _check_strata(strata, table.shape[1])
+    draws = _distributions((table,), statistic, draw, resamples, seed, strata)[0]
     return _interval(float(_apply(statistic, table)), draws, confidence)
 
 
@@ -185,6 +190,7 @@ def paired(
     statistic: Statistic,
     *,
     draw: Draw = "runs_per_task",
+    strata: Sequence[int] | None = None,
     confidence: float = 0.95,
     resamples: int = 2000,
     seed: int = 0,
@@ -199,6 +205,7 @@ def paired(
       b: [runs, tasks] of the same, in the same order.
       statistic: as of `bootstrap`.
       draw: as of `bootstrap`.
+      strata: as of `bootstrap`.
       confidence: as of `bootstrap`.
       resamples: as of `bootstrap`.
       seed: of the draws.
@@ -218,7 +225,8 @@ def paired(
                 f"{name} holds inf, and inf - inf is no number: use probability_of_improvement."
             )
     _check_resampling(confidence, resamples)
-    of_a, of_b = _distributions((before, after), statistic, draw, resamples, seed)
+    _check_strata(strata, before.shape[1])
+    of_a, of_b = _distributions((before, after), statistic, draw, resamples, seed, strata)
     estimate = float(_apply(statistic, after)) - float(_apply(statistic, before))
     return _interval(estimate, of_b - of_a, confidence)
 
@@ -227,7 +235,8 @@ def probability_of_improvement(
     a: ArrayLike,
     b: ArrayLike,
     *,
-    draw: RunDraw = "runs_per_task",
+    draw: RunDraw | SharedDraw = "runs_per_task",
+    strata: Sequence[int] | None = None,
     confidence: float = 0.95,
     resamples: int = 2000,
     seed: int = 0,
@@ -235,13 +244,15 @@ def probability_of_improvement(
     """Interval of how likely a run of a is to beat one of b: P(a > b) + P(a = b) / 2.
 
     Averaged over tasks. On each it is U / (n m) of the Mann-Whitney test, as in Agarwal et al.
-    2021, section 4.3; resamples of a and b are independent. Only the order of values counts, so
-    that inf is a value like any other. Where small is good, exchange a and b.
+    2021, section 4.3; resamples of the runs of a and b are independent, tasks that are drawn are
+    the same for both. Only the order of values counts, so that inf is a value like any other.
+    Where small is good, exchange a and b.
 
     Args:
-      a: [n, tasks] of any unit, at least three runs.
+      a: [n, tasks] of any unit, at least three of what is drawn.
       b: [m, tasks] of the same.
-      draw: `runs_per_task` or `runs`, as of `bootstrap`.
+      draw: `runs_per_task`, `runs`, `tasks` or `runs_and_tasks`, as of `bootstrap`.
+      strata: as of `bootstrap`.
       confidence: as of `bootstrap`.
       resamples: as of `bootstrap`.
       seed: of the draws.
@@ -250,21 +261,24 @@ def probability_of_improvement(
       Probability and interval, 0 to 1.
 
     Raises:
-      ValueError: As of `bootstrap`, and if tasks differ in number or are what is drawn.
+      ValueError: As of `bootstrap`, and if tasks differ in number or are drawn for each run.
     """
-    if draw not in ("runs_per_task", "runs"):
-        raise ValueError(f"draw is '{draw}': give runs_per_task or runs.")
+    if draw not in ("runs_per_task", "runs", "tasks", "runs_and_tasks"):
+        raise ValueError(f"draw is '{draw}': give runs_per_task, runs, tasks or runs_and_tasks.")
     ours, theirs = _table("a", a, draw), _table("b", b, draw)
     if ours.shape[1] != theirs.shape[1]:
         raise ValueError(f"a has {ours.shape[1]} tasks and b has {theirs.shape[1]}: give the same.")
     _check_resampling(confidence, resamples)
+    _check_strata(strata, ours.shape[1])
     wins = (ours[:, None] > theirs) + 0.5 * (ours[:, None] == theirs)
     random = np.random.default_rng(seed)
     draws = []
     for count in _blocks(resamples, wins.size):
-        mine, tasks = _indices(random, draw, count, ours.shape)
-        other, _ = _indices(random, draw, count, theirs.shape)
-        draws.append(wins[mine[:, :, None], other[:, None], tasks].mean(axis=(1, 2, 3)))
+        mine, tasks = _indices(random, draw, count, ours.shape, strata)
+        other, _ = _indices(random, draw, count, theirs.shape, strata)
+        # Axes: resamples, runs of a, runs of b, tasks; one that is not drawn has one resample.
+        found = wins[mine[..., :, None, :], other[..., None, :, :], _widen(tasks)]
+        draws.append(found.mean(axis=(1, 2, 3)))
     return _interval(float(wins.mean()), np.concatenate(draws), confidence)
 
 
@@ -421,7 +435,11 @@ def _blocks(resamples: int, cells: int) -> Iterator[int]:
 
 
 def _indices(
-    random: np.random.Generator, draw: str, count: int, shape: tuple[int, ...]
+    random: np.random.Generator,
+    draw: str,
+    count: int,
+    shape: tuple[int, ...],
+    strata: Sequence[int] | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draws where to take values [runs, tasks] from: two indices that fit [count, runs, tasks]."""
     by_run, by_task = _DRAWS[draw]
@@ -430,18 +448,46 @@ def _indices(
     if by_run != "kept":
         row = random.integers(runs, size=(count, runs, tasks if by_run == "each" else 1))
     if by_task != "kept":
-        column = random.integers(tasks, size=(count, runs if by_task == "each" else 1, tasks))
+        low, high = _bounds(strata, tasks)
+        size = (count, runs if by_task == "each" else 1, tasks)
+        column = random.integers(low, high, size=size)
     return row, column
 
 
+def _bounds(strata: Sequence[int] | None, tasks: int) -> tuple[Any, Any]:
+    """From where to where each of the tasks is drawn."""
+    if strata is None:
+        return 0, tasks
+    ends = np.cumsum(strata)
+    return np.repeat(ends - strata, strata), np.repeat(ends, strata)
+
+
+def _check_strata(strata: Sequence[int] | None, tasks: int) -> None:
+    if strata is not None and (min(strata, default=0) < LEAST_DRAWN or sum(strata) != tasks):
+        raise ValueError(
+            f"strata is {list(strata)}: give numbers of {LEAST_DRAWN} or more that add up to "
+            f"{tasks}."
+        )
+
+
+def _widen(tasks: np.ndarray) -> np.ndarray:
+    """Gives indices of tasks [tasks] or [count, 1, tasks] an axis for the runs of another table."""
+    return tasks if tasks.ndim == 1 else tasks[:, :, None]
+
+
 def _distributions(
-    tables: tuple[np.ndarray, ...], statistic: Statistic, draw: str, resamples: int, seed: int
+    tables: tuple[np.ndarray, ...],
+    statistic: Statistic,
+    draw: str,
+    resamples: int,
+    seed: int,
+    strata: Sequence[int] | None = None,
 ) -> np.ndarray:
     """Statistics [tables, resamples] of tables of one shape, resampled by the same draws."""
     random = np.random.default_rng(seed)
     found = []
     for count in _blocks(resamples, tables[0].size):
-        index = _indices(random, draw, count, tables[0].shape)
+        index = _indices(random, draw, count, tables[0].shape, strata)
         found.append([_apply(statistic, table[index]) for table in tables])
     return np.concatenate(found, axis=1)
 

@@ -158,7 +158,7 @@ def _write_results(run: Path, program: Program, state: TrainState, tally: Tally)
     settings, every = program.config, seeds.numbers(program.config)
     leaves = checkpoint.to_leaves(state)
     for seed in every:
-        file = export.policy_file(run / export.POLICY, settings, seed)
+        file = export.seed_path(run / export.POLICY, settings, seed)
         export.write_policy(file, leaves, settings, tally.update, seed)
     steps = tally.update * settings.arenas * settings.algo.rollout
     train_s, transitions = tally.earlier_s + tally.seconds, tally.transitions
@@ -193,7 +193,7 @@ def _closing(run: Path, settings: TrainConfig, tally: Tally) -> str:
             f"stopped after update {tally.update:,} of {settings.updates:,}, saved; go on with: "
             f"python -m swarmjax.train resume={run}"
         )
-    policy = export.policy_file(run / export.POLICY, settings, settings.seed)
+    policy = export.seed_path(run / export.POLICY, settings, settings.seed)
     stage = settings.stage[-1].name
     what = "the policy" if settings.seeds == 1 else f"each of {settings.seeds} policies"
     return f"done; judge {what} with: python -m swarmjax.evaluate policy={policy} stage={stage}"

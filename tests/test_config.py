@@ -75,8 +75,8 @@ def test_train_defaults_to_the_whole_curriculum():
     assert train.learners == 1
 
 
-def test_defaults_of_the_reward_are_equation_3():
-    assert dataclasses.astuple(RewardConfig()) == (1.0, -0.001, 0.0, 0.0, 0.0)
+def test_defaults_of_the_reward_are_equation_3_and_two_prices():
+    assert dataclasses.astuple(RewardConfig()) == (1.0, -0.001, 0.0, -0.02, -0.001)
 
 
 def test_robot_defaults_are_the_epuck():
@@ -151,7 +151,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage=../train"], f"stage is '../train': give one of {CHOICES}."),
         (["stage=[s1,s2]"], f"stage is '[s1,s2]': give one of {CHOICES}."),
         (["stage=null"], f"stage is 'null': give one of {CHOICES}."),
-        (["robot=legged"], "robot is 'legged': give one of planar, planar_v2, wheeled, "
+        (["robot=legged"], "robot is 'legged': give one of paper, planar, planar_v2, wheeled, "
          "wheeled_v2."),
         # Stages and curricula.
         (["stage.side=0.9"], "stage.side cannot be given for curriculum, a curriculum: choose "
@@ -204,11 +204,12 @@ def test_import_needs_neither_jax_nor_hydra():
          "obstacles=3, obstacle_size=0.1: give at least 0.77."),
         # Options of a mode.
         (["curriculum.score=learnability"], "curriculum.score is learnability, but mode is "
-         "sequential: score is an option of adaptive, so give null or mode=adaptive."),
+         "mixed: score is an option of adaptive, so give null or mode=adaptive."),
         (["curriculum.mode=mixed", "curriculum.floor=0.1"], "curriculum.floor is 0.1, but mode is "
          "mixed: floor is an option of adaptive, so give null or mode=adaptive."),
-        (["curriculum.earlier_share=0.1"], "curriculum.earlier_share is 0.1, but mode is "
-         "sequential: earlier_share is an option of mixed, so give null or mode=mixed."),
+        (["curriculum.mode=sequential", "curriculum.earlier_share=0.1"], "curriculum.earlier_share "
+         "is 0.1, but mode is sequential: earlier_share is an option of mixed, so give null or "
+         "mode=mixed."),
         (["curriculum.mode=adaptive", "curriculum.threshold=0.8"], "curriculum.threshold is 0.8, "
          "but mode is adaptive: threshold is an option of sequential and mixed, so give null or "
          "mode=sequential."),
@@ -268,11 +269,21 @@ def test_train_refuses(words, sentence):
         (["stage=curriculum"], "stage is curriculum, a curriculum: give one stage, as in "
          "stage=s6."),
         (["stage=grid"], "stage is grid, a grid: give one stage, as in stage=s6."),
-        (["suite=all"], "suite is 'all', but is not built yet: leave it out."),
+        (["suite=all", "stage=s6"], "stage cannot be given with suite=all, which says what its "
+         "levels are: leave stage or suite out."),
+        (["suite=all", "seed=2"], "seed cannot be given with suite=all, which says what its "
+         "levels are: leave seed or suite out."),
+        (["compare=a,b"], "policy is 'p' and compare is 'a,b': give one of them, policy=FILE or "
+         "compare=FILE,FILE."),
+        (["policy=null"], "policy is null and compare is null: give one of them, policy=FILE or "
+         "compare=FILE,FILE."),
+        (["shape=ball"], "shape is 'ball': give box, bar, cross, ell or pillar."),
+        (["shape=bar", "stage.level=fixed"], "shape is bar, but stage.level is fixed, with "
+         "obstacles of its own: give shape=box."),
         (["workers=0"], "workers is 0: give 1 to 1024."),
-        (["engine=mjx"], "engine is 'mjx': give c."),
-        (["algo=ppo"], "algo is not a key: give one of policy, stage, robot, task, suite, "
-         "realism, engine, steps, episodes, seed, workers, substeps, out."),
+        (["engine=warp"], "engine is 'warp': give c or mjx."),
+        (["algo=ppo"], "algo is not a key: give one of policy, compare, stage, robot, task, suite, "
+         "shape, realism, engine, steps, episodes, seed, workers, substeps, out."),
     ],
 )  # fmt: skip
 def test_evaluate_refuses(words, sentence):
@@ -280,7 +291,29 @@ def test_evaluate_refuses(words, sentence):
 
 
 def test_export_refuses_an_unknown_format():
-    assert refusal(load_export, ["run=r", "format=pt"]) == "format is 'pt': give npz."
+    assert refusal(load_export, ["run=r", "format=pt"]) == (
+        "format is 'pt': give npz, onnx, c or webots."
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ([], "run is null and policy is null: give one of them, as in run=runs/a or "
+         "policy=policy.npz."),
+        (["run=r", "policy=p"], "run is 'r' and policy is 'p': give one of them, as in run=runs/a "
+         "or policy=policy.npz."),
+        (["policy=p", "format=c", "seed=1"], "seed is 1, but policy is one file: give seed with "
+         "run."),
+        (["policy=p", "format=c", "step=1"], "step is 1, but policy is one file: give step with "
+         "run."),
+        (["policy=p"], "out is null, but policy is given already: give out=FILE."),
+        (["run=r", "format=onnx", "sensors=real"], "sensors is real, but format is onnx: give "
+         "format=webots."),
+    ],
+)  # fmt: skip
+def test_export_refuses(words, sentence):
+    assert refusal(load_export, words) == sentence
 
 
 def test_a_budget_of_one_update_is_enough():
@@ -456,10 +489,10 @@ def test_help_lists_every_key_once():
             value = value[0] if key == "stage" else value
             if isinstance(value, dict):
                 yield from leaves(value, f"{where}{key}.")
-            elif f"{where}{key}" not in ("stage_name", "realism.name"):
+            elif f"{where}{key}" not in ("stage_name", "realism.name", "algo.name"):
                 yield f"{where}{key}"
 
-    assert listed[:4] == ["stage", "robot", "algo", "realism"]
+    assert listed[:4] == ["stage", "robot", "realism", "algo"]
     assert listed[4:] == list(leaves(to_dict(load_train([]))))
 
 
@@ -481,7 +514,7 @@ def test_help_gives_default_meaning_and_allowed_values():
 
 
 def test_help_of_the_other_commands():
-    assert "policy=<required>" in help_text(EvaluateConfig, "swarmjax.evaluate")
+    assert "robot=wheeled" in help_text(EvaluateConfig, "swarmjax.evaluate")
     export = help_text(ExportConfig, "swarmjax.export")
-    assert "run=<required>" in export
+    assert "run=null" in export
     assert "Groups" not in export

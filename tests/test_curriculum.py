@@ -28,7 +28,7 @@ from swarmjax.curriculum import (
 from swarmjax.curriculum_modes import MODES
 from swarmjax.rollout import Ended
 
-OPTIONS = CurriculumConfig()
+OPTIONS = CurriculumConfig(mode="sequential")
 NOW, BEFORE = -1, -2  # the current cohort, and the one before
 
 

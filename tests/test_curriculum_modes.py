@@ -44,7 +44,7 @@ from swarmjax.task import env, observation
 from swarmjax.task.env import EnvState
 
 COHORT = 4  # updates
-SEQUENTIAL, MIXED = CurriculumConfig(), CurriculumConfig(mode="mixed")
+SEQUENTIAL, MIXED = (CurriculumConfig(mode=mode) for mode in ("sequential", "mixed"))
 ADAPTIVE = CurriculumConfig(mode="adaptive")
 PROGRESS = CurriculumConfig(mode="adaptive", score="progress")
 
@@ -379,7 +379,7 @@ def step() -> Step:
 EARLY, LATE = np.array([24, 90, NEVER], np.int32), np.array([60, 80, NEVER], np.int32)
 CASES = {
     "sequential": (SEQUENTIAL, {"deadline": EARLY}),
-    "sequential-all": (CurriculumConfig(success="all"), {"deadline": EARLY}),
+    "sequential-all": (CurriculumConfig(mode="sequential", success="all"), {"deadline": EARLY}),
     "mixed": (MIXED, {"deadline": LATE, "earlier_share": np.float32(0.5)}),
     "learnability": (ADAPTIVE, {}),
     "progress": (PROGRESS, {"floor": np.float32(0.4)}),

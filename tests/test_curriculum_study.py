@@ -53,7 +53,7 @@ def test_unsound_words_are_refused(words: list[str], expected: str) -> None:
 @pytest.mark.parametrize(
     ("arm", "mode", "stages"),
     [
-        ("final", "sequential", ["s6"]),
+        ("final", "mixed", ["s6"]),
         ("sequential", "sequential", ["s1", "s2", "s3", "s4", "s5", "s6"]),
         ("mixed", "mixed", ["s1", "s2", "s3", "s4", "s5", "s6"]),
         ("adaptive", "adaptive", ["s1", "s2", "s3", "s4", "s5", "s6"]),

@@ -1,718 +1,195 @@
-"""The judge against hand-worked numbers, against the training environment, and as a command."""
+"""The command that judges policies: its figures by hand, its files, and what it refuses."""
 
-import dataclasses
+import csv
 import json
 import math
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import steering
+from steering import SPEED, STAY, STEP
 
-from swarmjax import command, config, evaluate, evaluate_c, policy
-from swarmjax.config import (
-    ConfigError,
-    EvaluateConfig,
-    RealismConfig,
-    RobotConfig,
-    SimConfig,
-    StageConfig,
-    TaskConfig,
-    TrainConfig,
+from swarmjax import (
+    cells,
+    command,
+    compose,
+    config,
+    evaluate,
+    evaluate_run,
+    evaluate_summary,
+    policy,
+    statistics,
 )
-from swarmjax.evaluate_c import Arenas, Judge, Outcome
-from swarmjax.policy import PolicyError
-from swarmjax.sim import gaps, infrared, model, physics
-from swarmjax.task import env, observation, senses
-from swarmjax.task.env import EnvState, TimeStep, World
-from swarmjax.task.level import Level
+from swarmjax.cells import Cell
+from swarmjax.config import EvaluateConfig, RealismConfig, RobotConfig, StageConfig, TaskConfig
+from swarmjax.evaluate_run import Trial
+from swarmjax.measures import MEASURES
+from swarmjax.settings import build, to_dict
+from swarmjax.task import observation
 
-SPEED = 0.1256  # m/s, the largest command
-STEP = 0.032  # s, a control step
-STRIDE = SPEED * STEP  # m; the servo has the speed within one control step
-# Action of a policy by hand: at bearing 0, and what each radian to the left and right adds.
-STEER = ((1.0, 0.0), (-2.0, 2.0), (-2.0, -2.0))
-AHEAD = ((1.0, 0.0), (0.0, 0.0), (0.0, 0.0))
-STAY = ((-1.0, 0.0), (0.0, 0.0), (0.0, 0.0))
-SPIN = ((-1.0, 1.0), (0.0, 0.0), (0.0, 0.0))
 
+def _stage(robots: int, side: float = 1.0, obstacles: int = 0) -> StageConfig:
+    return StageConfig(name="test", robots=robots, side=side, obstacles=obstacles)
 
-def _policy(path: Path, drive: tuple = STEER, learners: int = 1, **meta: Any) -> Path:
-    """Writes a policy of one hidden layer, relu(bearing) and relu(-bearing)."""
-    bearing = np.zeros((1, observation.SIZE, 2))
-    bearing[0, observation.NAMES.index("target_bearing")] = [1.0, -1.0]
-    zero = np.zeros((1, observation.SIZE))
-    arrays = {
-        "actor/hidden_0/kernel": bearing,
-        "actor/hidden_0/bias": zero[:, :2],
-        "actor/mean/kernel": np.array([drive[1:]]),
-        "actor/mean/bias": np.array([drive[0]]),
-        "actor/log_std": zero[:, :2],
-        "normalizer/mean": zero,
-        "normalizer/std": zero + 1.0,
-    }
-    arrays = {n: np.repeat(a, learners, 0).astype(np.float32) for n, a in arrays.items()}
-    full = {
-        "policy": "shared",
-        "learners": learners,
-        "activation": "relu",
-        "observation": observation.describe("metric") | {"limit": 10.0},
-        "action": {
-            "names": ["speed", "turn_rate"],
-            "units": ["m/s", "rad/s"],
-            "low": [0.0, -3.14],
-            "high": [SPEED, 3.14],
-        },
-        "config": {},
-        "versions": {},
-        "update": 0,
-    }
-    policy.save(path, arrays, full | meta)
-    return path
 
+def _config(path: Path, **rest: Any) -> EvaluateConfig:
+    """An evaluation with the planar body, which is the faster one, in one process."""
+    plain = {"robot": RobotConfig(), "workers": 1} | rest
+    return EvaluateConfig(policy=str(path), **plain)
 
-def _stage(
-    robots: int = 1,
-    side: float | tuple[float, float] = 1.0,
-    obstacles: int = 0,
-    **rest: Any,
-) -> StageConfig:
-    return StageConfig(name="test", robots=robots, side=side, obstacles=obstacles, **rest)
 
-
-def _judge(tmp_path: Path, stage: StageConfig, drive: tuple = STEER, **rest: Any) -> Judge:
-    path = _policy(tmp_path / "policy.npz", drive)
-    config = EvaluateConfig(policy=str(path), stage=stage, **rest)
-    return evaluate_c.load(config, policy.load(path))
-
-
-def _start(
-    judge: Judge, pose: list, target: list | None = None, obstacle: list | None = None
-) -> Arenas:
-    """Starts one arena by hand; without a target it lies far ahead, out of reach."""
-    return evaluate_c.start(judge, [_level(judge, pose, target, obstacle)])
-
-
-def _level(
-    judge: Judge,
-    pose: list,
-    target: list | None = None,
-    obstacle: list | None = None,
-    seed: int = 0,
-) -> Level:
-    start = np.array(pose, np.float32)
-    ahead = np.stack([np.cos(start[:, 2]), np.sin(start[:, 2])], axis=-1)
-    robots, obstacles = len(start), len(obstacle or [])
-    return Level(
-        side=judge.stage.side,
-        present=np.ones(robots, bool),
-        start=start,
-        target=start[:, :2] + 100 * ahead if target is None else np.array(target),
-        obstacle_present=np.ones(obstacles, bool),
-        obstacle=np.array(obstacle or np.zeros((0, 5)), np.float32),
-        seed=np.uint32(seed),
-    )
-
-
-def _run(judge: Judge, arenas: Arenas, steps: int) -> Arenas:
-    for _ in range(steps):
-        arenas = evaluate_c.step(judge, arenas)
-    return arenas
-
-
-def _pose(arenas: Arenas) -> np.ndarray:
-    return np.stack([data.qpos.reshape(-1, 3) for data in arenas.data])
-
-
-def test_a_robot_drives_straight_to_its_target_and_stays(tmp_path: Path) -> None:
-    judge = _judge(tmp_path, _stage())
-    arenas = _start(judge, [[-0.1, 0.2, 0.0]], [[0.2, 0.2]])
-    # (0.3 - 0.05) / 0.0040192 = 62.2: it is within 0.05 m after 63 control steps.
-    steps = math.ceil((0.3 - 0.05) / STRIDE)
-    assert steps == 63
-    arenas = _run(judge, arenas, steps - 1)
-    assert not arenas.outcome.arrived.any()
-    # Float32 rounds the action and the start: some 1e-7 of 0.25 m.
-    np.testing.assert_allclose(_pose(arenas)[0, 0], [-0.1 + 62 * STRIDE, 0.2, 0.0], atol=1e-6)
-    arenas = _run(judge, arenas, 20)
-    assert arenas.outcome.arrival.tolist() == [[63]]
-    assert arenas.outcome.moving.tolist() == [[63]]
-    # The command is zero from the step after the arrival on, and the servo stops within it.
-    np.testing.assert_allclose(_pose(arenas)[0, 0], [-0.1 + 63 * STRIDE, 0.2, 0.0], atol=1e-6)
-
-
-def test_a_robot_turns_by_its_turn_rate(tmp_path: Path) -> None:
-    judge = _judge(tmp_path, _stage(), SPIN)
-    arenas = _start(judge, [[0.1, 0.2, 0.5]], [[0.1, 0.4]])
-    # The first step takes 1.06e-4 * 3.14 / 0.032 = 0.0104 N m, less than the limit of 0.0408.
-    turned = 10 * 3.14 * STEP
-    arenas = _run(judge, arenas, 10)
-    np.testing.assert_allclose(_pose(arenas)[0, 0], [0.1, 0.2, 0.5 + turned], atol=1e-6)
-    seen = dict(zip(observation.NAMES, arenas.observation[0, 0], strict=True))
-    assert seen["target_distance"] == pytest.approx(0.2, abs=1e-6)
-    assert seen["target_bearing"] == pytest.approx(math.pi / 2 - 0.5 - turned, abs=1e-6)
-
-
-def test_a_robot_that_starts_at_its_target_arrives_with_the_first_step(tmp_path: Path) -> None:
-    judge = _judge(tmp_path, _stage(), STAY)
-    arenas = _start(judge, [[0.0, 0.0, 0.0]], [[0.05, 0.0]])
-    assert not arenas.outcome.arrived.any()
-    assert _run(judge, arenas, 1).outcome.arrival.tolist() == [[1]]
-
-
-@pytest.mark.parametrize(
-    ("kind", "pose", "obstacle", "gap", "pace"),
-    [
-        # Centres 0.2 m apart, head on; both drive.
-        ("robot", [[-0.1, 0.0, 0.0], [0.1, 0.0, math.pi]], [], 0.2 - 2 * 0.037, 2 * STRIDE),
-        # The wall is at x = 0.5; robot 1 drives along the middle, meeting nothing.
-        ("wall", [[0.35, 0.3, 0.0], [-0.4, -0.3, 0.0]], [], 0.5 - 0.35 - 0.037, STRIDE),
-        # A box of edge 0.1 at (0.2, 0), straight.
-        (
-            "obstacle",
-            [[0.0, 0.0, 0.0], [-0.4, -0.3, 0.0]],
-            [[0.2, 0.0, 0.0, 0.05, 0.05]],
-            0.2 - 0.05 - 0.037,
-            STRIDE,
-        ),
-    ],
-)
-def test_a_push_is_one_contact_of_its_kind(
-    tmp_path: Path, kind: str, pose: list, obstacle: list, gap: float, pace: float
-) -> None:
-    judge = _judge(tmp_path, _stage(robots=2, obstacles=len(obstacle)), AHEAD)
-    arenas = _start(judge, pose, obstacle=obstacle)
-    first = math.ceil(gap / pace)  # the control step in which the gap closes
-    arenas = _run(judge, arenas, first - 1)
-    assert not arenas.outcome.contacts.any()
-    arenas = _run(judge, arenas, 1)
-    expected = np.zeros((1, 2, 3), int)
-    expected[0, : 2 if kind == "robot" else 1, gaps.KINDS.index(kind)] = 1
-    np.testing.assert_array_equal(arenas.outcome.contacts, expected)
-    # It goes on pushing, which is no further contact.
-    np.testing.assert_array_equal(_run(judge, arenas, 40).outcome.contacts, expected)
-
-
-def test_a_contact_in_the_first_step_counts(tmp_path: Path) -> None:
-    judge = _judge(tmp_path, _stage(), AHEAD)
-    arenas = _start(judge, [[0.5 - 0.037 - 0.001, 0.0, 0.0]])
-    assert _run(judge, arenas, 1).outcome.contacts.tolist() == [[[0, 0, 1]]]
-
-
-def test_an_arrived_robot_is_pushed_and_its_arrival_stands(tmp_path: Path) -> None:
-    judge = _judge(tmp_path, _stage(robots=2), AHEAD)
-    arenas = _start(judge, [[-0.1, 0.0, 0.0], [-0.3, 0.0, 0.0]], [[-0.1, 0.0], [9.0, 0.0]])
-    arenas = _run(judge, arenas, 60)
-    before = _pose(arenas)[0, 0, 0]
-    arenas = _run(judge, arenas, 50)
-    # One servo holds SPEED and the other 0, both with gain m / dt: together SPEED / 2. Contact is
-    # soft, so the speed is still settling, and a tenth covers it.
-    assert _pose(arenas)[0, 0, 0] - before == pytest.approx(50 * STRIDE / 2, rel=0.1)
-    assert arenas.outcome.arrival.tolist() == [[1, 0]]
-    assert arenas.outcome.moving.tolist() == [[1, 110]]
-    assert arenas.observation[0, 0, observation.NAMES.index("target_distance")] > 0.05
-    assert arenas.outcome.contacts[0, :, 0].tolist() == [1, 1]
-
-
-def test_steps_with_infrared_are_those_of_robots_on_their_way(tmp_path: Path) -> None:
-    judge = _judge(tmp_path, _stage(robots=3), STAY)
-    pose = [[0.45, 0.0, 0.0], [0.45, 0.3, 0.0], [0.0, 0.0, 0.0]]
-    # Sensors at x = 0.48 look at the wall from 0.02 / cos(17 degrees) m. Robot 1 has arrived.
-    arenas = _run(judge, _start(judge, pose, [[-0.4, 0.0], [0.45, 0.3], [-0.4, 0.0]]), 7)
-    assert arenas.outcome.sensed.tolist() == [[7, 1, 0]]
-    assert arenas.outcome.moving.tolist() == [[7, 1, 7]]
-
-
-def test_a_control_step_is_that_many_steps_of_mujoco(tmp_path: Path) -> None:
-    stage = _stage(robots=2, side=0.6, obstacles=1)
-    judge = _judge(tmp_path, stage, AHEAD, substeps=3)
-    pose = [[-0.1, 0.02, 0.1], [0.1, 0.0, 2.5]]
-    box = [[0.0, 0.15, 0.3, 0.05, 0.05]]
-    arenas = _run(judge, _start(judge, pose, obstacle=box), 50)
-    data = evaluate_c.place(
-        judge, judge.model, np.array(pose, np.float32), np.array(box, np.float32)
-    )
-    data.ctrl = [SPEED, 0.0, 0.0] * 2
-    # Float32 rounds the policy's action, which contacts do not magnify here.
-    mujoco.mj_step(judge.model, data, 150)
-    np.testing.assert_allclose(_pose(arenas)[0], data.qpos.reshape(-1, 3), atol=1e-6)
-    assert judge.model.opt.timestep == STEP / 3
-
-
-def test_touching_is_a_gap_below_zero(tmp_path: Path) -> None:
-    judge = _judge(tmp_path, _stage(robots=4, side=0.7, obstacles=2))
-    draw = np.random.default_rng(0)
-    count = 250
-    pose = draw.uniform(-0.34, 0.34, (count, 4, 3)).astype(np.float32)
-    box = draw.uniform(-0.25, 0.25, (count, 2, 5)).astype(np.float32)
-    box[..., 2] *= 8.0
-    box[..., 3:] = 0.05
-    data = np.empty(count, object)
-    data[:] = [evaluate_c.place(judge, judge.model, *each) for each in zip(pose, box, strict=True)]
-    gap = np.stack(
-        [
-            gaps.gaps(p.astype(float), judge.stage.side, b.astype(float), 0.037, np)
-            for p, b in zip(pose, box, strict=True)
-        ]
-    )
-    assert np.abs(gap).min() > 1e-7  # float32 in the walls' quaternions moves them by 1e-8 m
-    touching = evaluate_c.touching(judge, data)
-    assert touching.mean(axis=(0, 1)).min() > 0.1  # every kind occurs
-    np.testing.assert_array_equal(touching, gap <= 0.0)
-
-
-def test_the_walls_stand_where_the_level_says(tmp_path: Path) -> None:
-    """Of arenas whose side is drawn: a robot 5 mm away sees it, one 1 mm inside touches it."""
-    judge = _judge(tmp_path, _stage(robots=1, side=(0.6, 1.4)))
-    drawn = [evaluate_c.draw_level(judge.stage, judge.spacing, 1, i) for i in range(20)]
-    sides = [level.side for level in drawn]
-    assert max(sides) - min(sides) > 0.4
-    for gap in (0.005, -0.001):
-        wall = [np.array([[0.5 * side - 0.037 - gap, 0.0, 0.0]], np.float32) for side in sides]
-        levels = [level._replace(start=x) for level, x in zip(drawn, wall, strict=True)]
-        arenas = evaluate_c.start(judge, levels)
-        touched = evaluate_c.touching(judge, arenas.data)
-        assert (touched.any(axis=(1, 2)) == (gap < 0)).all()
-        if gap > 0:
-            nearest = arenas.observation[:, 0, :8].min(axis=-1)
-            assert ((nearest > 0.005) & (nearest < 0.04)).all()  # in range, and in all the same
-            np.testing.assert_allclose(nearest, nearest[0], atol=1e-6)  # float32
-
-
-def test_the_judge_counts_what_the_training_environment_counts(tmp_path: Path) -> None:
-    stage = _stage(robots=3, side=0.7, obstacles=1)
-    judge = _judge(tmp_path, stage)
-    # An episode in which robots meet one another and the obstacle, and all arrive.
-    drawn = evaluate_c.draw_level(judge.stage, judge.spacing, 1, 65)
-    arenas = evaluate_c.start(judge, [drawn])
-    sim = SimConfig(impl="jax", max_robots=3, max_obstacles=1)
-    world = env.load(TrainConfig(stage=(stage,), sim=sim))
-    zero = jnp.zeros((), jnp.int32)
-    state = env.reset(world, jax.tree.map(jnp.asarray, drawn), zero, zero)
-    seen = np.asarray(state.observation)
-    state = dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
-    step = jax.jit(lambda state, action: env.step(world, state, action))
-    # Float32 against double along the way; the paths hardly magnify it, contacts included.
-    np.testing.assert_allclose(seen, arenas.observation[0], atol=1e-5)
-    for _ in range(168):
-        state, came = step(state, policy.mean_action(judge.policy, np.asarray(seen)))
-        seen = np.asarray(came.observation)
-        arenas = evaluate_c.step(judge, arenas)
-        np.testing.assert_allclose(seen, arenas.observation[0], atol=1e-3)
-        np.testing.assert_array_equal(state.arrived, arenas.outcome.arrived[0])
-    assert arenas.outcome.arrived.all()
-    np.testing.assert_array_equal(state.episode.contacts, arenas.outcome.contacts[0])
-    np.testing.assert_array_equal(state.episode.sensed, arenas.outcome.sensed[0])
-    np.testing.assert_array_equal(state.episode.moving, arenas.outcome.moving[0])
-    assert arenas.outcome.contacts.sum(axis=(0, 1))[:2].min() >= 2  # both kinds did occur
-
-
-# --- the same level in training
-
-
-class Engines(NamedTuple):
-    """The judge, and the training environment of the same words: one arena, compiled."""
-
-    judge: Judge
-    world: World
-    reset: Callable[[Level], EnvState]
-    step: Callable[[EnvState, jax.Array], tuple[EnvState, TimeStep]]
-
-
-@pytest.fixture(
-    scope="module",
-    params=[("wheeled", "ideal"), ("planar", "real"), ("wheeled", "real")],
-    ids="-".join,
-)
-def engines(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Engines:
-    """As they come of the YAML files, with the same physics steps."""
-    body, realism = request.param
-    path = _policy(tmp_path_factory.mktemp("engines") / "policy.npz")
-    arena = ["stage=s6", "stage.robots=3", "stage.side=0.7", "stage.obstacles=1"]
-    words = [*arena, f"robot={body}", f"realism={realism}"]
-    sim = ["sim.impl=jax", "sim.max_robots=3", "sim.max_obstacles=1"]
-    world = env.load(config.load_train([*words, *sim]))
-    steps = f"substeps={world.physics.substeps}"
-    judged = config.load_evaluate([f"policy={path}", steps, *words])
-    assert judged.realism.name == realism
-    zero = jnp.zeros((), jnp.int32)
-
-    def reset(drawn: Level) -> EnvState:
-        state = env.reset(world, drawn, zero, zero)
-        return dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
-
-    step = jax.jit(lambda state, action: env.step(world, state, action))
-    return Engines(evaluate_c.load(judged, policy.load(path)), world, jax.jit(reset), step)
-
-
-def _draw(engines: Engines) -> Level:
-    """An episode in which robots meet one another and the obstacle."""
-    return evaluate_c.draw_level(engines.judge.stage, engines.judge.spacing, 1, 65)
-
-
-def _train(engines: Engines, drawn: Level, steps: int) -> tuple[list[EnvState], list[np.ndarray]]:
-    """Drives by the policy; returns states and observations [R, O], the first ones included."""
-    states = [engines.reset(drawn)]
-    seen = [np.asarray(states[0].observation)]
-    for _ in range(steps):
-        action = policy.mean_action(engines.judge.policy, seen[-1])
-        state, came = engines.step(states[-1], jnp.asarray(action))
-        states.append(state)
-        seen.append(np.asarray(came.observation))
-    return states, seen
-
-
-def test_judge_and_training_see_the_same_and_count_the_same(engines: Engines) -> None:
-    drawn, steps = _draw(engines), 64
-    states, seen = _train(engines, drawn, steps)
-    arenas = evaluate_c.start(engines.judge, [drawn])
-    for theirs, mine in zip(states[0].factors, arenas.factors, strict=True):
-        assert (theirs is None) == (mine is None)
-        if theirs is not None and mine is not None:
-            # The rounding of low + u * (high - low), and of log and cos.
-            np.testing.assert_allclose(theirs, mine[0], rtol=2e-6, atol=1e-6)
-    touched = False
-    for state, found in zip(states, seen, strict=True):
-        off = np.abs(found - arenas.observation[0])
-        off[:, 9] = np.minimum(off[:, 9], 2 * math.pi - off[:, 9])
-        if touched:
-            # Two solvers push alike to about a millimetre; a robot that pushes slips and turns.
-            assert off[:, 8].max() < 1e-3
-        else:
-            # Float32 against double: 1e-7 m and, near a target, 1e-5 rad. Where speeds are
-            # quantised it may turn into 2 % of a wheel's for a step; in this episode it does not.
-            assert off.max() < 5e-5
-            np.testing.assert_array_equal(state.episode.sensed, arenas.outcome.sensed[0])
-        np.testing.assert_array_equal(state.episode.contacts, arenas.outcome.contacts[0])
-        np.testing.assert_array_equal(state.arrived, arenas.outcome.arrived[0])
-        touched = bool(arenas.outcome.contacts.any())
-        arenas = evaluate_c.step(engines.judge, arenas)
-    assert touched
-    assert (seen[-1][:, :8] < 0.04).any()
-
-
-def test_a_level_replays_exactly(engines: Engines) -> None:
-    drawn, steps = _draw(engines), 50
-    states, seen = _train(engines, drawn, steps)
-    again, seen_again = _train(engines, drawn, steps)
-    np.testing.assert_array_equal(seen, seen_again)
-    np.testing.assert_array_equal(states[-1].sim.qpos, again[-1].sim.qpos)
-    first, second = (
-        _run(engines.judge, evaluate_c.start(engines.judge, [drawn, drawn]), steps)
-        for _ in range(2)
-    )
-    np.testing.assert_array_equal(first.observation, second.observation)
-    np.testing.assert_array_equal(first.observation[0], first.observation[1])
-    for one, other in zip(first.data, second.data, strict=True):
-        np.testing.assert_array_equal(one.qpos, other.qpos)
-    # What is random about it comes from its seed, and nothing else does.
-    other = drawn._replace(seed=drawn.seed ^ np.uint32(1))
-    _, elsewhere = _train(engines, other, steps)
-    judged = _run(engines.judge, evaluate_c.start(engines.judge, [other]), steps)
-    is_random = engines.world.config.realism.name == "real"
-    assert (np.array(elsewhere) != np.array(seen)).any() == is_random
-    assert (judged.observation[0] != first.observation[0]).any() == is_random
-
-
-# --- one factor at a time
-
-# Two robots that push each other, one beside the east wall, one before an obstacle; they drive
-# gently to the left, whatever they see.
-CROWD = [[-0.038, 0.0, 0.0], [0.038, 0.0, 3.0], [0.45, 0.0, 1.0], [0.0, -0.3, 0.0]]
-BOX = [[0.11, -0.3, 0.0, 0.05, 0.05]]
-CURVE = ((0.4, 0.2), (0.0, 0.0), (0.0, 0.0))
-PUSHING, ALL = [0, 1], [0, 1, 2, 3]
-BODIES = pytest.mark.parametrize("body", ["planar", "wheeled"])
-BodyName = Literal["planar", "wheeled"]
-
-
-def _tour(tmp_path: Path, body: BodyName, **realism: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Poses [T, R, 3] and observations [T + 1, R, O] of the crowd."""
-    stage, real = _stage(robots=4, obstacles=1), RealismConfig(infrared="real", **realism)
-    judge = _judge(tmp_path, stage, CURVE, robot=RobotConfig(body=body), realism=real)
-    arenas = _start(judge, CROWD, obstacle=BOX)
-    path, seen = [], [arenas.observation[0]]
-    for _ in range(12):
-        arenas = evaluate_c.step(judge, arenas)
-        path.append(model.BODIES[body].pose(arenas.data[0].qpos.copy(), np))
-        seen.append(arenas.observation[0])
-    return np.array(path), np.array(seen)
-
-
-def _robots_apart(one: np.ndarray, other: np.ndarray, least: float = 0.0) -> list[int]:
-    """Robots of which anything [T, R, ...] differs by more than the least."""
-    return np.flatnonzero((np.abs(one - other) > least).any(axis=(0, 2))).tolist()
-
-
-@BODIES
-@pytest.mark.parametrize(
-    ("factor", "value"),
-    [
-        ("mass", (0.13, 0.20)),
-        ("friction", (0.1, 0.1)),
-        ("wheel_radius", (0.0198, 0.0198)),
-        ("wheel_mismatch", 0.02),
-        ("track", (0.057, 0.057)),
-        ("max_wheel_speed", (2.0, 2.0)),
-        ("speed_noise", 0.05),
-        ("speed_quantisation", "epuck1"),
-        ("action_latency", (1, 2)),
-        ("stall", 1.0),
-    ],
-)
-def test_a_factor_of_the_drive_moves_the_robots_alone(
-    tmp_path: Path, body: BodyName, factor: str, value: Any
-) -> None:
-    path, seen = _tour(tmp_path, body)
-    moved, felt = _tour(tmp_path, body, **{factor: value})
-    np.testing.assert_array_equal(seen[0], felt[0])  # before anything moves
-    # Robots of any mass drive alike until they push: grip grows with the mass.
-    assert _robots_apart(path, moved, 1e-5) == (PUSHING if factor == "mass" else ALL)  # m, rad
-    if factor == "mass" and body == "planar":
-        # Servos for another mass: the ratio is rounded, 1e-16 of 1e-1 m twelve times.
-        assert _robots_apart(path, moved, 1e-12) == PUSHING
-    if factor == "stall":
-        # Float32 poses; and a wheeled robot's heading goes through a quaternion.
-        np.testing.assert_allclose(moved, np.broadcast_to(CROWD, moved.shape), atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("factor", "value", "robots"),
-    [
-        ("infrared_noise", (1.0, 1.0), ALL),
-        ("infrared_gain", (0.7, 0.7), ALL),
-        ("infrared_offset", 3.0, ALL),
-        ("infrared_yaw", 0.0349, ALL),
-        ("infrared_position", 0.001, ALL),
-        ("infrared_period", (0.05, 0.05), ALL),
-        ("dead_sensor", 1.0, ALL),
-        ("reflectance_wall", (0.5, 0.5), [2]),
-        ("reflectance_obstacle", (0.5, 0.5), [3]),
-        ("reflectance_robot", (0.5, 0.5), PUSHING),
-    ],
-)
-def test_a_factor_of_the_sensors_changes_what_they_see_alone(
-    tmp_path: Path, factor: str, value: Any, robots: list[int]
-) -> None:
-    path, seen = _tour(tmp_path, "planar")
-    moved, felt = _tour(tmp_path, "planar", **{factor: value})
-    np.testing.assert_array_equal(path, moved)
-    np.testing.assert_array_equal(seen[..., 8:], felt[..., 8:])
-    assert _robots_apart(seen[..., :8], felt[..., :8]) == robots
-    if factor == "dead_sensor":
-        np.testing.assert_array_equal(felt[..., :8], np.float32(0.04))
-    if factor.startswith("reflectance"):
-        assert (felt[..., :8] >= seen[..., :8]).all()  # what is darker seems further away
-
-
-@pytest.mark.parametrize(
-    ("factor", "value", "entry"),
-    [("target_distance_noise", 0.005, 8), ("target_bearing_noise", 0.05, 9)],
-)
-def test_noise_of_the_target_is_of_its_entry_alone(
-    tmp_path: Path, factor: str, value: float, entry: int
-) -> None:
-    path, seen = _tour(tmp_path, "planar")
-    moved, felt = _tour(tmp_path, "planar", **{factor: value})
-    np.testing.assert_array_equal(path, moved)
-    others = np.arange(observation.SIZE) != entry
-    np.testing.assert_array_equal(seen[..., others], felt[..., others])
-    assert (seen[..., entry] != felt[..., entry]).all()
-
-
-def test_a_late_observation_is_that_of_the_step_before(tmp_path: Path) -> None:
-    path, seen = _tour(tmp_path, "planar")
-    moved, felt = _tour(tmp_path, "planar", observation_latency=(1, 1))
-    np.testing.assert_array_equal(path, moved)
-    np.testing.assert_array_equal(felt[1:], seen[:-1])
-    np.testing.assert_array_equal(felt[0], seen[0])
-
-
-def test_the_judge_sees_how_bright_each_thing_is(tmp_path: Path) -> None:
-    shade: Any = (0.3, 1.0)
-    real = RealismConfig(
-        infrared="real",
-        reflectance_wall=shade,
-        reflectance_obstacle=shade,
-        reflectance_robot=shade,
-    )
-    judge = _judge(tmp_path, _stage(robots=3, side=0.7, obstacles=2), realism=real)
-    levels = [evaluate_c.draw_level(judge.stage, judge.spacing, 1, n) for n in range(200)]
-    # Closer together than they would ever start.
-    levels = [drawn._replace(start=drawn.start * np.float32([1.0, 0.7, 1.0])) for drawn in levels]
-    arenas = evaluate_c.start(judge, levels)
-    pose, side, box = (
-        np.array([getattr(drawn, name) for drawn in levels], np.float64)
-        for name in ("start", "side", "obstacle")
-    )
-    args = (arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)
-    sight, shades = evaluate_c.look(judge, *args), senses.reflectance(arenas.factors)
-    assert shades is not None
-    assert sight.reflectance is not None
-    ray, bright = infrared.sights(pose, side, box, 0.037, 0.1, shades, None, np)
-    # Of what overlaps its origin a ray of MuJoCo's does not say which it is.
-    apart = (ray > 0.0) & (sight.ray > 0.0) & (ray < 0.1)
-    # 1e-6 m: float32 in the walls' quaternions. The shades are numbers of a table.
-    np.testing.assert_allclose(sight.ray[apart], ray[apart], atol=1e-6)
-    np.testing.assert_array_equal(sight.reflectance[apart], bright[apart])
-    for each in shades:
-        assert np.isin(bright[apart], each).mean() > 0.05  # every kind is seen
-
-
-@BODIES
-def test_each_arena_has_robots_of_its_own(tmp_path: Path, body: BodyName) -> None:
-    """The heavier robot has the better grip, and pushes the lighter one back."""
-    real = RealismConfig(mass=(0.05, 0.5))
-    judge = _judge(tmp_path, _stage(robots=2), AHEAD, robot=RobotConfig(body=body), realism=real)
-    levels = [
-        _level(judge, [[-0.04, 0.0, 0.0], [0.04, 0.0, math.pi]], seed=seed) for seed in range(6)
-    ]
-    arenas = evaluate_c.start(judge, levels)
-    mass = arenas.factors.mass
-    assert mass is not None
-    for one, found in zip(arenas.model, mass, strict=True):
-        rows = judge.ids.robots.bodies
-        np.testing.assert_allclose(one.body_mass[rows].sum(axis=1), found, rtol=1e-6)  # float32
-    np.testing.assert_allclose(judge.model.body_mass[judge.ids.robots.bodies].sum(axis=1), 0.16)
-    arenas = _run(judge, arenas, 30)
-    pose = np.stack([model.BODIES[body].pose(data.qpos, np) for data in arenas.data])
-    heavier = np.where(mass[:, 0] > mass[:, 1], 1.0, -1.0)
-    assert len(set(heavier)) == 2
-    assert (pose[..., 0].mean(axis=1) * heavier > 1e-3).all()
-
-
-def test_an_episode_does_not_depend_on_those_beside_it(tmp_path: Path) -> None:
-    judge = _judge(tmp_path, _stage(robots=3, side=0.7, obstacles=1), steps=150)
-    together = evaluate_c.simulate(judge, range(8))
-    assert len(set(together.clock.tolist())) > 2  # arenas leave at different times
-    for episode in (0, 5, 7):
-        alone = evaluate_c.simulate(judge, [episode])
-        for one, all_ in zip(alone, together, strict=True):
-            np.testing.assert_array_equal(one[0], all_[episode])
+def _measures(settings: EvaluateConfig) -> dict[str, Any]:
+    return evaluate.evaluate(settings).result["cells"][0]["measures"]
 
 
 def test_a_result_does_not_depend_on_batches_and_workers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = _policy(tmp_path / "policy.npz")
-    results = []
+    path = steering.write(tmp_path / "policy.npz")
+    found = []
     for workers, batch in ((1, 64), (1, 2), (2, 3)):
-        monkeypatch.setattr(evaluate, "BATCH", batch)
-        config = EvaluateConfig(
-            policy=str(path), stage=_stage(robots=2), steps=120, episodes=7, workers=workers
-        )
+        monkeypatch.setattr(evaluate_run, "BATCH", batch)
+        settings = _config(path, stage=_stage(2, 0.7, 1), steps=120, episodes=7, workers=workers)
         told: list[int] = []
-        results.append(evaluate.evaluate(config, policy.load(path), told.append))
+        entrants = evaluate_run.read_policies([str(path)])
+        (trial,) = evaluate_run.run(settings, cells.load(settings).cells, entrants, told.append)
         assert sum(told) == 7
-    assert results[0] == results[1] == results[2]
-    assert results[0]["targets_reached"] > 0.0
+        found.append(trial)
+    for other in found[1:]:
+        np.testing.assert_array_equal(other.shortest, found[0].shortest)
+        for name, table in other.found.items():
+            np.testing.assert_array_equal(table, found[0].found[name], err_msg=name)
+    assert found[0].found["targets_reached"].mean() > 0.0
+    assert list(found[0].found) == list(MEASURES)
 
 
-def test_seed_and_number_alone_decide_the_level(tmp_path: Path) -> None:
-    judge = _judge(tmp_path, _stage(robots=2, obstacles=2))
-    again, other, next_ = (
-        evaluate_c.draw_level(judge.stage, judge.spacing, seed, episode)
-        for seed, episode in ((1, 4), (2, 4), (1, 5))
-    )
-    first = evaluate_c.draw_level(judge.stage, judge.spacing, 1, 4)
-    np.testing.assert_array_equal(first.start, again.start)
-    assert (first.start != other.start).any()
-    assert (first.start != next_.start).any()
-    assert first.start.dtype == np.float32  # as training draws it
-
-
-@pytest.mark.parametrize("stage", [_stage(robots=2, side=0.5), _stage(robots=2, side=0.7)])
-def test_steering_to_the_target_reaches_it_in_empty_arenas(
-    tmp_path: Path, stage: StageConfig
-) -> None:
-    path = _policy(tmp_path / "policy.npz")
-    config = EvaluateConfig(policy=str(path), stage=stage, episodes=40, steps=400, workers=1)
-    result = evaluate.evaluate(config, policy.load(path))
-    assert result["targets_reached"] >= 0.95  # only another robot can be in the way
-    # The arena's diagonal at full speed, and a turn by half a circle at 3.14 rad/s.
-    assert 0.0 < result["arrival_time_s"] < stage.sides[1] * math.sqrt(2) / SPEED + 1.0 + 2.0
+@pytest.mark.parametrize("side", [0.5, 0.7])
+def test_steering_to_the_target_reaches_it_in_empty_arenas(tmp_path: Path, side: float) -> None:
+    path = steering.write(tmp_path / "policy.npz")
+    found = _measures(_config(path, stage=_stage(2, side), episodes=40, steps=400))
+    assert found["targets_reached"]["mean"] >= 0.95  # only another robot can be in the way
+    # The arena's diagonal at full speed, a turn by half a circle at 3.14 rad/s, and a share of
+    # 0.05 that is late by the whole episode.
+    late = 0.05 * 400 * STEP
+    assert 0.0 < found["time_to_reach_s"]["mean"] < side * math.sqrt(2) / SPEED + 1.0 + 1.0 + late
+    assert 0.5 < found["spl"]["mean"] <= found["targets_reached"]["mean"]
 
 
 def test_standing_still_reaches_nothing(tmp_path: Path) -> None:
-    path = _policy(tmp_path / "policy.npz", STAY)
-    config = EvaluateConfig(
-        policy=str(path), stage=_stage(robots=2), episodes=10, steps=9, workers=1
-    )
-    result = evaluate.evaluate(config, policy.load(path))
-    assert result["targets_reached"] == result["all_reached"] == 0.0
-    assert result["contacts_per_robot"] == 0.0
-    assert result["arrival_time_s"] is None
-    assert result["episode_time_s"] == pytest.approx(9 * STEP)
+    path = steering.write(tmp_path / "policy.npz", STAY)
+    settings = _config(path, stage=_stage(2), episodes=5, steps=160)
+    found = {name: each["mean"] for name, each in _measures(settings).items()}
+    for name in ("targets_reached", "all_reached", "spl", "contacts_per_robot", "impulse_ns_wall"):
+        assert found[name] == 0.0
+    # 160 control steps are 5.12 s: a deadlock, with no time left.
+    assert found["deadlocks"] == found["time_outs"] == 1.0
+    assert found["episode_time_s"] == pytest.approx(160 * STEP)
+    assert found["time_to_reach_s"] == pytest.approx(160 * STEP)
 
 
-@pytest.mark.parametrize("layout", ["boxes", "fence"])
-def test_obstacles_of_a_fixed_level_have_their_own_sizes(tmp_path: Path, layout: Any) -> None:
-    stage = _stage(robots=1, side=1.4, obstacles=1, level="fixed", layout=layout)
-    judge = _judge(tmp_path, stage)
-    # Boxes of 0.10 m; a fence of 0.50 by 0.06 m in a 0.7 m arena, its length scaled with the side.
-    half = [0.05, 0.05] if layout == "boxes" else [0.50, 0.03]
-    found = judge.model.geom("obstacle0_box")
-    np.testing.assert_allclose(found.size[:2], half, rtol=1e-6)  # float32
-    # A bound that is left too small hides contacts at the ends from MuJoCo.
-    assert found.rbound[0] == pytest.approx(math.hypot(*half, 0.05), rel=1e-6)
+# --- intervals
 
 
-def test_the_policy_says_how_fast_it_may_ask_for(tmp_path: Path) -> None:
-    limits = {"low": [0.0, -1.0], "high": [0.05, 1.0]}
-    names = {"names": ["speed", "turn_rate"], "units": ["m/s", "rad/s"]}
-    path = _policy(tmp_path / "policy.npz", AHEAD, action=names | limits)
-    judge = evaluate_c.load(EvaluateConfig(policy=str(path), stage=_stage()), policy.load(path))
-    arenas = _run(judge, _start(judge, [[0.0, 0.0, 0.0]]), 10)
-    assert _pose(arenas)[0, 0, 0] == pytest.approx(10 * 0.05 * STEP, abs=1e-7)  # float32 action
+def test_one_policy_is_judged_over_levels_and_several_over_policies_too() -> None:
+    tables = {"targets_reached": np.random.default_rng(0).random((3, 40))}
+    cases = ((1, "tasks"), (2, "tasks"), (3, "runs_and_tasks"))
+    for policies, draw in cases:
+        table = tables["targets_reached"][:policies]
+        found = evaluate_summary.summarize({"targets_reached": table})["targets_reached"]
+        expected: Any = statistics.bootstrap(table, np.mean, draw=draw)
+        assert found["mean"] == pytest.approx(table.mean())
+        assert found["mean_interval"] == [expected.low, expected.high]
+        assert found["iqm"] == pytest.approx(statistics.iqm(table))
 
 
-def test_physics_that_breaks_down_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_worst_levels_are_those_that_are_bad() -> None:
+    values = np.arange(100.0)[None]
+    found = evaluate_summary.summarize({"targets_reached": values, "contacts_per_robot": values})
+    assert found["targets_reached"]["cvar"] == pytest.approx(np.mean([0, 1, 2, 3, 4]))
+    assert found["contacts_per_robot"]["cvar"] == pytest.approx(np.mean([95, 96, 97, 98, 99]))
+
+
+def test_two_levels_have_no_interval() -> None:
+    found = evaluate_summary.summarize({"spl": np.array([[0.2, 0.4]])})["spl"]
+    assert found["mean"] == pytest.approx(0.3)
+    assert found["mean_interval"] is None
+
+
+def test_a_comparison_is_paired_by_level() -> None:
+    a = {"targets_reached": np.random.default_rng(0).random((1, 50))}
+    b = {"targets_reached": a["targets_reached"] - 0.25}
+    found = evaluate_summary.compare(a, b)["targets_reached"]
+    assert found["difference"] == pytest.approx(-0.25)
+    assert found["difference_interval"] == pytest.approx([-0.25, -0.25])
+    assert (found["improvement"], found["improvement_interval"]) == (0.0, [0.0, 0.0])
+    contacts = evaluate_summary.compare(
+        {"contacts_per_robot": a["targets_reached"]}, {"contacts_per_robot": b["targets_reached"]}
+    )["contacts_per_robot"]
+    assert contacts["improvement"] == 1.0  # fewer is better
+
+
+def test_strata_of_two_levels_have_no_interval() -> None:
+    """Drawn anew, a stratum of one level never changes: the interval would have no width."""
+    table = {"spl": np.random.default_rng(1).random((1, 10))}
+    for strata, there in (([5, 5], True), ([7, 3], True), ([8, 2], False), ([1] * 10, False)):
+        found = evaluate_summary.summarize(table, strata)["spl"]
+        assert (found["mean_interval"] is not None) == there
+        found = evaluate_summary.compare(table, table, strata)["spl"]
+        assert ("difference" in found) == there
+
+
+def _trial(name: str, *, seed: int = 1_000_000, first: int = 0, **stage: Any) -> Trial:
+    """A trial by one policy on ten levels, with figures of their own."""
+    numbers = np.arange(first, first + 10)
+    plain = StageConfig(**({"name": name, "robots": 2, "side": 1.0} | stage))
+    levels: Any = None
+    cell = Cell(name, plain, "box", None, seed, numbers, levels)
+    found = {"spl": np.random.default_rng(first).random((1, 10))}
+    return Trial(cell, np.ones((10, 2)), found, np.ones((1, 10, 2)))
+
+
+@pytest.mark.parametrize(
+    ("other", "shared"),
+    [
+        ({}, True),
+        ({"first": 9}, True),  # one level
+        ({"first": 10}, False),
+        ({"seed": 1_000_001}, False),
+        ({"side": 1.1}, False),
+    ],
+)
+def test_cells_that_share_levels_are_not_pooled(
+    monkeypatch: pytest.MonkeyPatch, other: dict[str, Any], shared: bool
 ) -> None:
-    monkeypatch.chdir(tmp_path)  # where MuJoCo writes its log
-    judge = _judge(tmp_path, _stage(robots=2))
-    arenas = _start(judge, [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])
-    arenas.data[0].qvel[3] = np.nan
-    with pytest.raises(ConfigError, match=r"^the physics broke down.*substeps of more than 1.*\.$"):
-        evaluate_c.step(judge, arenas)
+    monkeypatch.setattr(evaluate_summary, "about_cell", lambda *_: {})
+    trials = [_trial("a"), _trial("b", seed=1_000_002), _trial("c", **other)]
+    settings = EvaluateConfig(policy="", stage=_stage(2))
+    one = evaluate_summary.result(settings, "x", [], trials)["pooled"]
+    two = evaluate_summary.comparison(settings, "x", ([], []), (trials, trials))["pooled"]
+    if shared:
+        assert one is two is None
+        return
+    assert one["episodes"] == two["episodes"] == 30
+    mean = np.mean([trial.found["spl"] for trial in trials])
+    assert one["measures"]["spl"]["mean"] == pytest.approx(mean)
+    assert two["measures"]["spl"]["a"] == pytest.approx(mean)
 
 
-def test_summarize_by_hand() -> None:
-    contacts = np.zeros((3, 2, 3), int)
-    contacts[0, 0] = [1, 0, 2]
-    contacts[2, 1] = [1, 2, 0]
-    outcome = Outcome(
-        clock=np.array([10, 20, 30]),
-        arrived=np.array([[True, True], [True, False], [False, False]]),
-        arrival=np.array([[4, 10], [6, 0], [0, 0]]),
-        contacts=contacts,
-        sensed=np.array([[1, 2], [3, 4], [0, 5]]),
-        moving=np.array([[4, 10], [6, 20], [30, 30]]),
-    )
-    result = evaluate.summarize(outcome, 0.1)
-    assert result == {
-        "targets_reached": pytest.approx((1 + 0.5 + 0) / 3),
-        "targets_reached_se": pytest.approx(0.5 / math.sqrt(3)),  # of 1, 0.5, 0: deviation 0.5
-        "all_reached": pytest.approx(1 / 3),
-        # Of 1, 0, 0: variance (4/9 + 1/9 + 1/9) / 2 = 1/3.
-        "all_reached_se": pytest.approx(math.sqrt(1 / 3) / math.sqrt(3)),
-        "contacts_per_robot": pytest.approx(6 / 6),
-        "contacts_per_robot_by_kind": {
-            "robot": pytest.approx(2 / 6),
-            "obstacle": pytest.approx(2 / 6),
-            "wall": pytest.approx(2 / 6),
-        },
-        "ir_steps_share": pytest.approx(15 / 100),
-        "episode_time_s": pytest.approx(2.0),
-        "arrival_time_s": pytest.approx((4 + 10 + 6) / 3 * 0.1),
-    }
-    single = Outcome(*(field[:1] for field in outcome))
-    assert evaluate.summarize(single, 0.1)["targets_reached_se"] is None
+def test_long_lists_of_files_are_taken_apart() -> None:
+    names = [f"policy{i}.npz" for i in range(1000)]  # no path may be as long as them together
+    assert evaluate.list_files("policy", ",".join(names)) == names
+
+
+# --- the command
+
+
+def _plain(section: Any) -> dict[str, Any]:
+    """A section of the configuration as JSON has it."""
+    return json.loads(json.dumps(to_dict(section)))
 
 
 def _command(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
@@ -723,49 +200,201 @@ def _command(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
 def test_the_command_writes_the_result_and_prints_a_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path, out = _policy(tmp_path / "policy.npz"), tmp_path / "new" / "result.json"
+    path, out = steering.write(tmp_path / "policy.npz"), tmp_path / "new" / "result.json"
     words = (f"policy={path}", "stage=s1", "episodes=3", "steps=20", "seed=5", "workers=1")
-    assert _command(monkeypatch, *words, f"out={out}") == 0
+    rules = ("robot.mass=0.2", "task.target_radius=0.06", "realism.stall=0.01")
+    assert _command(monkeypatch, *words, *rules, f"out={out}") == 0
     result = json.loads(out.read_text())
-    assert {key: result[key] for key in ("episodes", "engine", "robot", "stage", "steps")} == {
-        "episodes": 3,
+    assert [path.name for path in out.parent.iterdir()] == ["result.json"]
+    assert {key: result[key] for key in ("suite", "engine", "steps", "substeps", "pooled")} == {
+        "suite": None,
         "engine": "c",
-        "robot": "planar",
-        "stage": "s1",
         "steps": 20,
+        "substeps": 4,  # of the wheeled robot in this engine
+        "pooled": None,
     }
-    assert (result["seed"], result["policy"]) == (5, str(path))
-    assert result["policy_digest"] == policy.load(path).digest
+    assert result["robot"] == _plain(RobotConfig(body="wheeled", mass=0.2))
+    assert result["task"] == _plain(TaskConfig(target_radius=0.06))
+    assert result["cells"][0]["realism"] == _plain(RealismConfig(stall=0.01))
+    assert result["policies"] == [{"path": str(path), "digest": policy.load(path).digest}]
     assert result["versions"]["mujoco"] == mujoco.__version__
+    (cell,) = result["cells"]
+    assert (cell["cell"], cell["episodes"], cell["seed"], cell["unreachable"]) == ("s1", 3, 5, 0)
     printed = capsys.readouterr()
-    share = f"{100 * result['targets_reached']:.1f} ± "
-    row = next(line for line in printed.out.splitlines() if "targets reached" in line)
-    assert share in row
+    row = next(line for line in printed.out.splitlines() if "targets reached, %" in line)
+    assert f"{100 * cell['measures']['targets_reached']['mean']:.1f}" in row.split()
     assert f"{path} on s1, 3 episodes" in printed.out
     assert "\x1b" not in printed.out  # plain where it is no terminal
     assert printed.err == ""
 
 
+@pytest.fixture
+def suite(tmp_path: Path) -> Path:
+    """A suite of two small cells, as a file for any tool."""
+    file = tmp_path / "tiny.yaml"
+    file.write_text(
+        "name: tiny\ncells:\n"
+        "  - {name: one, stage: s1, levels: 4, seed: 1000001}\n"
+        "  - {name: two, stage: s3, levels: 5, seed: 1000002, shape: bar, realism: webots}\n"
+    )
+    drawn = [cells.draw_cell(each) for each in config.read_suite(str(file)).cells]
+    cells.write(tmp_path / "tiny.npz", cells.Suite("tiny", tuple(drawn)))
+    return tmp_path / "tiny.npz"
+
+
+def test_a_suite_and_several_policies_fill_a_folder(
+    tmp_path: Path, suite: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for i in range(3):
+        steering.write(tmp_path / f"seed{i}.npz", drive=steering.STEER if i else STAY)
+    out = tmp_path / "out"
+    words = (f"policy={tmp_path}/seed*.npz", f"suite={suite}", "steps=40", "workers=1")
+    assert _command(monkeypatch, *words, f"out={out}") == 0
+    result = json.loads((out / "result.json").read_text())
+    assert result["suite"] == "tiny"
+    assert [each["path"][-9:] for each in result["policies"]] == [f"seed{i}.npz" for i in range(3)]
+    assert [cell["cell"] for cell in result["cells"]] == ["one", "two"]
+    assert [cell["realism"]["name"] for cell in result["cells"]] == ["ideal", "webots"]
+    preset = build(RealismConfig, compose.read_preset("realism", "webots"))
+    assert result["cells"][1]["realism"] == _plain(preset)
+    with (out / "levels.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 3 * (4 + 5)
+    for cell in result["cells"]:
+        mine = [float(row["spl"]) for row in rows if row["cell"] == cell["cell"]]
+        assert cell["measures"]["spl"]["mean"] == pytest.approx(np.mean(mine))
+    every = [float(row["targets_reached"]) for row in rows]
+    assert result["pooled"]["measures"]["targets_reached"]["mean"] == pytest.approx(np.mean(every))
+    for name in ("measures.png", "times.png"):
+        assert (out / name).read_bytes().startswith(b"\x89PNG")
+    printed = capsys.readouterr().out
+    assert "seed0.npz and 2 more on suite tiny, 9 episodes" in printed
+    assert [line.split()[0] for line in printed.splitlines()[2:]] == ["one", "two", "all"]
+
+
+def test_a_comparison_is_written_and_shown(
+    tmp_path: Path, suite: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a, b = steering.write(tmp_path / "a.npz", STAY), steering.write(tmp_path / "b.npz")
+    out = tmp_path / "out"
+    words = (f"compare={a},{b}", f"suite={suite}", "steps=100", "workers=1", f"out={out}")
+    assert _command(monkeypatch, *words) == 0
+    result = json.loads((out / "result.json").read_text())
+    assert [[each["path"] for each in side] for side in result["compared"]] == [[str(a)], [str(b)]]
+    found = result["cells"][0]["measures"]["targets_reached"]
+    assert found["a"] == 0.0
+    assert found["difference"] == pytest.approx(found["b"]) != 0.0
+    assert 0.5 < found["improvement"] <= 1.0
+    with (out / "levels.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["policy"] for row in rows} == {str(a), str(b)}
+    means = [float(r["targets_reached"]) for r in rows if r["policy"] == str(b)]
+    assert result["pooled"]["measures"]["targets_reached"]["b"] == pytest.approx(np.mean(means))
+    printed = capsys.readouterr().out
+    assert f"{a} against {b} on suite tiny, 9 episodes" in printed
+    heads = [line.split(" levels")[0].strip() for line in printed.splitlines() if " levels" in line]
+    assert heads == ["one, 4", "two, 5", "all, 9"]
+    assert result["pooled"]["episodes"] == 9
+    last = [line for line in printed.splitlines() if "targets reached, %" in line][-1]
+    assert f"{100 * np.mean(means):.1f}" in last.split()
+
+
+def test_a_suite_that_is_not_pooled_has_no_row_of_all(
+    tmp_path: Path, suite: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drawn = cells.read(suite).cells[0]
+    again = drawn._replace(name="again", realism="webots")
+    cells.write(suite, cells.Suite("tiny", (drawn, again)))
+    path = steering.write(tmp_path / "p.npz")
+    words = (f"suite={suite}", "steps=2", "workers=1")
+    assert _command(monkeypatch, f"policy={path}", *words) == 0
+    printed = capsys.readouterr().out
+    assert [line.split()[0] for line in printed.splitlines()[2:]] == ["one", "again"]
+    assert _command(monkeypatch, f"compare={path},{path}", *words) == 0
+    printed = capsys.readouterr().out
+    heads = [line.split(" levels")[0].strip() for line in printed.splitlines() if " levels" in line]
+    assert heads == ["one, 4", "again, 4"]
+
+
+def test_unreachable_targets_are_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(evaluate_run.paths, "shortest", lambda side, start, *_: _lost(start))
+    path = steering.write(tmp_path / "policy.npz")
+    words = (f"policy={path}", "stage=s1", "episodes=3", "steps=2", "workers=1")
+    assert _command(monkeypatch, *words, f"out={tmp_path}/r.json") == 0
+    assert json.loads((tmp_path / "r.json").read_text())["cells"][0]["unreachable"] == 2
+    printed = capsys.readouterr().out
+    assert "2 of 3 levels of s1 have a target that no robot can reach." in printed
+
+
+def _lost(start: np.ndarray) -> np.ndarray:
+    """Lengths of ways, of which two of three levels lack one."""
+    lengths = np.ones(start.shape[:-1])
+    lengths[1:, 0] = np.inf
+    return lengths
+
+
+@pytest.fixture
+def wrong(tmp_path: Path) -> None:
+    """Policies that do not fit."""
+    steering.write(tmp_path / "policy.npz")
+    steering.write(tmp_path / "three.npz", learners=3, policy="independent")
+    layout = observation.describe("metric") | {"limit": 10.0}
+    names = [*observation.NAMES[:-1], "target_angle"]
+    steering.write(tmp_path / "other.npz", observation=layout | {"names": names})
+    scale = [*[2.0] * 8, 1.0, 1.0]
+    steering.write(tmp_path / "scaled.npz", observation=layout | {"scale": scale})
+
+
+@pytest.mark.usefixtures("wrong")
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["policy={tmp}/none.npz"], "{tmp}/none.npz is no file: give the path of a policy.npz."),
+        (["policy={tmp}/none.npz"], "{tmp}/none.npz "),
+        (["policy={tmp}/no*.npz"], "policy is '{tmp}/no*.npz', and '{tmp}/no*.npz' matches no "),
+        (["policy={tmp}/policy.npz,{tmp}/p*.npz"], "policy is "),
         (["policy={tmp}/policy.npz", "stage=s7"], "stage is 's7': give one of "),
-        ([], "policy is missing"),
-        (
-            ["policy={tmp}/policy.npz", "out={tmp}"],
-            "out is {tmp}, which cannot be written: it is a folder.",
-        ),
+        ([], "policy is null and compare is null: give one of them"),
+        (["compare={tmp}/policy.npz"], "compare is '{tmp}/policy.npz': give two files"),
         (
             ["policy={tmp}/policy.npz", "out={tmp}/policy.npz/result.json"],
             "out is {tmp}/policy.npz/result.json, which cannot be written: ",
         ),
         (
-            ["policy={tmp}/three.npz", "stage=s6"],
-            "{tmp}/three.npz holds a network for each of 3 robots, but stage.robots is 5: "
-            "give 1 to 3.",
+            ["policy={tmp}/policy.npz", "out={tmp}/policy.npz"],
+            "out is {tmp}/policy.npz, which cannot be written: ",
         ),
-        (["policy={tmp}/other.npz", "stage=s1"], "{tmp}/other.npz observes a, a, "),
+        (
+            ["policy={tmp}/three.npz", "stage=s6"],
+            "{tmp}/three.npz holds a network for each of 3 robots, but stage s6 has 5: give a "
+            "shared policy, or a stage of 1 to 3.",
+        ),
+        (
+            ["policy={tmp}/three.npz", "suite=swarm"],
+            "{tmp}/three.npz holds a network for each of 3 robots, but stage r4 has 4: ",
+        ),
+        (
+            ["policy={tmp}/other.npz", "stage=s1"],
+            "{tmp}/other.npz was trained on other observations than this robot makes: its "
+            "meta.observation.names is infrared_0, ",
+        ),
+        (
+            ["policy={tmp}/scaled.npz", "stage=s1"],
+            "{tmp}/scaled.npz was trained on other observations than this robot makes: its "
+            "meta.observation.scale is 2.0, ",
+        ),
+        (["policy={tmp}/policy.npz", "suite=stage"], "suite is 'stage': give one of "),
+        (["policy={tmp}/policy.npz", "suite={tmp}/no.yaml"], "{tmp}/no.yaml cannot be read: "),
+        (["policy={tmp}/policy.npz", "suite={tmp}/no.npz"], "suite {tmp}/no.npz cannot be read: "),
+        (
+            ["policy={tmp}/policy.npz", "suite=stages", "robot.hull_radius=0.04"],
+            "robot.hull_radius is 0.04, but suites are drawn for 0.037: give at most that.",
+        ),
+        (
+            ["policy={tmp}/policy.npz", "suite=stages", "task.target_radius=0.06"],
+            "task.target_radius is 0.06, but suites are drawn for 0.05: give that.",
+        ),
     ],
 )
 def test_the_command_refuses_in_one_sentence(
@@ -775,24 +404,21 @@ def test_the_command_refuses_in_one_sentence(
     words: list[str],
     sentence: str,
 ) -> None:
-    _policy(tmp_path / "policy.npz")
-    _policy(tmp_path / "three.npz", learners=3, policy="independent")
-    layout = observation.describe("metric") | {"names": ["a"] * observation.SIZE, "limit": 10.0}
-    _policy(tmp_path / "other.npz", observation=layout)
     words = [word.format(tmp=tmp_path) for word in words]
-    assert _command(monkeypatch, *words, "workers=1", "episodes=1") == 2
+    short = [] if any(word.startswith("suite=") for word in words) else ["episodes=1"]
+    assert _command(monkeypatch, *words, "workers=1", *short) == 2
     printed = capsys.readouterr()
     assert printed.out == ""
     assert printed.err.startswith(f"swarmjax.evaluate: error: {sentence.format(tmp=tmp_path)}")
     assert printed.err.count("\n") == 1
 
 
-def test_a_policy_of_three_judges_three(tmp_path: Path) -> None:
-    path = _policy(tmp_path / "policy.npz", learners=3, policy="independent")
-    config = EvaluateConfig(policy=str(path), stage=_stage(robots=4))
-    with pytest.raises(PolicyError, match=r"each of 3 robots, but stage\.robots is 4"):
-        evaluate_c.load(config, policy.load(path))
-    config = EvaluateConfig(policy=str(path), stage=_stage(robots=3), task=TaskConfig(), steps=2)
-    assert evaluate_c.simulate(evaluate_c.load(config, policy.load(path)), [0]).clock.tolist() == [
-        2
-    ]
+@pytest.mark.usefixtures("wrong")
+def test_a_comparison_takes_as_many_policies_of_either_recipe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert _command(monkeypatch, "compare=policy.npz,*e*.npz", "stage=s1", "episodes=1") == 2
+    printed = capsys.readouterr().err
+    assert "compare is 'policy.npz,*e*.npz', which is 1 against 3: give as many " in printed
+    assert printed.count("\n") == 1

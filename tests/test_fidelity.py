@@ -12,7 +12,7 @@ from sentences import refusal
 from benchmarks import fidelity, fidelity_body, fidelity_infrared, fidelity_motion, rig
 from benchmarks.fidelity_row import Row, beside
 from benchmarks.rig import Rig
-from swarmjax import config, evaluate_c
+from swarmjax import config, evaluate_judge
 from swarmjax.config import RobotConfig
 
 BODIES = pytest.mark.parametrize("body", ["planar", "wheeled"])
@@ -31,7 +31,7 @@ def wheeled() -> Rig:
 @BODIES
 def test_the_rig_steps_as_the_judge_does(body: str) -> None:
     settings = config.load_evaluate(["policy=none", f"robot={body}"])
-    assert rig.SUBSTEPS[body] == evaluate_c._substeps(settings)
+    assert rig.SUBSTEPS[body] == evaluate_judge.substeps(settings)
     assert settings.task.control_step == rig.CONTROL_STEP
 
 

@@ -11,7 +11,7 @@ ROOT = Path(swarmjax.__file__).parent
 # A module imports from rows above its own, and a package from itself.
 LAYERS = (
     {"epuck", "policy", "settings", "statistics"},
-    {"compose"},
+    {"compose", "policy_file", "webots_controller"},
     {"config"},
     {"sim"},
     {"task"},
@@ -24,14 +24,29 @@ LAYERS = (
     {"provenance", "checkpoint", "recorder", "display"},
     {"report_rows"},
     {"command", "report_figures", "report_page", "trainer"},
+    {"export_folder", "export_layout"},
+    {"export_onnx", "export_c", "export_webots"},
     {"export"},
     {"start"},
-    {"evaluate_c"},
+    {"measures", "paths", "evaluate_rays"},
+    {"evaluate_judge"},
+    {"evaluate_c", "cells"},
     {"evaluate_mjx"},
-    {"report", "train", "evaluate"},
+    {"evaluate_run", "replay_record"},
+    {"evaluate_summary", "evaluate_table", "evaluate_figures", "replay_pack"},
+    {"replay_page", "replay_video"},
+    {"report", "train", "evaluate", "replay"},
+    {"suite"},
 )
 # These stand alone: the learner knows nothing of robots, a policy file needs only NumPy.
-ONLY = {"ppo": {"config"}, "policy": set(), "epuck": set(), "settings": set()}
+ONLY = {
+    "ppo": {"config"},
+    "policy": set(),
+    "policy_file": {"policy"},
+    "webots_controller": {"policy"},
+    "epuck": set(),
+    "settings": set(),
+}
 FILES = sorted(ROOT.rglob("*.py"))
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 

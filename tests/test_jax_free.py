@@ -6,8 +6,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from policies import EMBODIMENT
 
-from swarmjax import policy
+from swarmjax import policy_file
 from swarmjax.task import observation
 
 _ABSENT = ("jax", "jaxlib", "flax", "chex", "optax", "brax", "orbax", "scipy", "warp")
@@ -31,16 +32,17 @@ def _write_policy(path: Path) -> None:
         "activation": "tanh",
         "observation": observation.describe("metric") | {"limit": 10.0},
         "action": {
-            "names": policy.ACTION_NAMES,
-            "units": policy.ACTION_UNITS,
+            "names": policy_file.ACTION_NAMES,
+            "units": policy_file.ACTION_UNITS,
             "low": [0.0, -3.14],
             "high": [0.1256, 3.14],
         },
         "config": {},
+        **EMBODIMENT,
         "versions": {},
         "update": 0,
     }
-    policy.save(path, {name: a.astype(np.float32) for name, a in arrays.items()}, meta)
+    policy_file.write(path, {name: a.astype(np.float32) for name, a in arrays.items()}, meta)
 
 
 def test_policy_and_evaluate_run_without_jax(tmp_path: Path) -> None:
@@ -54,7 +56,7 @@ def test_policy_and_evaluate_run_without_jax(tmp_path: Path) -> None:
     code = (
         "import sys, runpy\n"
         "sys.modules['mujoco.mjx'] = None\n"
-        "import swarmjax.policy, swarmjax.statistics\n"
+        "import swarmjax.policy, swarmjax.policy_file, swarmjax.statistics\n"
         f"sys.argv = ['evaluate', *{words}, 'out=result.json']\n"
         "runpy.run_module('swarmjax.evaluate', run_name='__main__', alter_sys=True)\n"
     )

@@ -110,7 +110,7 @@ def _six(base: TrainConfig, options: CurriculumConfig) -> TrainConfig:
 
 def test_the_curriculum_visits_every_stage_within_one_trace(tiny_config: TrainConfig) -> None:
     """Promoted by deadline, since nothing is learned so fast."""
-    options = CurriculumConfig(threshold=1.0, budget_share=0.8)
+    options = CurriculumConfig(mode="sequential", threshold=1.0, budget_share=0.8)
     program, schedule = loop.load(_six(tiny_config, options))
     chunk = _traced_once(program)
     state = jax.jit(partial(loop.init, program))(schedule)

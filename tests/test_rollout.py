@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from swarmjax import rollout
+from swarmjax.config import AlgoConfig
 from swarmjax.ppo import gae
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
@@ -155,10 +156,9 @@ def test_each_robot_has_its_learner() -> None:
     np.testing.assert_array_equal(rollout.to_arenas(flat), x[..., 0])
 
 
-@pytest.mark.parametrize(("count", "robots"), [(1, 3), (3, 1)])
-def test_batch_groups_the_samples_of_an_arena(count: int, robots: int) -> None:
+def _random_trajectory(shape: tuple[int, int, int, int]) -> Trajectory:
+    """Random numbers [T, L, A, N, ...], with ends of both kinds and samples that are not valid."""
     random = np.random.default_rng(0)
-    shape = (5, count, 4, robots)  # [T, L, A, N]
     end = random.random(shape)
     trajectory = Trajectory(
         observation=random.random((*shape, 10)),
@@ -171,7 +171,13 @@ def test_batch_groups_the_samples_of_an_arena(count: int, robots: int) -> None:
         truncated=end > 0.8,
         valid=random.random(shape) < 0.7,
     )
-    trajectory = jax.tree.map(jnp.asarray, trajectory)
+    return jax.tree.map(jnp.asarray, trajectory)
+
+
+@pytest.mark.parametrize(("count", "robots"), [(1, 3), (3, 1)])
+def test_batch_groups_the_samples_of_an_arena(count: int, robots: int) -> None:
+    shape = (5, count, 4, robots)
+    trajectory = _random_trajectory(shape)
     advantage, return_ = gae.generalized_advantages(
         *trajectory[5:6],
         *trajectory[3:5],
@@ -179,7 +185,7 @@ def test_batch_groups_the_samples_of_an_arena(count: int, robots: int) -> None:
         discount=0.9,
         gae_lambda=0.8,
     )
-    found = rollout.batch(trajectory, discount=0.9, gae_lambda=0.8)
+    found = rollout.batch(trajectory, AlgoConfig(discount=0.9, gae_lambda=0.8))
     for t, learner, arena, robot in np.ndindex(*shape):
         mine, sample = (learner, arena, t * robots + robot), (t, learner, arena, robot)
         np.testing.assert_array_equal(found.observation[mine], trajectory.observation[sample])
@@ -189,6 +195,41 @@ def test_batch_groups_the_samples_of_an_arena(count: int, robots: int) -> None:
         assert found.advantage[mine] == advantage[sample]
         assert found.return_[mine] == return_[sample]
     assert found.valid.shape == (count, 4, 5 * robots)
+
+
+def test_a_step_limit_may_be_terminal_to_bootstrapped_returns() -> None:
+    trajectory = _random_trajectory((20, 2, 3, 1))
+    config = AlgoConfig(discount=0.9, time_out="terminal")
+    found = rollout.batch(trajectory, config).return_[..., 0]
+    # Where physics broke, which is not valid, the value still stands for the rest.
+    timed_out = trajectory.truncated & trajectory.valid
+    terminal = trajectory._replace(terminated=trajectory.terminated | timed_out)
+    expected = rollout.batch(terminal, AlgoConfig(discount=0.9)).return_[..., 0]
+    np.testing.assert_array_equal(found, expected)
+    assert np.any(found != rollout.batch(trajectory, AlgoConfig(discount=0.9)).return_[..., 0])
+
+
+@pytest.mark.parametrize("time_out", ["terminal", "leak"])
+def test_monte_carlo_returns_are_targets_and_advantages(time_out: str) -> None:
+    shape = (20, 2, 3, 1)
+    trajectory = _random_trajectory(shape)
+    config = AlgoConfig(discount=0.9, returns="monte_carlo", time_out=time_out)
+    found = rollout.batch(trajectory, config)
+    reward, terminated, truncated, valid = (np.asarray(x) for x in trajectory[5:])
+    following, returns = np.zeros(shape[1:]), np.zeros(shape)
+    for t in reversed(range(shape[0])):
+        # A step limit that leaks is no end; physics that broke always is.
+        cut = truncated[t] if time_out == "terminal" else truncated[t] & ~valid[t]
+        following = reward[t] + 0.9 * np.where(terminated[t] | cut, 0.0, following)
+        returns[t] = following
+    for learner in range(2):  # each over its own samples
+        mine = np.s_[:, learner, :, 0]
+        inside = returns[mine][valid[mine]]
+        normal = (returns[mine] - inside.mean()) / (inside.std(ddof=1) + 1e-7)
+        # Float32 of sums of up to ten rewards of order 1.
+        np.testing.assert_allclose(found.return_[learner], normal.T, atol=5e-6)
+        advantage = normal - np.asarray(trajectory.value[mine])
+        np.testing.assert_allclose(found.advantage[learner], advantage.T, atol=5e-6)
 
 
 # --- episodes that wait
@@ -315,6 +356,38 @@ def test_a_level_counts_once_a_rollout(tiny_world: World, run: Run) -> None:
             assert ended.cohort[:, arena].tolist() == expected
             assert ended.episodes[:, arena].tolist() == [1, 0, 0, 1, 0, 0, 1, 0]  # they train on
             assert after.cohort[arena] == uncounted
+
+
+def test_a_long_rollout_draws_an_episode_for_every_32_control_steps() -> None:
+    assert [rollout.waiting(steps) for steps in (1, 32, 63, 64, 6000)] == [1, 1, 1, 2, 187]
+
+
+def test_episodes_that_wait_are_begun_in_turn_and_all_count(
+    tiny_world: World, run: Run, draw: Draw
+) -> None:
+    before = dataclasses.replace(run.before, clock=jnp.full(ARENAS, 15, jnp.int32))
+    drawn = [draw(seed, NEXT) for seed in (11, 12, 13)]
+    starts = jax.tree.map(lambda *x: jnp.concatenate(x), *drawn)
+    starts = dataclasses.replace(starts, clock=jnp.full(3 * ARENAS, 13, jnp.int32))
+    collect = jax.jit(functools.partial(rollout.collect, tiny_world))
+    after, trajectory, ended = collect(run.learners, before, starts, jax.random.key(2))
+    values = ppo.values(
+        jax.tree.map(lambda x: x[0], run.learners), tiny_world.config.algo, starts.observation
+    )
+    for arena in range(ARENAS):
+        if arena in (BROKEN, ARRIVES):
+            continue
+        assert ended.cohort[:, arena].tolist() == [NOW, -1, -1, NEXT, -1, -1, NEXT, -1]
+        for turn, first in enumerate((1, 4, 7)):
+            mine = turn * ARENAS + arena
+            seen = trajectory.observation[first, 0, arena]
+            np.testing.assert_array_equal(seen, starts.observation[mine])
+            # A matrix product of another width rounds differently, float32.
+            np.testing.assert_allclose(
+                trajectory.value[first, 0, arena], values[mine], rtol=1e-4, atol=1e-5
+            )
+        assert after.level.seed[arena] == starts.level.seed[2 * ARENAS + arena]
+        assert after.cohort[arena] == NEXT
 
 
 def _recount(run: Run, replay: Replay, arena: int) -> dict[int, dict[str, object]]:

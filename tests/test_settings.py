@@ -17,6 +17,7 @@ from swarmjax.config import (
     TrainConfig,
     load_evaluate,
     load_export,
+    load_report,
     load_train,
     smallest_side,
 )
@@ -155,8 +156,7 @@ def test_stages_of_a_curriculum_are_named_in_sentences():
 
 
 def test_a_missing_key_is_named():
-    assert refusal(load_evaluate, []) == "policy is missing and has no default: give it."
-    assert refusal(load_export, []) == "run is missing and has no default: give it."
+    assert refusal(load_report, []) == "run is missing and has no default: give it."
     assert refusal(build, TrainConfig, {"stage": [{"name": "s", "side": 1.0}]}) == (
         "stage.robots is missing and has no default: give it."
     )

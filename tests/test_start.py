@@ -144,6 +144,30 @@ def test_exploration_is_reset_only_where_that_is_said(trained: Path) -> None:
         np.testing.assert_array_equal(reset[name], kept[name], err_msg=name, strict=True)
 
 
+SCHEDULED = ["algo.exploration=scheduled", "algo.std_interval=30"]
+EXPLORED = "learners/explored"
+
+
+def test_a_schedule_of_exploration_goes_on_unless_it_is_reset(
+    trained: Path, tmp_path: Path
+) -> None:
+    words = [*TINY, *SCHEDULED, f"run.dir={tmp_path / 'run'}"]
+    assert train.main(words) == 0
+
+    def explored(*words: str) -> list[int] | None:
+        settings = config.load_train([*TINY, *words])
+        source, state, _ = _load([w for w in words if w not in TINY])
+        found = checkpoint.to_leaves(start.carry(source, state, settings)).get(EXPLORED)
+        return None if found is None else found[0].tolist()
+
+    begun = f"start={tmp_path / 'run'}"
+    assert explored(*SCHEDULED, begun) == [UPDATES * 16]  # four arenas, rollouts of four
+    assert explored(*SCHEDULED, begun, "start_std=reset") == [0]
+    # A learned deviation has no schedule to go on with, and needs none.
+    assert explored(*SCHEDULED, f"start={trained}") == [0]
+    assert explored(begun) is None
+
+
 @pytest.fixture(scope="module")
 def pair(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two seeds, its second lane the first one's numbers and 1."""
@@ -236,6 +260,10 @@ def test_a_started_run_resumes_without_the_run_it_started_from(
         (
             ["algo.activation=relu"],
             "algo.activation is tanh, but here it is relu: give algo.activation=tanh",
+        ),
+        (
+            ["algo.output=tanh"],
+            "algo.output is linear, but here it is tanh: give algo.output=linear",
         ),
         (
             ["realism=webots"],

@@ -461,9 +461,85 @@ def test_improvement_refuses() -> None:
     three = np.ones((3, 2))
     assert "b has 2 runs" in _refusal(probability_of_improvement, three, three[:2])
     assert "a has 2 tasks and b has 1" in _refusal(probability_of_improvement, three, three[:, :1])
-    assert "draw is 'tasks'" in _refusal(probability_of_improvement, three, three, draw="tasks")
+    found = _refusal(probability_of_improvement, three, three, draw="tasks_per_run")
+    assert "draw is 'tasks_per_run'" in found
+    found = _refusal(probability_of_improvement, three, three, draw="tasks")
+    assert "a has 2 tasks" in found
     assert "a holds nan" in _refusal(probability_of_improvement, three * math.nan, three)
     assert "resamples is 1" in _refusal(probability_of_improvement, three, three, resamples=1)
+
+
+def test_improvement_over_levels_is_a_bootstrap_of_their_shares() -> None:
+    """One run of each on shared levels: P is the mean of 1, 1/2 or 0 a level."""
+    random = np.random.default_rng(19)
+    a, b = random.integers(3, size=(1, 60)), random.integers(3, size=(1, 60))
+    found = probability_of_improvement(a, b, draw="tasks", seed=5)
+    wins = (a > b) + 0.5 * (a == b)
+    assert found == bootstrap(wins, np.mean, draw="tasks", seed=5)
+
+
+def test_improvement_over_runs_and_levels_spreads_as_both() -> None:
+    """Where runs are all alike only levels spread, and where levels are alike only runs."""
+    random = np.random.default_rng(20)
+    levels = random.normal(size=(1, 50))
+    a, b = levels.repeat(3, axis=0), np.zeros((4, 50))
+    both = probability_of_improvement(a, b, draw="runs_and_tasks", seed=6)
+    alone = probability_of_improvement(a[:1], b[:1], draw="tasks", seed=6)
+    # Other draws of the same: the sd is a quarter of the width, and values come in steps of 1/50.
+    error = math.sqrt(2) * _end_error(2000, (alone.high - alone.low) / 4)
+    assert both[1:] == pytest.approx(alone[1:], abs=error + 1 / 50)
+    runs = random.normal(size=(7, 1)).repeat(50, axis=1)
+    both = probability_of_improvement(runs, b, draw="runs_and_tasks")
+    kept = probability_of_improvement(runs, b, draw="runs")
+    error = math.sqrt(2) * _end_error(2000, (kept.high - kept.low) / 4)
+    assert both[1:] == pytest.approx(kept[1:], abs=error + 1 / 7)
+
+
+# --- strata
+
+
+def test_tasks_are_drawn_within_their_strata() -> None:
+    """Where all of a stratum are alike nothing spreads, however far strata are apart."""
+    values = np.repeat([0.0, 5.0, 7.0], [4, 3, 5])[None]
+    found = bootstrap(values, np.mean, draw="tasks", strata=[4, 3, 5])
+    assert found == pytest.approx((values.mean(),) * 3)
+    assert bootstrap(values, np.mean, draw="tasks").low < values.mean() - 0.5
+
+
+def test_the_spread_over_strata_is_that_of_scipy() -> None:
+    random = np.random.default_rng(21)
+    first, second = random.normal(size=30), 3.0 * random.normal(size=50)
+
+    def mean(x: np.ndarray, y: np.ndarray, axis: int = -1) -> np.ndarray:
+        return (x.sum(axis=axis) + y.sum(axis=axis)) / (x.shape[axis] + y.shape[axis])
+
+    theirs = stats.bootstrap(
+        (first, second), mean, n_resamples=20_000, method="percentile", rng=1
+    ).confidence_interval
+    values = np.concatenate([first, second])[None]
+    mine = bootstrap(values, np.mean, draw="tasks", strata=[30, 50], resamples=20_000)
+    error = math.sqrt(2) * _end_error(20_000, (mine.high - mine.low) / 4)
+    assert mine[1:] == pytest.approx(tuple(theirs), abs=error)
+
+
+def test_pairs_and_improvement_take_strata() -> None:
+    a = np.repeat([0.0, 5.0], [4, 6])[None]
+    b = a + np.repeat([1.0, -2.0], [4, 6])
+    found = paired(a, b, np.mean, draw="tasks", strata=[4, 6])
+    assert found == pytest.approx((-0.8,) * 3)
+    chance = probability_of_improvement(a, b, draw="tasks", strata=[4, 6])
+    assert chance == pytest.approx((0.6,) * 3)
+
+
+@pytest.mark.parametrize("strata", [[], [3], [4, 7], [0, 10], [11, -1], [8, 2], [4, 1, 5]])
+def test_strata_that_do_not_fit_are_refused(strata: list[int]) -> None:
+    values = np.ones((1, 10))
+    for function in (
+        lambda: bootstrap(values, np.mean, draw="tasks", strata=strata),
+        lambda: paired(values, values, np.mean, draw="tasks", strata=strata),
+        lambda: probability_of_improvement(values, values, draw="tasks", strata=strata),
+    ):
+        assert f"strata is {strata}" in _refusal(function)
 
 
 def test_curve_is_an_interval_at_each_point() -> None:

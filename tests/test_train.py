@@ -133,7 +133,7 @@ def test_several_seeds_leave_what_each_of_them_came_to(several: Path) -> None:
     name = "learners/params/actor/mean/kernel"
     for lane, seed in enumerate((3, 4)):
         found = policy.load(several / f"policy-seed{seed}.npz")
-        np.testing.assert_array_equal(found.mean.kernel, leaves[name][lane])
+        np.testing.assert_array_equal(found.layers[-1][0], leaves[name][lane])
         assert found.meta["seed"] == seed
     assert not np.array_equal(*leaves[name])
     assert not (several / "policy.npz").exists()
@@ -231,6 +231,10 @@ def test_export_gives_all_seeds_or_the_one_that_is_asked_for(
         kept = policy.load(several / f"policy-seed{seed}.npz")
         assert found.digest == kept.digest
         assert found.meta["seed"] == seed
+    assert export.main([f"run={several}", "format=c", f"out={tmp_path / 'c'}"]) == 0
+    for seed in (3, 4):
+        header = (tmp_path / f"c-seed{seed}" / "policy.h").read_text()
+        assert policy.load(several / f"policy-seed{seed}.npz").digest in header
     (several / "policy-seed3.npz").unlink()
     assert export.main([f"run={several}", "seed=3"]) == 0
     assert (several / "policy-seed3.npz").exists()

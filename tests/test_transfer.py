@@ -34,6 +34,11 @@ def test_differences_are_paired_by_level() -> None:
     assert result["targets_reached_by_seed"] == pytest.approx((levels.mean(axis=1) - 0.25).tolist())
 
 
+def test_a_suite_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"^suite is 'stages', but worlds are compared on .*\.$"):
+        transfer.main(["policies=x:none.npz", "suite=stages"])
+
+
 @pytest.mark.parametrize("word", ["policies=a.npz", "policies=:a.npz", "policies=x:", "stage=s6"])
 def test_policies_are_labelled(word: str) -> None:
     with pytest.raises(ConfigError, match="give label:file"):

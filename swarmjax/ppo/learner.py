@@ -5,6 +5,8 @@ G stands for groups of samples that are shuffled as one (arenas), N for the samp
 """
 
 import functools
+import math
+from dataclasses import replace
 
 import chex
 import jax
@@ -13,15 +15,14 @@ import optax
 from flax import struct
 
 from swarmjax.config import AlgoConfig
-from swarmjax.ppo import losses, networks, normalizer
+from swarmjax.ppo import exploration, losses, networks, normalizer
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
 from swarmjax.ppo.normalizer import Normalizer
 
 # Huang et al. 2022, "The 37 Implementation Details of Proximal Policy Optimization":
-# bound of normalised observations, continuous-action detail 7, and Adam's epsilon, core detail 3.
+# bound of normalised observations, continuous-action detail 7.
 OBSERVATION_LIMIT = 10.0
-_ADAM_EPSILON = 1e-5
 _ADVANTAGE_EPSILON = 1e-8
 
 _Progress = tuple[Params, optax.OptState]
@@ -34,12 +35,16 @@ class LearnerState:
     Attributes:
         params: `{"actor": .., "critic": ..}`.
         optimizer_state: Of the optimiser that `init` was given.
-        normalizer: Moments of the valid observations of all updates so far.
+        normalizer: Moments of the valid observations of all updates so far; those of a learner
+            that does not normalise stay 0 and 1.
+        explored: [], int32, control steps that the schedule of exploration has counted; None if
+            exploration is learned.
     """
 
     params: Params
     optimizer_state: optax.OptState
     normalizer: Normalizer
+    explored: jax.Array | None = None
 
 
 @struct.dataclass(kw_only=True)
@@ -50,7 +55,8 @@ class Batch:
         observation: [G, N, O], raw.
         action: [G, N, U], as drawn.
         log_prob: [G, N], as `act` returned it.
-        advantage: [G, N], not normalised.
+        advantage: [G, N]; normalised over the valid samples before use, but not those of
+            Monte-Carlo returns, which are normalised themselves.
         return_: [G, N], target of the critic.
         valid: [G, N], bool or 0/1.
     """
@@ -83,7 +89,47 @@ def init(
         params=params,
         optimizer_state=_optimizer(config, updates).init(params),
         normalizer=normalizer.init(observation_size),
+        explored=jnp.zeros((), jnp.int32) if config.exploration == "scheduled" else None,
     )
+
+
+def explore(learner: LearnerState, config: AlgoConfig, steps: jax.Array | int) -> LearnerState:
+    """Moves a learner on along the schedule of exploration, if there is one.
+
+    Args:
+        learner: Before.
+        config: The config that made the learner.
+        steps: [], how many control steps are made, at least 1.
+
+    Returns:
+        The learner with the deviation of the last of these steps; itself if exploration is
+        learned.
+    """
+    if learner.explored is None:
+        return learner
+    explored = learner.explored + steps
+    std = exploration.scheduled_std(config, explored - 1)
+    return replace(_with_log_std(learner, jnp.log(std)), explored=explored)
+
+
+def explore_anew(learner: LearnerState, config: AlgoConfig) -> LearnerState:
+    """Sets the policy's deviation to the initial one, and a schedule of it to its beginning.
+
+    Args:
+        learner: Before, with any leading axes.
+        config: The config that made the learner.
+
+    Returns:
+        The learner with the exploration of a new one.
+    """
+    begun = _with_log_std(learner, math.log(config.initial_std))
+    return replace(begun, explored=jax.tree.map(jnp.zeros_like, learner.explored))
+
+
+def _with_log_std(learner: LearnerState, log_std: jax.Array | float) -> LearnerState:
+    actor = learner.params["actor"]
+    actor = actor | {"log_std": jnp.full_like(actor["log_std"], log_std)}
+    return replace(learner, params=learner.params | {"actor": actor})
 
 
 def normalize(learner: LearnerState, observation: jax.Array) -> jax.Array:
@@ -146,7 +192,7 @@ def update(
         clipping), as means over all minibatches, and the policy's mean `std` after the update.
     """
     _check(config, batch)
-    samples = _samples(learner, batch)
+    samples = _samples(learner, config, batch)
     expected_valid = jnp.sum(samples.valid) / config.minibatches
     step = functools.partial(_step, config, updates, expected_valid)
     epoch = functools.partial(_epoch, config, step, samples)
@@ -155,12 +201,15 @@ def update(
     )
     metrics = {name: jnp.mean(metric) for name, metric in metrics.items()}
     metrics["std"] = jnp.mean(jnp.exp(params["actor"]["log_std"]))
-    moments = normalizer.update(learner.normalizer, batch.observation, batch.valid)
-    return LearnerState(params=params, optimizer_state=optimizer_state, normalizer=moments), metrics
+    moments = learner.normalizer
+    if config.normalize_observations:
+        moments = normalizer.update(moments, batch.observation, batch.valid)
+    learned = replace(learner, params=params, optimizer_state=optimizer_state, normalizer=moments)
+    return learned, metrics
 
 
 def _optimizer(config: AlgoConfig, updates: int) -> optax.GradientTransformation:
-    """One clip over all gradients, then Adam with a learning rate for each network."""
+    """One clip over all gradients, if any, then Adam with a learning rate for each network."""
     steps = updates * config.epochs * config.minibatches
 
     def adam(learning_rate: float) -> optax.GradientTransformation:
@@ -168,18 +217,15 @@ def _optimizer(config: AlgoConfig, updates: int) -> optax.GradientTransformation
             "constant": optax.constant_schedule(learning_rate),
             "linear": optax.linear_schedule(learning_rate, 0.0, steps),
         }[config.learning_rate_schedule]
-        return optax.adam(schedule, eps=_ADAM_EPSILON)
+        return optax.adam(schedule, eps=config.adam_epsilon)
 
-    return optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm),
-        optax.partition(
-            {
-                "actor": adam(config.actor_learning_rate),
-                "critic": adam(config.critic_learning_rate),
-            },
-            {"actor": "actor", "critic": "critic"},
-        ),
+    adams = optax.partition(
+        {"actor": adam(config.actor_learning_rate), "critic": adam(config.critic_learning_rate)},
+        {"actor": "actor", "critic": "critic"},
     )
+    if config.max_grad_norm is None:
+        return adams
+    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adams)
 
 
 def _check(config: AlgoConfig, batch: Batch) -> None:
@@ -190,14 +236,16 @@ def _check(config: AlgoConfig, batch: Batch) -> None:
     chex.assert_is_divisible(batch.valid.shape[0], config.minibatches)
 
 
-def _samples(learner: LearnerState, batch: Batch) -> Minibatch:
+def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch) -> Minibatch:
     """What the loss takes, still [G, N, ...]: normalised, and zero where not valid."""
-    valid = batch.valid.astype(bool)
+    valid, advantage = batch.valid.astype(bool), batch.advantage
+    if config.returns == "gae":
+        advantage = _normalize_advantages(advantage, valid)
     samples = Minibatch(
         observation=normalize(learner, batch.observation),
         action=batch.action,
         log_prob=batch.log_prob,
-        advantage=_normalize_advantages(batch.advantage, valid),
+        advantage=advantage,
         return_=batch.return_,
         valid=valid,
     )

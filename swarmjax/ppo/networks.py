@@ -3,6 +3,7 @@
 B stands for any number of leading axes, O for the observation and U for the action.
 """
 
+import functools
 import math
 from typing import Any, cast
 
@@ -16,6 +17,7 @@ from swarmjax.config import AlgoConfig
 Params = dict[str, Any]
 
 _ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "swish": nn.swish}
+_OUTPUTS = {"linear": lambda mean: mean, "tanh": nn.tanh}
 
 # Gains of the orthogonal initialisation: Huang et al. 2022, "The 37 Implementation Details of
 # Proximal Policy Optimization", core detail 2.
@@ -27,63 +29,59 @@ _CRITIC_GAIN = 1.0
 class _Torso(nn.Module):
     """Hidden layers `hidden_0`, `hidden_1`, ...: [B, O] -> [B, hidden[-1]]."""
 
-    hidden: tuple[int, ...]
-    activation: str
+    config: AlgoConfig
 
     @nn.compact
     def __call__(self, features: jax.Array) -> jax.Array:
-        for index, width in enumerate(self.hidden):
-            features = nn.Dense(
-                width, kernel_init=nn.initializers.orthogonal(_HIDDEN_GAIN), name=f"hidden_{index}"
-            )(features)
-            features = _ACTIVATIONS[self.activation](features)
+        for index, width in enumerate(self.config.hidden):
+            layer = _layer(self.config, features, width, _HIDDEN_GAIN, f"hidden_{index}")
+            features = _ACTIVATIONS[self.config.activation](layer(features))
         return features
 
 
 class _Actor(nn.Module):
     """Mean (`mean`) and logarithm of the standard deviation (`log_std`) of the action."""
 
-    hidden: tuple[int, ...]
-    activation: str
+    config: AlgoConfig
     action_size: int
-    initial_std: float
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-        features = _Torso(self.hidden, self.activation, name="torso")(observation)
-        mean = nn.Dense(
-            self.action_size, kernel_init=nn.initializers.orthogonal(_ACTOR_GAIN), name="mean"
-        )(features)
+        features = _Torso(self.config, name="torso")(observation)
+        layer = _layer(self.config, features, self.action_size, _ACTOR_GAIN, "mean")
         log_std = self.param(
             "log_std",
-            nn.initializers.constant(math.log(self.initial_std)),
+            nn.initializers.constant(math.log(self.config.initial_std)),
             (self.action_size,),
             jnp.float32,
         )
-        return mean, log_std
+        return _OUTPUTS[self.config.output](layer(features)), log_std
 
 
 class _Critic(nn.Module):
     """Value (`value`) of an observation: [B, O] -> [B]."""
 
-    hidden: tuple[int, ...]
-    activation: str
+    config: AlgoConfig
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> jax.Array:
-        features = _Torso(self.hidden, self.activation, name="torso")(observation)
-        output = nn.Dense(1, kernel_init=nn.initializers.orthogonal(_CRITIC_GAIN), name="value")(
-            features
-        )
-        return output[..., 0]
+        features = _Torso(self.config, name="torso")(observation)
+        return _layer(self.config, features, 1, _CRITIC_GAIN, "value")(features)[..., 0]
 
 
-def _actor(config: AlgoConfig, action_size: int) -> _Actor:
-    return _Actor(config.hidden, config.activation, action_size, config.initial_std)
+def _layer(config: AlgoConfig, features: jax.Array, width: int, gain: float, name: str) -> nn.Dense:
+    """Makes a layer to apply to `features`; `gain` is that of an orthogonal kernel."""
+    if config.initialization == "orthogonal":
+        return nn.Dense(width, kernel_init=nn.initializers.orthogonal(gain), name=name)
+    # What `torch.nn.Linear.reset_parameters` comes to: the bound of both is 1 / sqrt(inputs).
+    uniform = functools.partial(_uniform, bound=1.0 / math.sqrt(features.shape[-1]))
+    return nn.Dense(width, kernel_init=uniform, bias_init=uniform, name=name)
 
 
-def _critic(config: AlgoConfig) -> _Critic:
-    return _Critic(config.hidden, config.activation)
+def _uniform(
+    key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32, *, bound: float
+) -> jax.Array:
+    return jax.random.uniform(key, shape, dtype, -bound, bound)
 
 
 def init_params(
@@ -93,7 +91,7 @@ def init_params(
 
     Args:
         key: Random key, consumed.
-        config: Layer widths, activation and initial standard deviation.
+        config: Layers, how they begin, and the initial standard deviation.
         observation_size: O.
         action_size: U.
 
@@ -104,8 +102,8 @@ def init_params(
     actor_key, critic_key = jax.random.split(key)
     observation = jnp.zeros((observation_size,), jnp.float32)
     return {
-        "actor": _actor(config, action_size).init(actor_key, observation)["params"],
-        "critic": _critic(config).init(critic_key, observation)["params"],
+        "actor": _Actor(config, action_size).init(actor_key, observation)["params"],
+        "critic": _Critic(config).init(critic_key, observation)["params"],
     }
 
 
@@ -120,12 +118,15 @@ def action_distribution(
         observation: [B, O], normalised.
 
     Returns:
-        The mean [B, U], unbounded, and the standard deviation [U], which no observation changes.
+        The mean [B, U], within -1..1 if the output is tanh, otherwise unbounded, and the standard
+        deviation [U], which no observation changes, nor any gradient if it is scheduled.
     """
     chex.assert_axis_dimension(observation, -1, _input_size(params["actor"]))
-    actor = _actor(config, params["actor"]["log_std"].shape[-1])
+    actor = _Actor(config, params["actor"]["log_std"].shape[-1])
     output = actor.apply({"params": params["actor"]}, observation)
     mean, log_std = cast("tuple[jax.Array, jax.Array]", output)
+    if config.exploration == "scheduled":
+        log_std = jax.lax.stop_gradient(log_std)
     return mean, jnp.exp(log_std)
 
 
@@ -141,7 +142,7 @@ def value(params: Params, config: AlgoConfig, observation: jax.Array) -> jax.Arr
         The expected discounted return, [B].
     """
     chex.assert_axis_dimension(observation, -1, _input_size(params["critic"]))
-    return cast("jax.Array", _critic(config).apply({"params": params["critic"]}, observation))
+    return cast("jax.Array", _Critic(config).apply({"params": params["critic"]}, observation))
 
 
 def log_prob(mean: jax.Array, std: jax.Array, action: jax.Array) -> jax.Array:

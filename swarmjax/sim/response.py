@@ -38,7 +38,7 @@ def _distance_to_hull() -> np.ndarray:
     return (np.sqrt(outward**2 + spare) - outward).astype(np.float32)
 
 
-_TO_HULL = _distance_to_hull()
+TO_HULL = _distance_to_hull()
 
 
 class Wear(NamedTuple):
@@ -115,7 +115,7 @@ def distance(response: Response, counts: Array, xp: Any) -> Array:
         return xp.clip(_RISE * _interpolate(counts, _COUNTS[::-1], _LENGTH[::-1], xp), 0.0, reach)
     # Any reading that is below what is seen at the reach will do as the least.
     echo = xp.clip(counts, 1.0, _SPAN)
-    return xp.clip(xp.sqrt(_STRENGTH / echo) - _DEPTH + _TO_HULL, 0.0, reach)
+    return xp.clip(xp.sqrt(_STRENGTH / echo) - _DEPTH + TO_HULL, 0.0, reach)
 
 
 def _webots(ray: Array, bright: Array, gain: Array, xp: Any) -> tuple[Array, Array]:
@@ -132,7 +132,7 @@ def _webots(ray: Array, bright: Array, gain: Array, xp: Any) -> tuple[Array, Arr
 
 def _real(ray: Array, bright: Array, gain: Array, xp: Any) -> tuple[Array, Array]:
     """Returns counts above free space, and their sd, by the curve fitted to a measured robot."""
-    gap = xp.maximum(ray - _TO_HULL, 0.0)
+    gap = xp.maximum(ray - TO_HULL, 0.0)
     echo = bright * gain * _STRENGTH / (gap + _DEPTH) ** 2
     return xp.where(ray < REACH["real"], xp.minimum(echo, _SPAN), 0.0), _SD
 

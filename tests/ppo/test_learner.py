@@ -242,11 +242,13 @@ def test_one_norm_clips_the_gradient_of_both_networks() -> None:
     updated, metrics = _update(
         state, _batch(state, 0, ONE_STEP), jax.random.key(1), config=ONE_STEP
     )
-    assert metrics["grad_norm"] > ONE_STEP.max_grad_norm
+    limit = ONE_STEP.max_grad_norm
+    assert limit is not None
+    assert metrics["grad_norm"] > limit
     # After its first step Adam's mean is 0.1 times the gradient that it was given.
     momentum = [mu for _, mu in optax.tree.get_all_with_path(updated.optimizer_state, "mu")]
     # Float32 rounding of a sum of squares.
-    np.testing.assert_allclose(optax.tree.norm(momentum), 0.1 * ONE_STEP.max_grad_norm, rtol=1e-5)
+    np.testing.assert_allclose(optax.tree.norm(momentum), 0.1 * limit, rtol=1e-5)
 
 
 def test_linear_schedule_falls_to_zero_over_the_run_and_constant_does_not() -> None:
@@ -338,3 +340,42 @@ def test_minibatches_that_do_not_divide_the_groups_are_refused() -> None:
     config = AlgoConfig(hidden=(8,), minibatches=3)
     with pytest.raises(AssertionError):
         _update(state, _batch(state), jax.random.key(0), config=config)
+
+
+def test_without_a_norm_the_gradient_is_not_clipped() -> None:
+    config = replace(ONE_STEP, max_grad_norm=None)
+    state = _fresh(config=config)
+    updated, metrics = _update(state, _batch(state, 0, config), jax.random.key(1), config=config)
+    momentum = [mu for _, mu in optax.tree.get_all_with_path(updated.optimizer_state, "mu")]
+    assert metrics["grad_norm"] > 0.5
+    # After its first step Adam's mean is 0.1 times the gradient; float32 rounding.
+    np.testing.assert_allclose(optax.tree.norm(momentum), 0.1 * metrics["grad_norm"], rtol=1e-5)
+
+
+def test_adam_takes_its_epsilon_from_the_config() -> None:
+    config = replace(ONE_STEP, adam_epsilon=10.0, max_grad_norm=None)
+    state = _fresh(config=config)
+    updated, metrics = _update(state, _batch(state, 0, config), jax.random.key(1), config=config)
+    # rate * g / (|g| + 10), at most a tenth of rate * the norm of g: far below the rate itself.
+    move = _step_sizes(state.params, updated.params)["critic"]
+    assert 0.0 < move < 0.1 * config.critic_learning_rate * float(metrics["grad_norm"])
+    assert move < 0.5 * config.critic_learning_rate
+
+
+def test_observations_may_be_left_as_they_are() -> None:
+    config = replace(ONE_STEP, normalize_observations=False)
+    state = _fresh(config=config)
+    updated, _ = _update(state, _batch(state, 0, config), jax.random.key(1), config=config)
+    _assert_equal(updated.normalizer, state.normalizer)
+    seen = jnp.array([4.0, -3.25, 0.5])
+    np.testing.assert_array_equal(learner.normalize(updated, seen), seen)
+
+
+def test_advantages_of_monte_carlo_returns_are_taken_as_they_are() -> None:
+    config = replace(ONE_STEP, returns="monte_carlo", gae_lambda=None, time_out=None)
+    state = _fresh(config=config)
+    batch = _batch(state, 0, config)
+    _, metrics = _update(state, batch, jax.random.key(1), config=config)
+    # At ratio 1 the policy's loss is the mean advantage, about 5, negated. Float32.
+    mean = np.mean(np.asarray(batch.advantage)[np.asarray(batch.valid)])
+    np.testing.assert_allclose(metrics["policy_loss"], -mean, rtol=1e-5)

@@ -6,6 +6,7 @@ import hypothesis
 import hypothesis.extra.numpy as hypothesis_numpy
 import hypothesis.strategies as st
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
@@ -114,3 +115,47 @@ def test_actor_and_critic_share_nothing() -> None:
 def test_wrong_observation_size_is_refused(network: Callable[..., object]) -> None:
     with pytest.raises(AssertionError):
         network(_params(), CONFIG, np.zeros((2, OBSERVATION + 1), np.float32))
+
+
+def test_pytorchs_initialisation_spreads_weights_and_biases_by_their_inputs() -> None:
+    config = AlgoConfig(hidden=(64, 32), initialization="uniform")
+    params = networks.init_params(jax.random.key(0), config, 100, 50)
+    for network, last in (("actor", "mean"), ("critic", "value")):
+        torso = params[network]["torso"]
+        layers = (torso["hidden_0"], torso["hidden_1"], params[network][last])
+        for layer, inputs in zip(layers, (100, 64, 32), strict=True):
+            bound = 1.0 / np.sqrt(inputs)
+            kernel, bias = np.asarray(layer["kernel"]), np.asarray(layer["bias"])
+            assert kernel.shape[0] == inputs
+            assert np.abs(kernel).max() <= bound
+            assert np.abs(bias).max() <= bound
+            assert np.abs(bias).max() > 0.0
+            # 32 and more draws of U(-b, b), deviation b / sqrt(3): within five standard errors.
+            apart = abs(kernel.std() - bound / np.sqrt(3.0))
+            assert apart < 5.0 * bound / np.sqrt(kernel.size)
+            assert kernel.max() > 0.7 * bound > -0.7 * bound > kernel.min()
+
+
+def test_an_output_of_tanh_keeps_the_mean_within_the_commands() -> None:
+    linear = AlgoConfig(hidden=(8,))
+    params = networks.init_params(jax.random.key(0), linear, 3, 2)
+    params["actor"]["mean"]["kernel"] *= 300.0
+    observation = jax.random.normal(jax.random.key(1), (5, 3))
+    mean, std = networks.action_distribution(params, linear, observation)
+    squashed, same = networks.action_distribution(
+        params, AlgoConfig(hidden=(8,), output="tanh"), observation
+    )
+    assert np.abs(mean).max() > 1.0
+    np.testing.assert_allclose(squashed, np.tanh(mean), rtol=1e-6)  # float32
+    np.testing.assert_array_equal(same, std)
+
+
+@pytest.mark.parametrize(("exploration", "moves"), [("learned", True), ("scheduled", False)])
+def test_no_gradient_reaches_a_scheduled_deviation(exploration: str, moves: bool) -> None:
+    config = AlgoConfig(hidden=(8,), exploration=exploration)
+    params = networks.init_params(jax.random.key(0), config, 3, 2)
+
+    def total(params: networks.Params) -> jax.Array:
+        return networks.action_distribution(params, config, jnp.ones(3))[1].sum()
+
+    assert bool(jax.grad(total)(params)["actor"]["log_std"].any()) is moves

@@ -11,10 +11,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from swarmjax import evaluate_c
-from swarmjax.config import EvaluateConfig, StageConfig
-from swarmjax.evaluate_c import Judge
-from swarmjax.policy import Layer, Policy
+from swarmjax import evaluate_c, evaluate_rays
+from swarmjax.config import EvaluateConfig, RobotConfig, StageConfig
+from swarmjax.evaluate_judge import Judge
+from swarmjax.policy import Policy
 from swarmjax.sim import infrared
 from swarmjax.task import observation
 
@@ -246,22 +246,21 @@ def _no_box(xp: ModuleType) -> Any:
 
 def _judge(stage: StageConfig) -> Judge:
     """Returns a judge whose policy is never asked."""
-    layer = Layer(np.zeros((1, observation.SIZE, 2)), np.zeros((1, 2)))
+    layer = (np.zeros((1, observation.SIZE, 2)), np.zeros((1, 2)))
     size = np.zeros((1, observation.SIZE))
-    meta = {
-        "policy": "shared",
-        "observation": {"names": observation.NAMES, "encoding": "metric"},
-        "action": {"high": [0.1256, 3.14]},
-    }
     policy = Policy(
-        hidden=(),
-        mean=layer,
-        log_std=layer.bias,
-        observation_mean=size,
-        observation_std=size + 1.0,
-        meta=meta,
+        layers=[layer],
+        log_std=layer[1],
+        mean=size,
+        std=size + 1.0,
+        is_shared=True,
+        encoding="metric",
+        max_speed=0.1256,
+        max_turn_rate=3.14,
+        meta={"observation": observation.describe("metric")},
+        digest="",
     )
-    return evaluate_c.load(EvaluateConfig(policy="", stage=stage), policy)
+    return evaluate_c.load(EvaluateConfig(policy="", stage=stage, robot=RobotConfig()), policy)
 
 
 ROBOTS, BOXES, ARENAS = 5, 2, 200
@@ -307,7 +306,9 @@ def test_distances_are_those_of_mujoco_at_1000_random_poses(xp: ModuleType) -> N
     data[:] = [
         evaluate_c.place(judge, judge.model, *scene) for scene in zip(pose, box, strict=True)
     ]
-    seen_by_mujoco, _ = evaluate_c.cast_rays(judge, data, pose.astype(float), box.astype(float))
+    seen_by_mujoco, _ = evaluate_rays.cast_rays(
+        judge.scene, data, pose.astype(float), box.astype(float)
+    )
     found = np.array(_distances(pose, box, xp))
     # Rays that meet something, and rays that start inside something.
     assert (seen_by_mujoco < RANGE).sum() > 1000

@@ -11,7 +11,8 @@ from swarmjax.config import RewardConfig
 from swarmjax.task import reward
 
 RANGE = 0.04  # m
-NOTHING = RewardConfig(progress=0.0, proximity=0.0)
+NOTHING = RewardConfig(progress=0.0, proximity=0.0, contact=0.0, time=0.0)
+EQUATION_3 = RewardConfig(contact=0.0, time=0.0)
 
 
 @pytest.fixture
@@ -50,10 +51,17 @@ def test_every_weight_has_its_term() -> None:
     assert set(reward.TERMS) == {field.name for field in dataclasses.fields(RewardConfig)}
 
 
-def test_default_is_equation_3(step: reward.Step) -> None:
+def test_without_its_prices_the_default_is_equation_3(step: reward.Step) -> None:
     expected = np.float32([0.125, -0.001, 0.03125 - 0.001, -0.25])
     # 1e-8: one float32 rounding of the sum.
-    np.testing.assert_allclose(reward.total(step, RewardConfig()), expected, atol=1e-8)
+    np.testing.assert_allclose(reward.total(step, EQUATION_3), expected, atol=1e-8)
+
+
+def test_default_adds_prices_of_contacts_and_time(step: reward.Step) -> None:
+    # 0.02 m a contact that begins, 0.001 m a control step.
+    expected = np.float32([0.124, -0.022, 0.03125 - 0.042, -0.251])
+    # 1e-8: float32, a few roundings of numbers below 0.3.
+    np.testing.assert_allclose(reward.total(step, RewardConfig()), expected, atol=2e-8)
 
 
 def test_terms_add_up(step: reward.Step) -> None:

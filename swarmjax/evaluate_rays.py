@@ -1,0 +1,137 @@
+"""The judge's infrared rays: MuJoCo's own, cast on the real shapes. No JAX."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import mujoco
+import numpy as np
+
+from swarmjax import epuck
+from swarmjax.sim import infrared
+from swarmjax.sim import model as sim_model
+from swarmjax.sim.geom import FLOOR_GROUP, HULL_GROUP
+
+# Rays pass through contact spheres, wheels, skids and floor.
+_RAY_GROUPS = np.array([i not in (HULL_GROUP, FLOOR_GROUP) for i in range(6)], np.uint8)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """What rays are cast in.
+
+    Attributes:
+        model: One arena, compiled.
+        ids: Rows of its moving bodies.
+        hull_radius: m.
+        side: Of the smallest arena, m.
+        reach: How far rays go, m.
+    """
+
+    model: mujoco.MjModel
+    ids: sim_model.Ids
+    hull_radius: float
+    side: float
+    reach: float
+
+
+def cast_rays(
+    scene: Scene,
+    data: np.ndarray,
+    pose: np.ndarray,
+    obstacle: np.ndarray,
+    mount: infrared.Mount | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Casts the infrared sensors' rays by MuJoCo.
+
+    A ray that starts inside something reads 0. MuJoCo reports where such a ray leaves, on a face
+    whose normal points along it; so of each sensor two rays are cast, ahead and back, and the
+    sensor is inside something if either of them leaves. Things overlap a little where robots
+    push, so that a single ray may enter a second thing before it leaves the first.
+
+    Args:
+        scene: What rays are cast in.
+        data: [A] of `MjData`, positions up to date.
+        pose: [A, R, 3] x (m), y (m), yaw (rad).
+        obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+        mount: How far off the sensors sit.
+
+    Returns:
+        [A, R, K] distance from the sensor's origin to the nearest surface, m, 0 to the reach of
+        the electronics; and the geom that is there, -1 where nothing is.
+    """
+    limit = scene.reach
+    origin, direction = infrared.rays(pose, np, mount)
+    near = _near(scene, origin + 0.5 * limit * direction, pose[..., :2], obstacle)
+    arena, robot, _ = np.nonzero(near)
+    origin, direction = origin[near], direction[near]
+    flat = np.zeros((len(origin), 1))
+    origin = np.concatenate([origin, flat + epuck.SENSOR_HEIGHT], axis=-1)
+    toward = np.concatenate([direction, flat, -direction, flat], axis=-1)
+    distance, normal = np.zeros((len(origin), 2)), np.zeros_like(toward)
+    met = np.full((len(origin), 2), -1, np.int32)
+    cast_one, far = partial(mujoco.mj_multiRay, scene.model), mujoco.mjMAXVAL
+    body = scene.ids.hull_body[robot].tolist()
+    rays = zip(data[arena], body, origin, toward, met, distance, normal, strict=True)
+    for where, me, start, ways, geom, reach, face in rays:
+        cast_one(where, start, ways, _RAY_GROUPS, True, me, geom, reach, face, 2, far)
+    leaves = (normal * toward).reshape(-1, 2, 3).sum(axis=-1) > 0.0
+    ahead = np.where(distance[:, 0] < 0.0, limit, distance[:, 0])  # -1: nothing there
+    seen, geoms = np.full(near.shape, limit), np.full(near.shape, -1)
+    seen[near] = np.where(leaves.any(axis=-1), 0.0, np.minimum(ahead, limit))
+    geoms[near] = met[:, 0]
+    return seen, geoms
+
+
+def brightness(scene: Scene, shades: infrared.Reflectance, geom: np.ndarray) -> np.ndarray:
+    """Tells how bright the geoms are that rays meet.
+
+    Args:
+        scene: What rays are cast in.
+        shades: Of things, [A, ...].
+        geom: [A, R, K] as `cast_rays` found them.
+
+    Returns:
+        [A, R, K] reflectance; 1 of nothing.
+    """
+    model, table = scene.model, np.ones((len(geom), scene.model.ngeom + 1))  # the last: nothing
+    obstacles = scene.ids.obstacle_geom
+    fixtures = np.flatnonzero(model.body_mocapid[model.geom_bodyid] >= 0)
+    if shades.wall is not None:
+        table[:, np.setdiff1d(fixtures, obstacles)] = shades.wall[:, None]
+    if shades.obstacle is not None:
+        table[:, obstacles] = shades.obstacle
+    if shades.robot is not None:
+        hulls = [model.geom(f"robot{i}_body").id for i in range(len(scene.ids.hull_body))]
+        table[:, hulls] = shades.robot
+    return np.take_along_axis(table, geom.reshape(len(geom), -1), axis=1).reshape(geom.shape)
+
+
+def _near(scene: Scene, middle: np.ndarray, place: np.ndarray, obstacle: np.ndarray) -> np.ndarray:
+    """Tells [A, R, K] whether a ray may meet anything, by circles about it and all things.
+
+    Casting a ray costs more than all else, and most have nothing to meet. The walls are taken to
+    stand where those of the stage's smallest arena do.
+
+    Args:
+        scene: What rays are cast in.
+        middle: [A, R, K, 2] of the rays, m.
+        place: [A, R, 2] of the robots, m.
+        obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+
+    Returns:
+        [A, R, K].
+    """
+    myself = np.eye(place.shape[-2], dtype=bool)[:, None]
+    robots = _apart(middle, place) - scene.hull_radius
+    boxes = _apart(middle, obstacle[..., :2])
+    boxes -= np.linalg.norm(obstacle[:, None, None, :, 3:], axis=-1)
+    wall = 0.5 * scene.side - np.abs(middle).max(axis=-1)
+    things = [np.where(myself, np.inf, robots), boxes, wall[..., None]]
+    radius = 0.5 * scene.reach
+    return np.concatenate(things, axis=-1).min(axis=-1) <= radius
+
+
+def _apart(ray: np.ndarray, thing: np.ndarray) -> np.ndarray:
+    """Distances [A, R, K, N] from points [A, R, K, 2] to points [A, N, 2], m."""
+    offset = ray[..., None, :] - thing[:, None, None]
+    return np.sqrt(np.einsum("...i,...i", offset, offset))

@@ -1,0 +1,72 @@
+"""What a policy observes, in words for the people who get it exported."""
+
+from typing import NamedTuple
+
+from swarmjax.policy import Policy
+
+
+class Entry(NamedTuple):
+    """One entry of an observation: (quantity - offset) / scale, in units of the quantity."""
+
+    name: str
+    unit: str
+    offset: float
+    scale: float
+
+
+def entries(policy: Policy) -> list[Entry]:
+    """Lists the entries of a policy's observation.
+
+    Args:
+        policy: the policy.
+
+    Returns:
+        [O] in their order.
+    """
+    layout = policy.meta["observation"]
+    keys = ("names", "units", "offset", "scale")
+    return [Entry(*row) for row in zip(*(layout[key] for key in keys), strict=True)]
+
+
+def table(policy: Policy) -> str:
+    """Writes the observation's layout down.
+
+    Args:
+        policy: the policy.
+
+    Returns:
+        A Markdown table with a row for each entry, without a line feed at its end.
+    """
+    lines = ["| entry | quantity | unit | offset | scale |", "|---|---|---|---|---|"]
+    for i, entry in enumerate(entries(policy)):
+        numbers = f"{short(entry.offset)} | {short(entry.scale)}"
+        lines.append(f"| {i} | {entry.name} | {entry.unit} | {numbers} |")
+    return "\n".join(lines)
+
+
+def trained_as(policy: Policy) -> str:
+    """Names the robot and the sensors that a policy was trained with.
+
+    Args:
+        policy: the policy.
+
+    Returns:
+        Part of a sentence.
+    """
+    robot, sensors = policy.meta["robot"], policy.meta["sensors"]
+    return (
+        f"robot {robot['preset']} (body {robot['body']}), "
+        f"sensors {sensors['preset']} (response {sensors['response']})"
+    )
+
+
+def short(value: float) -> str:
+    """Writes a number in the digits of a float32.
+
+    Args:
+        value: finite.
+
+    Returns:
+        At most nine digits, which tell any float32 from its neighbours.
+    """
+    return f"{value:.9g}"

@@ -1,0 +1,137 @@
+"""A policy as an ONNX graph, from the observation to the action and the command.
+
+Needs the package `onnx`, an extra. The layout of the observation is in the model's metadata.
+"""
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from swarmjax.config import ConfigError
+from swarmjax.policy import Policy
+
+if TYPE_CHECKING:
+    from onnx import NodeProto, TensorProto
+
+# What every operation here has been since 2021, so that old runtimes read the file too.
+OPSET = 17
+IR_VERSION = 8
+
+
+class _Graph:
+    """A chain of operations, each on what the one before came to."""
+
+    def __init__(self, start: str) -> None:
+        """Begins at the graph's input."""
+        self.nodes: list[NodeProto] = []
+        self.constants: list[TensorProto] = []
+        self.value = start
+
+    def constant(self, value: Any, dtype: Any = np.float32) -> str:
+        """Adds a constant and returns its name."""
+        from onnx import numpy_helper
+
+        name = f"constant_{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(np.asarray(value, dtype), name))
+        return name
+
+    def then(self, operation: str, *others: str, name: str | None = None, **options: Any) -> str:
+        """Adds an operation on the newest value and `others`; returns what it came to."""
+        from onnx import helper
+
+        result = name or f"value_{len(self.nodes)}"
+        node = helper.make_node(operation, [self.value, *others], [result], **options)
+        self.nodes.append(node)
+        self.value = result
+        return result
+
+
+def render(policy: Policy) -> bytes:
+    """Makes the model of a policy.
+
+    Args:
+        policy: the policy.
+
+    Returns:
+        The bytes of an ONNX file. Its input `observation` is [B, O] if the policy is shared, else
+        [B, R, O] with R the number of learners, as `meta["observation"]` of the policy says; its
+        outputs are `action` ([..., U], as `policy.mean_action`) and `command` (as
+        `policy.command`: m/s and rad/s).
+
+    Raises:
+        ConfigError: if the package `onnx` is not installed.
+    """
+    try:
+        from onnx import TensorProto, helper
+    except ImportError:
+        raise ConfigError(
+            "format is onnx, but the package onnx is not installed: run uv sync --extra onnx."
+        ) from None
+    graph = _graph(policy)
+    leading = ["batch"] if policy.is_shared else ["batch", len(policy.mean)]
+
+    def port(name: str, size: int) -> Any:
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, [*leading, size])
+
+    actions = len(policy.meta["action"]["names"])
+    made = helper.make_graph(
+        graph.nodes,
+        "policy",
+        [port("observation", policy.mean.shape[1])],
+        [port("action", actions), port("command", actions)],
+        graph.constants,
+    )
+    operators = [helper.make_opsetid("", OPSET)]
+    model = helper.make_model(
+        made, producer_name="swarmjax", ir_version=IR_VERSION, opset_imports=operators
+    )
+    helper.set_model_props(model, _properties(policy))
+    return model.SerializeToString()
+
+
+def _graph(policy: Policy) -> _Graph:
+    """Puts the operations of `policy.mean_action` and `policy.command` one after the other."""
+    graph = _Graph("observation")
+    limit = policy.meta["observation"]["limit"]
+    shared = policy.is_shared
+
+    def rows(array: np.ndarray) -> str:
+        """Adds what every row of a batch, robots first, is added to."""
+        return graph.constant(array[0] if shared else array[:, None])
+
+    if not shared:
+        graph.then("Transpose", perm=[1, 0, 2])  # robots first, so that each meets its own matrix
+    graph.then("Sub", rows(policy.mean))
+    graph.then("Div", rows(policy.std))
+    graph.then("Clip", graph.constant(-limit), graph.constant(limit))
+    for i, (kernel, bias) in enumerate(policy.layers):
+        graph.then("MatMul", graph.constant(kernel[0] if shared else kernel))
+        last = i == len(policy.layers) - 1
+        graph.then("Add", rows(bias), name="action" if last and shared else None)
+        if not last:
+            _activate(graph, policy.meta["activation"])
+    if not shared:
+        graph.then("Transpose", perm=[1, 0, 2], name="action")
+    graph.then("Clip", graph.constant(-1.0), graph.constant(1.0))
+    low, high = (np.array(policy.meta["action"][key]) for key in ("low", "high"))
+    graph.then("Mul", graph.constant((high - low) / 2))
+    graph.then("Add", graph.constant((high + low) / 2), name="command")
+    return graph
+
+
+def _activate(graph: _Graph, activation: str) -> None:
+    before = graph.value
+    if activation == "swish":
+        graph.then("Sigmoid")
+        graph.then("Mul", before)
+    else:
+        graph.then({"tanh": "Tanh", "relu": "Relu"}[activation])
+
+
+def _properties(policy: Policy) -> dict[str, str]:
+    """Says in the model's metadata what goes in and what comes out."""
+    keys = ("observation", "action", "robot", "sensors", "task", "policy", "learners", "config")
+    described = {key: policy.meta[key] for key in (*keys, "versions", "update", "seed")}
+    text = {key: json.dumps(value, sort_keys=True) for key, value in described.items()}
+    return text | {"digest": policy.digest}

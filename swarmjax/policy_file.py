@@ -1,0 +1,460 @@
+"""Reads and writes policy files (docs/policy-format.md), every field checked. No JAX.
+
+`policy.load` trusts what NumPy makes of a file; `read` trusts nothing. Each member's header is
+matched against the one form that NumPy writes, rather than evaluated, and sizes are compared
+before anything is allocated.
+"""
+
+import io
+import json
+import math
+import os
+import re
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import numpy as np
+
+from swarmjax import policy
+from swarmjax.policy import FORMAT, MAX_BYTES, Policy, PolicyError
+
+ACTION_NAMES = ("speed", "turn_rate")
+ACTION_UNITS = ("m/s", "rad/s")
+ENCODINGS = ("metric", "webots")
+ACTIVATIONS = ("tanh", "relu", "swish")
+BODIES = ("planar", "wheeled")
+RESPONSES = ("ideal", "webots", "real")
+
+_DTYPE = np.dtype("<f4")
+_MOST = float(np.finfo(np.float32).max)  # numbers of `meta` are computed with in float32
+_MOST_LIMIT = 1e6  # standard deviations; beyond, sums of float32 may overflow
+_MEMBER = re.compile(
+    r"(actor/(hidden_\d{1,3}|mean)/(kernel|bias)|actor/log_std|normalizer/(mean|std)|meta|digest)"
+    r"\.npy"
+)
+_MAGIC = b"\x93NUMPY\x01\x00"
+_HEADER = re.compile(
+    rb"\{'descr': '([<>|][a-zA-Z]\d{0,9})', 'fortran_order': False, "
+    rb"'shape': \((N,|N(?:, N){1,2}|)\), \} *\n".replace(b"N", rb"(?:0|[1-9]\d{0,8})")
+)
+_MOST_HEADER = 10_000  # bytes, of a header and what is before it; NumPy reads no longer ones
+_NAME = re.compile(r"[a-zA-Z][\w.-]{0,63}", re.ASCII)
+_UNIT = re.compile(r"(?!.*(?:\*/|/\*))[a-zA-Z0-9/^*. -]{1,16}")  # nothing that bounds a comment
+_META = {  # what `meta` holds, and as which type of JSON
+    "policy": str,
+    "learners": int,
+    "activation": str,
+    "observation": dict,
+    "action": dict,
+    "robot": dict,
+    "sensors": dict,
+    "task": dict,
+    "config": dict,
+    "versions": dict,
+    "update": int,
+    "seed": int,
+}
+_KINDS = {str: "text", int: "a whole number", dict: "an object"}
+# What a damaged or foreign archive makes zipfile raise.
+_UNREADABLE = (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile)
+
+
+def read(path: str | Path) -> Policy:
+    """Reads a policy file and checks all of it.
+
+    Args:
+        path: Of the file.
+
+    Returns:
+        The policy.
+
+    Raises:
+        PolicyError: If it is missing, damaged, of another format or inconsistent.
+    """
+    path = Path(path)
+    content = _read_bytes(path)
+    _refuse_in(path, lambda: _check_file(content))
+    try:
+        return policy.load(io.BytesIO(content))
+    except PolicyError as error:  # whose sentence names what it read from
+        _, _, reason = str(error).partition(" cannot be read as a policy: ")
+        raise PolicyError(f"{path} cannot be read as a policy: {reason}") from None
+
+
+def write(path: str | Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
+    """Writes a policy file, whole or not at all.
+
+    Args:
+        path: Of the file; folders that are missing are made.
+        arrays: All arrays of the format, by name, but `meta` and `digest`.
+        meta: All of the format's `meta` but `format`, which is added.
+
+    Raises:
+        PolicyError: If `read` would refuse the file, or if it cannot be written.
+    """
+    path = Path(path)
+    full = {**meta, "format": FORMAT}
+    _refuse_in(path, lambda: check(arrays, full))
+    everything = {**arrays, "meta": np.array(json.dumps(full, sort_keys=True, allow_nan=False))}
+    everything["digest"] = np.array(policy.digest(everything))
+    try:
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, allow_pickle=False, **everything)
+    except OSError as error:
+        raise PolicyError(f"{path} cannot be written: {error.strerror or error}.") from None
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Gives a place to write to, and moves what was written to `path` unless something failed.
+
+    Args:
+        path: Of the file; folders that are missing are made.
+
+    Yields:
+        Another path with the same ending.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Beside the file, so that the move stays within one file system and cannot stop half way.
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
+    """Refuses what does not make a policy.
+
+    Args:
+        arrays: All of a file but `meta` and `digest`.
+        meta: All of the file's.
+
+    Raises:
+        PolicyError: In one sentence that names the field.
+    """
+    if meta.get("format") != FORMAT:
+        raise PolicyError(
+            f"meta.format is {_show(meta.get('format'))}, but this version reads {FORMAT}: "
+            "export the policy from its run again."
+        )
+    for key, kind in _META.items():
+        _entry(meta, key, kind)
+    _choice(meta, "policy", ("shared", "independent"))
+    _choice(meta, "activation", ACTIVATIONS)
+    for key in ("update", "seed"):
+        if meta[key] < 0:
+            raise PolicyError(f"meta.{key} is {_show(meta[key])}: expected 0 or more.")
+    learners = meta["learners"]
+    if learners < 1 or (meta["policy"] == "shared" and learners != 1):
+        expected = "1 for a shared policy" if meta["policy"] == "shared" else "1 or more"
+        raise PolicyError(f"meta.learners is {_show(learners)}: expected {expected}.")
+    size = _check_observation(meta["observation"])
+    _check_action(meta["action"])
+    _check_embodiment(meta)
+    _check_arrays(arrays, learners, size)
+
+
+def _refuse_in[T](path: Path, make: Callable[[], T]) -> T:
+    """Puts the file's name before what is wrong with it."""
+    try:
+        return make()
+    except PolicyError as error:
+        raise PolicyError(f"{path}: {error}") from None
+
+
+# The archive
+
+
+def _read_bytes(path: Path) -> bytes:
+    """Reads a file that is not too large to be a policy."""
+    try:
+        if not path.is_file():
+            raise PolicyError(f"{path} is no file: give the path of a policy.npz.")
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise PolicyError(f"{path} has {size} bytes: a policy has {MAX_BYTES} at most.")
+        return path.read_bytes()
+    except (OSError, ValueError) as error:
+        if isinstance(error, PolicyError):
+            raise
+        reason = getattr(error, "strerror", None) or error
+        raise PolicyError(f"{path} cannot be read: {reason}.") from None
+
+
+def _check_file(content: bytes) -> None:
+    """Refuses whatever is no sound policy file."""
+    members = {name: _parse_array(name, data) for name, data in _unpack(content).items()}
+    expected, meta = _text(members, "digest"), _parse_meta(_text(members, "meta"))
+    del members["digest"]
+    found = policy.digest(members)
+    if found != expected:
+        raise PolicyError(
+            f"digest is {_show(expected[:12])}..., but that of the content is "
+            f"{_show(found[:12])}...: the file was changed or damaged."
+        )
+    del members["meta"]
+    check(members, meta)
+
+
+def _unpack(content: bytes) -> dict[str, bytes]:
+    """Returns the members of an archive by their arrays' names."""
+    found: set[str] = set()
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            members = archive.infolist()
+            for member in members:
+                _check_member(member, found)
+                found.add(member.filename)
+            _check_total(sum(member.file_size for member in members), len(content))
+            return {each.filename.removesuffix(".npy"): archive.read(each) for each in members}
+    except PolicyError:
+        raise
+    except _UNREADABLE as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
+        raise PolicyError(f"it is no npz archive that can be read: {_plain(reason)}.") from None
+
+
+def _check_total(total: int, most: int) -> None:
+    """Refuses members that overlap, of which a small file could hold any number."""
+    if total > most:
+        raise PolicyError(
+            f"its members have {total} bytes in all: expected at most the {most} of the file."
+        )
+
+
+def _check_member(member: zipfile.ZipInfo, found: Set[str]) -> None:
+    """Refuses a member that no policy has, before any of it is read."""
+    name = member.filename
+    if not _MEMBER.fullmatch(name):
+        raise PolicyError(f"{_show(name)} is not known: format {FORMAT} has no such member.")
+    if name in found:
+        raise PolicyError(f"{_show(name)} is there more than once: expected each member once.")
+    if member.flag_bits & 1 or member.compress_type != zipfile.ZIP_STORED:
+        raise PolicyError(f"{_show(name)} is compressed or encrypted: expected stored members.")
+
+
+def _parse_array(name: str, data: bytes) -> np.ndarray:
+    """Reads an array in the one form in which NumPy writes those of the format."""
+    start = len(_MAGIC) + 2 + int.from_bytes(data[len(_MAGIC) : len(_MAGIC) + 2], "little")
+    header = _HEADER.fullmatch(data, len(_MAGIC) + 2, start) if data.startswith(_MAGIC) else None
+    if header is None or start > _MOST_HEADER:
+        raise PolicyError(f"{name} is no plain array: expected one of npy version 1.0.")
+    shape = tuple(int(axis) for axis in header[2].split(b",") if axis)
+    try:
+        dtype = np.dtype(header[1].decode())
+    except (TypeError, ValueError):
+        dtype = np.dtype(object)
+    if dtype.kind not in "biufcSU" or not dtype.itemsize:
+        raise PolicyError(f"{name} is {header[1].decode()}: expected numbers or text.")
+    if math.prod(shape) * dtype.itemsize != len(data) - start:
+        raise PolicyError(f"{name} has not as many values as its shape {list(shape)} says.")
+    try:
+        return np.ndarray(shape, dtype, data, start)
+    except ValueError:  # of an axis of 0 beside others whose product NumPy cannot hold
+        raise PolicyError(f"{name} has shape {list(shape)}: expected no axis of 0.") from None
+
+
+def _text(members: Mapping[str, np.ndarray], name: str) -> str:
+    array = members.get(name)
+    if array is None:
+        raise PolicyError(f"{name} is missing: the file is no policy of format {FORMAT}.")
+    if array.shape != () or not array.dtype.str.startswith("<U"):
+        raise PolicyError(f"{name} is {array.dtype} {list(array.shape)}: expected one text.")
+    try:
+        return array.tobytes().decode("utf-32-le").rstrip("\0")
+    except UnicodeDecodeError:
+        raise PolicyError(f"{name} cannot be read: expected text in Unicode.") from None
+
+
+def _parse_meta(text: str) -> dict[str, Any]:
+    try:
+        meta = json.loads(text)
+    except (ValueError, RecursionError):
+        raise PolicyError("meta cannot be read: expected one text of JSON.") from None
+    if not isinstance(meta, dict):
+        raise PolicyError(f"meta is {_show(meta)}: expected a JSON object.")
+    return meta
+
+
+# What `meta` says
+
+
+def _entry(mapping: Mapping[str, Any], key: str, kind: type, where: str = "meta") -> None:
+    if key not in mapping:
+        raise PolicyError(f"{where}.{key} is missing: expected {_KINDS[kind]}.")
+    value = mapping[key]
+    if not isinstance(value, kind) or isinstance(value, bool):
+        raise PolicyError(f"{where}.{key} is {_show(value)}: expected {_KINDS[kind]}.")
+
+
+def _choice(
+    mapping: Mapping[str, Any], key: str, choices: Sequence[str], where: str = "meta"
+) -> None:
+    if mapping.get(key) not in choices:
+        allowed = " or ".join(choices)
+        raise PolicyError(f"{where}.{key} is {_show(mapping.get(key))}: expected {allowed}.")
+
+
+def _check_observation(layout: Mapping[str, Any]) -> int:
+    """Checks the layout of the observation and returns its size O."""
+    where = "meta.observation"
+    names, units = _words(layout, "names", _NAME), _words(layout, "units", _UNIT)
+    if not names or len(set(names)) < len(names):
+        raise PolicyError(f"{where}.names is {_show(names)}: expected names that differ.")
+    if len(units) != len(names):
+        raise PolicyError(
+            f"{where}.units has {len(units)} entries: expected {len(names)}, as many as names."
+        )
+    _choice(layout, "encoding", ENCODINGS, where)
+    for key in ("offset", "scale"):
+        _check_numbers(layout, key, len(names), where)
+    if not np.array(layout["scale"], np.float32).all():
+        raise PolicyError(f"{where}.scale holds 0: it divides.")
+    _check_positive(layout, "limit", where)
+    if layout["limit"] > _MOST_LIMIT:
+        raise PolicyError(
+            f"{where}.limit is {_show(layout['limit'])}: expected at most {_MOST_LIMIT:g}."
+        )
+    return len(names)
+
+
+def _words(layout: Mapping[str, Any], key: str, form: re.Pattern[str]) -> list[str]:
+    """Returns a list of words that may stand in a comment of any language."""
+    value = layout.get(key)
+    if not isinstance(value, list | tuple) or not all(
+        isinstance(item, str) and form.fullmatch(item) for item in value
+    ):
+        raise PolicyError(
+            f"meta.observation.{key} is {_show(value)}: expected a list of {key} in plain letters."
+        )
+    return list(value)
+
+
+def _check_numbers(layout: Mapping[str, Any], key: str, size: int, where: str) -> None:
+    value = layout.get(key)
+    if not isinstance(value, list | tuple) or len(value) != size or not all(map(_is_number, value)):
+        raise PolicyError(f"{where}.{key} is {_show(value)}: expected {size} finite numbers.")
+
+
+def _check_positive(layout: Mapping[str, Any], key: str, where: str) -> None:
+    value = layout.get(key)
+    if not _is_number(value) or np.float32(value) <= 0:
+        raise PolicyError(f"{where}.{key} is {_show(value)}: expected a number above 0.")
+
+
+def _check_action(layout: Mapping[str, Any]) -> None:
+    for key, expected in (("names", ACTION_NAMES), ("units", ACTION_UNITS)):
+        found = layout.get(key)
+        if not isinstance(found, list | tuple) or tuple(found) != expected:
+            raise PolicyError(
+                f"meta.action.{key} is {_show(found)}: expected {_show(list(expected))}."
+            )
+    for key in ("low", "high"):
+        _check_numbers(layout, key, len(ACTION_NAMES), "meta.action")
+    low, high = list(layout["low"]), list(layout["high"])
+    if (np.array(high, np.float32) <= 0).any() or low != [0, -high[1]]:
+        raise PolicyError(
+            f"meta.action.low is {_show(low)} and high is {_show(high)}: expected "
+            "a speed from 0 up and a turn rate within plus or minus one limit."
+        )
+
+
+def _check_embodiment(meta: Mapping[str, Any]) -> None:
+    """Checks what the policy was trained as: which robot, with which sensors, at which task."""
+    robot, sensors, task = meta["robot"], meta["sensors"], meta["task"]
+    _check_preset(robot, "meta.robot")
+    _choice(robot, "body", BODIES, "meta.robot")
+    for key in ("wheel_radius", "track", "max_wheel_speed"):
+        _check_positive(robot, key, "meta.robot")
+    _check_preset(sensors, "meta.sensors")
+    _choice(sensors, "response", RESPONSES, "meta.sensors")
+    _check_positive(sensors, "range", "meta.sensors")
+    for key in ("control_step", "target_radius"):
+        _check_positive(task, key, "meta.task")
+
+
+def _check_preset(mapping: Mapping[str, Any], where: str) -> None:
+    value = mapping.get("preset")
+    if not isinstance(value, str) or not _NAME.fullmatch(value):
+        raise PolicyError(f"{where}.preset is {_show(value)}: expected the name of a preset.")
+
+
+def _is_number(value: object) -> TypeGuard[float]:
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    return -_MOST <= value <= _MOST  # also of an integer that no float can hold
+
+
+# Arrays
+
+
+def _check_arrays(arrays: Mapping[str, np.ndarray], learners: int, size: int) -> None:
+    """Checks names, then types, shapes and values; `size` is O."""
+    depth = _depth(arrays)
+    shapes = _shapes(arrays, learners, size, depth)
+    for name in shapes:
+        if name not in arrays:
+            raise PolicyError(f"{name} is missing: the policy has {depth} hidden layers.")
+    for name, array in arrays.items():
+        if name not in shapes:
+            raise PolicyError(f"{name} is not known: format {FORMAT} has no such array.")
+        _check_array(name, array, shapes[name])
+    if (arrays["normalizer/std"] <= 0).any():
+        raise PolicyError("normalizer/std holds a value that is not above 0: it divides.")
+
+
+def _check_array(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
+    if array.dtype != _DTYPE:
+        raise PolicyError(f"{name} is {array.dtype}: expected float32.")
+    if array.shape != shape:
+        raise PolicyError(f"{name} has shape {list(array.shape)}: expected {list(shape)}.")
+    if not array.size:
+        raise PolicyError(f"{name} has shape {list(array.shape)}: expected no axis of 0.")
+    if not np.isfinite(array).all():
+        raise PolicyError(f"{name} holds a value that is not finite: expected numbers.")
+
+
+def _depth(arrays: Mapping[str, np.ndarray]) -> int:
+    """Counts the hidden layers, at least one."""
+    found = {match[0] for name in arrays if (match := re.match(r"actor/hidden_\d+/", name))}
+    return max(1, len(found))
+
+
+def _shapes(
+    arrays: Mapping[str, np.ndarray], learners: int, size: int, depth: int
+) -> dict[str, tuple[int, ...]]:
+    """Returns the shape that each array should have; a bias says how wide its layer is."""
+    shapes = {}
+    width = size
+    for i in range(depth):
+        bias = arrays.get(f"actor/hidden_{i}/bias")
+        inner = bias.shape[-1] if bias is not None and bias.ndim == 2 else 0
+        shapes[f"actor/hidden_{i}/kernel"] = (learners, width, inner)
+        shapes[f"actor/hidden_{i}/bias"] = (learners, inner)
+        width = inner
+    actions = len(ACTION_NAMES)
+    shapes["actor/mean/kernel"] = (learners, width, actions)
+    shapes["actor/mean/bias"] = shapes["actor/log_std"] = (learners, actions)
+    shapes["normalizer/mean"] = shapes["normalizer/std"] = (learners, size)
+    return shapes
+
+
+def _show(value: object) -> str:
+    """Writes a value as JSON would, and short."""
+    text = json.dumps(value, default=str)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _plain(text: str) -> str:
+    """Writes text so that no control character is left in it."""
+    return text.encode("unicode_escape").decode("ascii")

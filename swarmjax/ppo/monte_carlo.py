@@ -1,0 +1,57 @@
+"""Monte-Carlo returns, as PPO-PyTorch (nikhilbarhate99, commit 728cce8, `PPO.update`) has them."""
+
+import chex
+import jax
+import jax.numpy as jnp
+
+_EPSILON = 1e-7  # PPO-PyTorch's
+
+
+def monte_carlo_returns(reward: jax.Array, boundary: jax.Array, *, discount: float) -> jax.Array:
+    """Sums up what is earned from each step to the next boundary, discounted, time first.
+
+    Nothing is bootstrapped: at a boundary, and at the end of the rollout, the sum is cut as if
+    nothing more could be earned. Where an episode ends and no boundary is marked, the return goes
+    on into the next episode.
+
+    Args:
+        reward: [T, ...], of step t.
+        boundary: [T, ...], bool: the return of step t ends with its reward.
+        discount: Per step, 0..1.
+
+    Returns:
+        The returns, [T, ...].
+    """
+    chex.assert_equal_shape([reward, boundary])
+
+    def accumulate(
+        following: jax.Array, step: tuple[jax.Array, jax.Array]
+    ) -> tuple[jax.Array, jax.Array]:
+        earned, end = step
+        total = earned + discount * jnp.where(end, 0.0, following)
+        return total, total
+
+    _, returns = jax.lax.scan(
+        accumulate, jnp.zeros_like(reward[0]), (reward, boundary.astype(bool)), reverse=True
+    )
+    return returns
+
+
+def normalize(returns: jax.Array, valid: jax.Array) -> jax.Array:
+    """Shifts and scales returns to mean 0 and deviation 1 over the valid samples.
+
+    The deviation is the unbiased one, of N - 1, plus 1e-7.
+
+    Args:
+        returns: [...].
+        valid: [...], bool or 0/1, of the same shape.
+
+    Returns:
+        The normalised returns, [...], of the others too.
+    """
+    chex.assert_equal_shape([returns, valid])
+    valid = valid.astype(bool)
+    count = jnp.sum(valid)
+    mean = jnp.sum(jnp.where(valid, returns, 0.0)) / jnp.maximum(count, 1)
+    squares = jnp.sum(jnp.where(valid, (returns - mean) ** 2, 0.0))
+    return (returns - mean) / (jnp.sqrt(squares / jnp.maximum(count - 1, 1)) + _EPSILON)

@@ -1,0 +1,186 @@
+"""`python -m swarmjax.suite suite=NAME [out=FILE]`: draws the levels of a suite.
+
+They are held to the digests in its file; `write=true` puts digests there. With `policies` the
+levels of each cell are chosen: those of a pool that these policies fail most.
+"""
+
+import json
+import os
+import re
+import sys
+import textwrap
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from rich import box
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from swarmjax import cells, command, compose, config, evaluate, evaluate_run
+from swarmjax.cells import Cell, Suite
+from swarmjax.config import CellConfig, ConfigError, EvaluateConfig, SuiteConfig
+from swarmjax.evaluate_run import Entrant, Trial
+
+_WIDTH = 100  # of a line of a suite's file
+
+
+def choose(trial: Trial, count: int) -> np.ndarray:
+    """Chooses the levels that policies fail most.
+
+    Args:
+        trial: Of one or more policies on a pool of levels.
+        count: How many to choose, at most as many as there are.
+
+    Returns:
+        Their numbers [count], rising: those of which the fewest targets were reached, of equal ones
+        those with the most contacts, then those that took longest, then the first ones.
+    """
+    reached, contacts, time = (
+        trial.found[name].mean(axis=0)
+        for name in ("targets_reached", "contacts_per_robot", "time_to_reach_s")
+    )
+    worst = np.lexsort((trial.cell.episodes, -time, -contacts, reached))[:count]
+    return np.sort(trial.cell.episodes[worst])
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    settings = config.load_suite(arguments)
+    if settings.policies is not None and not settings.write:
+        raise ConfigError(
+            "policies is given, but write is false: give write=true, which puts the levels that "
+            "are chosen into the suite's file."
+        )
+    if settings.out is not None and Path(settings.out).suffix != ".npz":
+        raise ConfigError(f"out is {settings.out}: give a file .npz.")
+    suite = _renew(settings) if settings.write else cells.draw(settings.suite)
+    if settings.out is not None:
+        cells.write(Path(settings.out), suite)
+    console = Console()
+    if not console.is_terminal:
+        console.width = evaluate.PLAIN_WIDTH
+    _show(console, suite)
+    return 0
+
+
+def _renew(settings: SuiteConfig) -> Suite:
+    """Draws a suite whatever its digests are, and writes those that it finds into its file."""
+    file = config.read_suite(settings.suite)
+    wanted = file.cells
+    if settings.policies is not None:
+        entrants = evaluate_run.read_policies(evaluate.list_files("policies", settings.policies))
+        wanted = tuple(_search(settings, each, entrants) for each in wanted)
+    suite = Suite(file.name, tuple(cells.draw_cell(each) for each in wanted))
+    path = compose.suite_path(settings.suite)
+    content = compose.read_yaml(path)
+    for entry, cell, about in zip(content["cells"], suite.cells, wanted, strict=True):
+        entry["digest"] = cell.digest
+        if about.episodes:
+            entry["episodes"] = list(about.episodes)
+    _replace(path, _comment(path) + to_yaml(content))
+    return suite
+
+
+def _replace(path: Path, text: str) -> None:
+    """Puts a text in the place of a file's, whole or not at all."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        try:
+            temporary.write_text(text)
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be written: {error.strerror or error}.") from None
+
+
+def _search(settings: SuiteConfig, cell: CellConfig, entrants: Sequence[Entrant]) -> CellConfig:
+    """Gives a cell the levels of a pool that policies fail most."""
+    if settings.pool < cell.levels:
+        raise ConfigError(
+            f"pool is {settings.pool}, but cell {cell.name} takes {cell.levels} levels: give more."
+        )
+    pool = cells.draw_cell(replace(cell, levels=settings.pool, episodes=(), digest=None))
+    judged = EvaluateConfig(
+        policy=settings.policies,
+        stage=cell.stage,
+        steps=settings.steps,
+        workers=settings.workers,
+    )
+    progress = Progress(console=Console(stderr=True), transient=True)
+    progress.disable = not progress.console.is_terminal
+    with progress:
+        bar = progress.add_task(cell.name, total=settings.pool * len(entrants))
+        (trial,) = evaluate_run.run(judged, [pool], entrants, partial(progress.advance, bar))
+    chosen = choose(trial, cell.levels)
+    return replace(cell, episodes=tuple(chosen.tolist()), digest=None)
+
+
+def _comment(path: Path) -> str:
+    """The lines of comment that a file begins with."""
+    lines = path.read_text().splitlines(keepends=True)
+    end = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
+    return "".join(lines[:end])
+
+
+def to_yaml(content: dict[str, Any]) -> str:
+    """Writes a suite's file: a line for each key, lists of numbers wrapped.
+
+    Args:
+        content: Plain data, as `compose.read_yaml` gives it.
+
+    Returns:
+        The text.
+    """
+    lines = [f"{key}: {_flow(value)}" for key, value in content.items() if key != "cells"]
+    lines.append("cells:")
+    for cell in content["cells"]:
+        for i, (key, value) in enumerate(cell.items()):
+            head = f"  {' ' if i else '-'} {key}: "
+            lines += textwrap.wrap(
+                head + _flow(value),
+                _WIDTH,
+                subsequent_indent=" " * 6,
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
+    return "\n".join(lines) + "\n"
+
+
+def _flow(value: Any) -> str:
+    """Writes a value in YAML's flow style, text without quotes where YAML reads it as just that."""
+    if isinstance(value, dict):
+        items = (f"{_flow(key)}: {_flow(item)}" for key, item in value.items())
+        return "{" + ", ".join(items) + "}"
+    if isinstance(value, str) and re.fullmatch(r"[A-Za-z_][\w-]*", value, re.ASCII):
+        return value if yaml.safe_load(value) == value else json.dumps(value)
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _show(console: Console, suite: Suite) -> None:
+    """Prints a row for each cell."""
+    table = Table(box=box.SIMPLE if console.is_terminal else None)
+    heads = ("cell", "robots", "obstacles", "side", "shape", "realism", "levels", "unreachable")
+    for i, head in enumerate((*heads, "digest")):
+        table.add_column(head, justify="right" if 0 < i < len(heads) else "left")
+    for cell in suite.cells:
+        table.add_row(*_row(cell))
+    console.print(table)
+
+
+def _row(cell: Cell) -> list[str]:
+    stage = cell.stage
+    lost = np.isinf(evaluate_run.ways(EvaluateConfig(policy="", stage=stage), cell.levels))
+    numbers = (stage.robots, stage.obstacles, f"{'-'.join(f'{x:g}' for x in set(stage.sides))} m")
+    words = (cell.shape, cell.realism or "-", len(cell.episodes), int(lost.any(axis=-1).sum()))
+    return [str(each) for each in (cell.name, *numbers, *words, cell.digest[:12])]
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("suite", main, SuiteConfig))

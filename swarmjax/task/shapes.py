@@ -1,0 +1,80 @@
+"""Obstacles of other shapes than the trained box, put together of boxes within its outer circle.
+
+A level keeps its distances from an obstacle's outer circle, so that all of them hold for anything
+inside it; and boxes are what both engines and the analytic sensors know. NumPy.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from swarmjax.config import Shape
+from swarmjax.task.level import Level
+
+HALF_THICKNESS = 0.005  # m, of plates; chosen: a board that stands upright
+# Places in whole parts of a metre, which float32 holds exactly, so that a level is the same to the
+# last bit wherever sine and cosine round otherwise.
+_GRID = 2.0**20
+
+
+class _Part(NamedTuple):
+    """A box of a shape, in the obstacle's own frame; m and rad."""
+
+    x: float
+    y: float
+    turn: float
+    half_length: float
+    half_width: float
+
+
+def _parts(shape: Shape, half: float) -> list[_Part]:
+    """Boxes of a shape within the circle about a square of half edge `half`, m."""
+    outer, thin = half * math.sqrt(2.0), min(HALF_THICKNESS, 0.5 * half)
+    bar = _Part(0.0, 0.0, 0.0, math.sqrt(outer**2 - thin**2), thin)
+    quarter = 0.5 * math.pi
+    if shape == "bar":
+        return [bar]
+    if shape == "cross":
+        return [bar, bar._replace(turn=quarter)]
+    if shape == "ell":  # two sides of the square
+        aside = half - thin
+        return [_Part(0.0, -aside, 0.0, half, thin), _Part(-aside, 0.0, quarter, half, thin)]
+    if shape == "pillar":  # a regular octagon is the union of four boxes, an edge at either end
+        length, width = outer * math.cos(math.pi / 8), outer * math.sin(math.pi / 8)
+        return [_Part(0.0, 0.0, 0.25 * math.pi * i, length, width) for i in range(4)]
+    return [_Part(0.0, 0.0, 0.0, half, half)]
+
+
+def boxes_of(shape: Shape) -> int:
+    """How many boxes an obstacle of a shape is put together of."""
+    return len(_parts(shape, 1.0))
+
+
+def expand(level: Level, shape: Shape) -> Level:
+    """Puts obstacles of a shape in the place of a random level's boxes.
+
+    Args:
+      level: as drawn, one arena's; NumPy.
+      shape: `box` leaves it as it is.
+
+    Returns:
+      The level with P boxes for each of its M obstacles, [M * P, 5]; an obstacle's boxes stand one
+      after the other.
+    """
+    if shape == "box":
+        return level
+    boxes = [_place(box, part) for box in level.obstacle for part in _parts(shape, float(box[3]))]
+    return level._replace(
+        obstacle_present=np.repeat(level.obstacle_present, boxes_of(shape)),
+        obstacle=np.array(boxes, np.float32).reshape(-1, 5),
+    )
+
+
+def _place(box: np.ndarray, part: _Part) -> list[float]:
+    """Puts a part where the obstacle [5] stands."""
+    x, y, yaw = (float(value) for value in box[:3])
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    place = (x + cos * part.x - sin * part.y, y + sin * part.x + cos * part.y)
+    exact = [round(value * _GRID) / _GRID for value in (*place, yaw + part.turn)]
+    return [*exact, part.half_length, part.half_width]

@@ -1,0 +1,46 @@
+/* A robot's policy: from what it observes to how it moves. C99, float only, no heap.
+ *
+ * Written by swarmjax.export; the same numbers as policy.npz of digest
+ * $digest.
+ * $kind
+ *
+ * Observation, each entry (quantity - offset) / scale:
+ *
+$observation
+ *
+ * Command, each entry within low and high:
+ *
+$action
+ *
+ * Trained for: $trained,
+ * a command every $control_step s.
+ */
+#ifndef POLICY_H
+#define POLICY_H
+
+#define POLICY_OBSERVATIONS $observations
+#define POLICY_ACTIONS $actions
+#define POLICY_LEARNERS $learners
+
+#define POLICY_DIGEST "$digest"
+#define POLICY_CONTROL_STEP $control_step_f /* s */
+#define POLICY_TARGET_RADIUS $target_radius_f /* m, distance to the target that counts as arrival */
+
+/* Scales quantities, in the units above, to an observation. */
+void policy_observe(const float quantity[POLICY_OBSERVATIONS],
+                    float observation[POLICY_OBSERVATIONS]);
+
+/* Computes the most likely action; -1..1 spans the commands, but it may lie beyond. `learner` is
+ * the robot's number, modulo POLICY_LEARNERS: any number will do if all robots share the policy. */
+void policy_action(unsigned learner, const float observation[POLICY_OBSERVATIONS],
+                   float action[POLICY_ACTIONS]);
+
+/* Scales an action, clipped to -1..1 first, to forward speed (m/s) and turn rate (rad/s, left
+ * positive). */
+void policy_command(const float action[POLICY_ACTIONS], float command[POLICY_ACTIONS]);
+
+/* Turns a command into the speeds of the left and the right wheel (rad/s), each within its limit:
+ * wheel radius $wheel_radius m, track $track m, limit $max_wheel_speed rad/s. */
+void policy_wheel_speeds(const float command[POLICY_ACTIONS], float wheels[2]);
+
+#endif

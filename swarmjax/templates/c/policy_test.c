@@ -1,0 +1,42 @@
+/* Holds policy.c to what NumPy computes: 0 if all actions agree, else 1 + the number of the first
+ * that does not. No input or output, so that it runs on the robot too. */
+#include "policy.h"
+
+#define CASES $cases
+#define TOLERANCE 1e-5f /* times 1 or the action, whichever is larger */
+
+static const float OBSERVATION[CASES][POLICY_OBSERVATIONS] = {
+$observation
+};
+static const float ACTION[CASES][POLICY_ACTIONS] = {
+$action
+};
+
+static float magnitude(float x)
+{
+    return x < 0.0f ? -x : x;
+}
+
+static int agrees(const float *found, const float *expected)
+{
+    for (unsigned i = 0; i < POLICY_ACTIONS; i++) {
+        const float size = magnitude(expected[i]) > 1.0f ? magnitude(expected[i]) : 1.0f;
+        /* Written so that a NaN does not agree. */
+        if (!(magnitude(found[i] - expected[i]) <= TOLERANCE * size)) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
+int main(void)
+{
+    for (int i = 0; i < CASES; i++) {
+        float action[POLICY_ACTIONS];
+        policy_action((unsigned)i % POLICY_LEARNERS, OBSERVATION[i], action);
+        if (!agrees(action, ACTION[i])) {
+            return 1 + i;
+        }
+    }
+    return 0;
+}

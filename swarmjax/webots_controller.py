@@ -1,0 +1,277 @@
+"""Drives an e-puck of Webots to its target by a trained policy. Needs NumPy alone.
+
+Once every control step: infrared, GPS and compass in, speeds of the wheels out. `policy.npz` and
+`sensors.json`, which says what the sensors' counts mean, lie beside this file. The target comes as
+`target=x,y` (m) in the robot's controllerArgs, or in its customData, where it may change; so does
+`robot=i`, the robot's number from 0, for a policy that is not shared. controllerArgs win.
+"""
+
+import importlib
+import json
+import math
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from swarmjax import policy
+from swarmjax.policy import Policy
+
+INFRARED = tuple(f"ps{i}" for i in range(8))
+MOTORS = ("left wheel motor", "right wheel motor")
+
+
+class Orders(NamedTuple):
+    """Where a robot is to go, and which one it is."""
+
+    target: tuple[float, float] | None = None
+    robot: int = 0
+
+
+def parse(words: Iterable[str]) -> Orders:
+    """Reads `target=x,y` and `robot=i`.
+
+    Args:
+        words: of controllerArgs, or of customData.
+
+    Returns:
+        The orders.
+
+    Raises:
+        ValueError: if a word is neither.
+    """
+    orders = Orders()
+    for word in words:
+        key, _, value = word.partition("=")
+        try:
+            if key == "target":
+                x, y = (float(part) for part in value.split(","))
+                if not math.isfinite(x + y):
+                    raise ValueError
+                orders = orders._replace(target=(x, y))
+            elif key == "robot" and value.isdecimal():
+                orders = orders._replace(robot=int(value))
+            else:
+                raise ValueError
+        except ValueError:
+            raise ValueError(f"{word!r} cannot be read: give target=x,y or robot=i.") from None
+    return orders
+
+
+def observe(
+    trained: Policy,
+    sensors: dict[str, Any],
+    counts: Sequence[float],
+    distance: float,
+    bearing: float,
+) -> np.ndarray:
+    """Puts an observation together.
+
+    Args:
+        trained: the policy that is to observe.
+        sensors: what `sensors.json` holds.
+        counts: [K] of the infrared sensors.
+        distance: to the target, m.
+        bearing: of the target from the robot's x axis, rad, left positive.
+
+    Returns:
+        [O] float32, scaled as the policy's layout says.
+    """
+    layout = trained.meta["observation"]
+    seen = np.asarray(counts, float)
+    if trained.encoding != sensors["answers"]:
+        seen = ray(seen, sensors)
+        if trained.encoding == "metric":
+            seen = np.minimum(seen, trained.meta["sensors"]["range"])
+        else:
+            seen = np.interp(seen, sensors["distance"], sensors["counts"])
+    quantity = np.array([*seen, distance, bearing], np.float32)
+    offset, scale = (np.array(layout[key], np.float32) for key in ("offset", "scale"))
+    return (quantity - offset) / scale
+
+
+def ray(counts: np.ndarray, sensors: dict[str, Any]) -> np.ndarray:
+    """Turns counts into metres, as a robot does whose sensors are calibrated.
+
+    Args:
+        counts: [K].
+        sensors: what `sensors.json` holds.
+
+    Returns:
+        [K] the distances at which nominal sensors report such counts, m.
+    """
+    if sensors["answers"] == "webots":
+        return np.interp(counts, sensors["counts"][::-1], sensors["distance"][::-1])
+    fit = {key: np.array(value) for key, value in sensors["fit"].items()}
+    echo = np.clip(counts, 1.0, fit["span"])
+    return np.clip(
+        np.sqrt(fit["strength"] / echo) - fit["depth"] + fit["to_hull"], 0.0, fit["reach"]
+    )
+
+
+def to_target(
+    position: Sequence[float], north: Sequence[float], target: tuple[float, float]
+) -> tuple[float, float]:
+    """Works out how a target lies from a robot.
+
+    Args:
+        position: of the robot, x and y first, m; what a GPS reports.
+        north: in the robot's frame, x and y first; what a compass reports. The world is ENU, so
+            north is its y axis.
+        target: x and y, m.
+
+    Returns:
+        Distance, m, and bearing from the robot's x axis, rad, -pi to pi, left positive.
+    """
+    x, y = target[0] - position[0], target[1] - position[1]
+    yaw = math.atan2(north[0], north[1])
+    turn = math.atan2(y, x) - yaw
+    return math.hypot(x, y), math.atan2(math.sin(turn), math.cos(turn))
+
+
+def wheel_speeds(trained: Policy, observation: np.ndarray, robot: int) -> np.ndarray:
+    """Lets the policy act.
+
+    Args:
+        trained: the policy.
+        observation: [O].
+        robot: its number, from 0.
+
+    Returns:
+        [2] speeds of the left and the right wheel, rad/s, each within its own limit.
+    """
+    # Robots before this one are there only so that it meets its own network.
+    seen = np.broadcast_to(observation, (1 if trained.is_shared else robot + 1, observation.size))
+    speed, turn_rate = policy.command(trained, policy.mean_action(trained, seen))[-1]
+    body = trained.meta["robot"]
+    turn = turn_rate * 0.5 * body["track"]
+    wheels = np.array([speed - turn, speed + turn]) / body["wheel_radius"]
+    return np.clip(wheels, -body["max_wheel_speed"], body["max_wheel_speed"])
+
+
+class Devices(NamedTuple):
+    """What the controller has to do with."""
+
+    infrared: list[Any]
+    gps: Any
+    compass: Any
+    motors: list[Any]
+
+
+def find_devices(robot: Any, period: int) -> Devices:
+    """Finds a robot's devices and switches them on.
+
+    Args:
+        robot: of Webots.
+        period: between samples, ms.
+
+    Returns:
+        The devices: sensors that report every `period`, and motors that stand still.
+
+    Raises:
+        ValueError: if one is missing.
+    """
+    found = {name: robot.getDevice(name) for name in (*INFRARED, "gps", "compass", *MOTORS)}
+    for name, device in found.items():
+        if device is None:
+            raise ValueError(
+                f"the robot has no device {name!r}: an E-puck with a GPS and a Compass in its "
+                "turretSlot has all that this needs."
+            )
+    for name in (*INFRARED, "gps", "compass"):
+        found[name].enable(period)
+    for name in MOTORS:
+        found[name].setPosition(math.inf)  # turned by speed
+        found[name].setVelocity(0.0)
+    return Devices(
+        [found[name] for name in INFRARED],
+        found["gps"],
+        found["compass"],
+        [found[name] for name in MOTORS],
+    )
+
+
+def control_period(trained: Policy, basic_step: float) -> int:
+    """Finds how often the policy acts.
+
+    Args:
+        trained: the policy.
+        basic_step: of the world, ms.
+
+    Returns:
+        The control step that the policy was trained with, ms.
+
+    Raises:
+        ValueError: if it is not whole, or no multiple of the world's step.
+    """
+    period = 1000 * trained.meta["task"]["control_step"]
+    if abs(round(period) - period) > 1e-6 * period:
+        raise ValueError(
+            f"the control step of the policy is {period:g} ms: Webots has whole milliseconds only."
+        )
+    steps = round(period / basic_step)
+    if steps < 1 or abs(steps * basic_step - period) > 1e-6 * period:
+        raise ValueError(
+            f"basicTimeStep is {basic_step:g} ms: give {period:g} ms, the control step of the "
+            "policy, or a whole part of it."
+        )
+    return round(period)
+
+
+def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
+    """Drives a robot until the simulation ends.
+
+    Args:
+        robot: of Webots.
+        folder: where `policy.npz` and `sensors.json` lie.
+        words: of controllerArgs.
+
+    Raises:
+        ValueError: if the policy, the robot or the orders are unsound.
+    """
+    trained = policy.load(folder / "policy.npz")
+    sensors = json.loads((folder / "sensors.json").read_text())
+    period = control_period(trained, robot.getBasicTimeStep())
+    devices = find_devices(robot, period)
+    given = parse(words)
+    parked_at = None
+    while robot.step(period) != -1:  # the first step gives all sensors a value
+        orders = parse([*_custom(robot, given), *words])
+        wheels = np.zeros(len(MOTORS))
+        if orders.target is not None and orders.target != parked_at:
+            distance, bearing = to_target(
+                devices.gps.getValues(), devices.compass.getValues(), orders.target
+            )
+            counts = [sensor.getValue() for sensor in devices.infrared]
+            # A robot that has arrived stays where it is, as in training.
+            if distance <= trained.meta["task"]["target_radius"]:
+                parked_at = orders.target
+            else:
+                seen = observe(trained, sensors, counts, distance, bearing)
+                wheels = wheel_speeds(trained, seen, orders.robot)
+        for motor, speed in zip(devices.motors, wheels, strict=True):
+            motor.setVelocity(float(speed))
+
+
+def _custom(robot: Any, given: Orders) -> list[str]:
+    """The words of customData; if it need not name the target, somebody else may use it too."""
+    words = robot.getCustomData().split()
+    return [word for word in words if given.target is None or word.startswith("robot=")]
+
+
+def main() -> int:
+    """Runs the controller in Webots; returns its exit code."""
+    # Webots puts its own package `controller` where a controller finds it, and nowhere else.
+    robot = importlib.import_module("controller").Robot()
+    try:
+        drive(robot, Path(__file__).resolve().parent, sys.argv[1:])
+    except (OSError, ValueError) as error:
+        sys.stderr.write(f"{Path(__file__).stem}: error: {error}\n")
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,154 @@
+"""Our update on the golden batch, and how far it is from the golden numbers.
+
+As a program it prints that as JSON; with JAX_ENABLE_X64=1 everything is float64.
+"""
+
+import functools
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import golden_inputs as inputs
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from swarmjax import rollout
+from swarmjax.config import AlgoConfig, load_train
+from swarmjax.ppo import learner as ppo
+from swarmjax.ppo import networks
+from swarmjax.ppo.learner import LearnerState
+from swarmjax.rollout import Trajectory
+
+PAPER = load_train(["algo=paper"]).algo
+CONFIGS = {
+    "terminal": PAPER,
+    "leak": replace(PAPER, time_out="leak"),
+    # The schedule's second level, 0.55, begins with the update.
+    "std": replace(PAPER, std_interval=inputs.STEPS),
+}
+TOTAL = 166  # updates of the run; constant learning rates do not ask
+
+
+def learner(config: AlgoConfig) -> LearnerState:
+    """The learner with the golden weights, [1]."""
+    state = ppo.init(jax.random.key(0), config, inputs.OBSERVATION, inputs.ACTION, TOTAL)
+    drawn = inputs.draw().layers
+    params = {
+        network: {
+            "torso": {f"hidden_{i}": _layer(layers[i]) for i in range(2)},
+            {"actor": "mean", "critic": "value"}[network]: _layer(layers[2]),
+        }
+        for network, layers in drawn.items()
+    }
+    log_std = jnp.log(jnp.full(inputs.ACTION, inputs.STD, float))
+    params["actor"]["log_std"] = log_std
+    params = jax.tree.map(lambda old, new: new.reshape(old.shape), state.params, params)
+    state = jax.tree.map(
+        lambda x: x.astype(float) if jnp.issubdtype(x.dtype, jnp.floating) else x,
+        replace(state, params=params),
+    )
+    return jax.tree.map(lambda x: x[None], state)
+
+
+def _layer(drawn: tuple[np.ndarray, np.ndarray]) -> dict[str, jax.Array]:
+    return {"kernel": jnp.asarray(drawn[0], float), "bias": jnp.asarray(drawn[1], float)}
+
+
+def trajectory(state: LearnerState, config: AlgoConfig, idle: int = 0) -> Trajectory:
+    """The golden batch as a rollout of one arena, [T, 1, 1, 1].
+
+    Args:
+        state: [1], that collected it.
+        config: of the learner.
+        idle: steps for which the robot waits after each arrival, with NaN in them: they must not
+            count. The batch is then longer by that.
+    """
+    drawn = inputs.draw()
+    alone = jax.tree.map(lambda x: x[0], state)
+    observation = jnp.asarray(drawn.observation, float)
+    # `act` takes the deviation that the learner has, here that of the whole batch.
+    action, log_prob = ppo.act(alone, config, observation, jnp.asarray(drawn.noise, float))
+    terminated, truncated = inputs.ends(inputs.ARRIVALS), inputs.ends(inputs.TIME_OUTS)
+    value = ppo.values(alone, config, observation)
+    columns = Trajectory(
+        observation=observation,
+        action=action,
+        log_prob=log_prob,
+        value=value,
+        next_value=jnp.full_like(value, jnp.nan),  # never read: nothing is bootstrapped
+        reward=jnp.asarray(drawn.reward, float),
+        terminated=jnp.asarray(terminated),
+        truncated=jnp.asarray(truncated),
+        valid=jnp.ones(inputs.STEPS, bool),
+    )
+    if idle:
+        columns = Trajectory(*(_insert(x, idle) for x in columns))
+    return jax.tree.map(lambda x: x[:, None, None, None], columns)
+
+
+def _insert(column: jax.Array, idle: int) -> jax.Array:
+    """Inserts steps behind each arrival: False, or NaN."""
+    blank = False if column.dtype == bool else np.nan
+    after = np.repeat(np.array(inputs.ARRIVALS) + 1, idle)
+    return jnp.asarray(np.insert(np.asarray(column), after, blank, axis=0))
+
+
+def flat(params: networks.Params) -> np.ndarray:
+    """All kernels and biases in the order of golden.npz; of one learner, [1, ...]."""
+    found = []
+    for network, last in (("actor", "mean"), ("critic", "value")):
+        torso = params[network]["torso"]
+        for layer in (torso["hidden_0"], torso["hidden_1"], params[network][last]):
+            found += [np.ravel(layer["kernel"]), np.ravel(layer["bias"])]
+    return np.concatenate(found)
+
+
+@functools.partial(jax.jit, static_argnames="epochs")
+def _learn(
+    state: LearnerState, batch: ppo.Batch, epochs: int
+) -> tuple[LearnerState, dict[str, jax.Array]]:
+    config = replace(PAPER, epochs=epochs)
+    keys = jax.random.split(jax.random.key(0), 1)
+    return jax.vmap(lambda s, b, k: ppo.update(s, config, b, k, TOTAL))(state, batch, keys)
+
+
+def _loss(metrics: dict[str, jax.Array], config: AlgoConfig) -> float:
+    """The loss of the metrics, a mean over the epochs."""
+    parts = metrics["policy_loss"] + config.value_cost * metrics["value_loss"]
+    return float((parts - config.entropy_cost * metrics["entropy"])[0])
+
+
+def _apart(found: np.ndarray, expected: np.ndarray) -> float:
+    return float(np.abs(found - expected).max())
+
+
+def errors(case: str, idle: int = 0, trained: tuple[int, ...] = (1, 80)) -> dict[str, float]:
+    """How far our update is from the golden one, by what is compared, after so many epochs."""
+    with np.load(Path(__file__).with_name("golden.npz")) as archive:
+        golden = {k.partition("/")[2]: archive[k] for k in archive if k.startswith(f"{case}/")}
+    config = CONFIGS[case]
+    state = learner(config)
+    batch = rollout.batch(trajectory(state, config, idle), config)
+    state = jax.vmap(lambda one: ppo.explore(one, config, inputs.STEPS + (case == "std")))(state)
+    found = {}
+    if "returns" in golden:
+        valid = np.asarray(batch.valid[0, 0])
+        returns, advantages = (np.asarray(x[0, 0])[valid] for x in (batch.return_, batch.advantage))
+        found["returns"] = _apart(returns, golden["returns"])
+        found["advantages"] = _apart(advantages[::10], golden["advantages"])
+    for epochs in trained:
+        learned, metrics = _learn(state, batch, epochs)
+        found[f"loss_{epochs}"] = abs(_loss(metrics, config) - golden["losses"][:epochs].mean())
+        if f"params_{epochs}" in golden:
+            params, expected = flat(learned.params), golden[f"params_{epochs}"]
+            apart = np.linalg.norm(params - expected) / np.linalg.norm(expected)
+            found[f"params_{epochs}"] = float(apart)
+    return found
+
+
+if __name__ == "__main__":
+    cases = {case: errors(case) for case in CONFIGS}
+    cases["waiting"] = errors("terminal", idle=50, trained=(1,))
+    sys.stdout.write(json.dumps(cases))

@@ -1,0 +1,54 @@
+"""One update of `algo=paper` against PPO-PyTorch; make_golden.py made the numbers."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from golden_update import errors
+
+# What the floating point of both sides may come to over 80 steps of Adam.
+DOUBLE = {"returns": 1e-10, "advantages": 1e-10, "loss_1": 1e-9, "loss_80": 1e-9}
+DOUBLE |= {"params_1": 1e-8, "params_80": 1e-6}  # relative in norm
+
+
+@pytest.fixture(scope="module")
+def double() -> dict[str, dict[str, float]]:
+    """Of a process of its own, since a process has one precision."""
+    program = Path(__file__).with_name("golden_update.py")
+    found = subprocess.run(
+        [sys.executable, str(program)],
+        env=os.environ | {"JAX_ENABLE_X64": "1", "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.returncode == 0, found.stderr
+    return json.loads(found.stdout)
+
+
+@pytest.mark.parametrize(
+    ("case", "compared"),
+    [
+        ("terminal", set(DOUBLE)),
+        ("leak", set(DOUBLE) - {"params_1"}),
+        ("std", {"loss_1", "loss_80"}),
+        # Steps for which a robot that has arrived waits count for nothing.
+        ("waiting", {"returns", "advantages", "loss_1", "params_1"}),
+    ],
+)
+def test_an_update_is_theirs_in_double_precision(
+    case: str, compared: set[str], double: dict[str, dict[str, float]]
+) -> None:
+    found = double[case]
+    assert set(found) == compared
+    assert all(found[name] <= DOUBLE[name] for name in compared), found
+
+
+def test_an_update_is_theirs_in_single_precision() -> None:
+    found = errors("terminal", trained=(80,))
+    # Relative in norm, after 80 epochs; float32 of both returns and gradients.
+    assert found["params_80"] <= 1e-3
+    assert found["returns"] <= 1e-4

@@ -1,0 +1,140 @@
+"""`algo=paper` is the published experiment, whatever the defaults are; Table 1 row by row."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sentences import refusal
+
+from swarmjax import compose, config, epuck, rollout
+from swarmjax.config import AlgoConfig, RewardConfig, TrainConfig, load_train
+from swarmjax.sim import drive
+from swarmjax.task import observation
+from swarmjax.task import stage as task_stage
+
+FILES = Path(compose.__file__).resolve().parent.parent / "configs"
+PAPER = load_train(["algo=paper"])
+# "timesteps" is Table 1's own word; a key of two words names what it stands for here.
+TABLE_1 = {
+    "max training timesteps": (PAPER.budget, 1_000_000),
+    "Max timesteps per episode": (PAPER.task.step_limit, 1500),
+    "state space dimension": (observation.SIZE, 10),
+    "action space dimension": (rollout.ACTION_SIZE, 2),
+    "discount factor (gamma)": (PAPER.algo.discount, 0.99),
+    "PPO epsilon clip": (PAPER.algo.clip, 0.2),
+    "PPO K epochs": (PAPER.algo.epochs, 80),
+    "optimizer learning rate actor": (PAPER.algo.actor_learning_rate, 0.0003),
+    "optimizer learning rate critic": (PAPER.algo.critic_learning_rate, 0.001),
+    "starting std of action distribution": (PAPER.algo.initial_std, 0.6),
+    "the decay rate of std of action distribution": (PAPER.algo.std_decrement, 0.05),
+    "minimum std of action distribution": (PAPER.algo.std_floor, 0.1),
+    "decay frequency of std of action distribution": (PAPER.algo.std_interval, 250_000),
+}
+
+
+@pytest.mark.parametrize("row", TABLE_1)
+def test_every_row_of_table_1_is_in_the_preset_by_its_name(row: str) -> None:
+    value, published = TABLE_1[row]
+    assert value == published
+    assert f'"{row}"' in (FILES / "algo" / "paper.yaml").read_text()
+
+
+def test_the_help_names_the_rows_of_the_algorithm() -> None:
+    text = config.help_text(TrainConfig, "swarmjax.train")
+    algorithm = list(TABLE_1)[4:]
+    assert [row for row in algorithm if f"'{row}'" not in text] == []
+
+
+def test_the_preset_leaves_no_number_of_the_learner_to_a_default() -> None:
+    given = compose.read_preset("algo", "paper")
+    assert set(given["algo"]) | {"gae_lambda"} == {f.name for f in dataclasses.fields(AlgoConfig)}
+    assert PAPER.algo.gae_lambda is None  # has no meaning
+    rewards = {f.name for f in dataclasses.fields(RewardConfig)}
+    assert set(given["task"]["reward"]) == rewards
+    # Equation 3.
+    assert dataclasses.astuple(PAPER.task.reward) == (1.0, -0.001, 0.0, 0.0, 0.0)
+
+
+def test_the_preset_chooses_the_files_that_are_not_given() -> None:
+    assert (PAPER.stage_name, PAPER.robot.max_speed) == ("paper_curriculum", 0.25)
+    assert (PAPER.realism.name, PAPER.arenas, PAPER.updates) == ("webots", 1, 166)
+    other = load_train(["algo=paper", "stage=paper6", "robot=planar", "realism=ideal", "seeds=10"])
+    assert (other.stage_name, other.robot.max_speed) == ("paper6", epuck.MAX_SPEED)
+    assert (other.realism.name, other.seeds) == ("ideal", 10)
+    changed = load_train(["arenas=2", "algo.epochs=3", "algo=paper", "task.step_limit=100"])
+    assert (changed.arenas, changed.algo.epochs, changed.task.step_limit) == (2, 3, 100)
+    assert load_train([]).realism.name == "ideal"  # the other preset chooses nothing
+
+
+def test_the_stages_are_fixed_levels_that_hold_their_robots() -> None:
+    sizes = [(2, 0.5, 0), (2, 0.7, 0), (3, 0.7, 1), (3, 1.0, 2), (5, 1.0, 2), (5, 1.2, 3)]
+    fence, boxes = PAPER.stage, load_train(["algo=paper", "stage=paper_boxes_curriculum"]).stage
+    assert [(each.robots, each.side, each.obstacles) for each in boxes] == sizes
+    for one, other in zip(fence, boxes, strict=True):
+        assert (one.robots, one.side) == (other.robots, other.side)
+        assert one.level == other.level == "fixed"
+        assert other.layout == "boxes"
+        assert (one.obstacles, one.layout) == ((1, "fence") if other.obstacles else (0, "boxes"))
+    for name in ("paper_expanded", "paper_expanded_boxes"):
+        (stage,) = load_train(["algo=paper", f"stage={name}"]).stage
+        assert (stage.robots, stage.side, stage.level) == (5, 1.5, "fixed")
+        task_stage.stack([stage])  # refuses what has no room
+    task_stage.stack([*fence, *boxes])
+
+
+def test_the_clamp_of_each_wheel_takes_the_turn_of_a_fast_command() -> None:
+    mine = drive.from_config(PAPER.robot)
+    # The realised (v, w) of epuck_facts.md section 1.7 for the action that commands (0.25, 3.14),
+    # (0.0625, 3.14) and (0, 3.14): both wheels at 6.28 rad/s; 6.25 / 2 and so on.
+    action = np.array([[1.0, 1.0], [-0.5, 1.0], [-1.0, 1.0], [1.0, 0.5]])
+    wheels = drive.wheel_speeds(drive.command(action, mine, np), mine, np)
+    found = drive.body_velocity(wheels, mine.wheel_radius, mine.track, np)
+    # To the digits of the table.
+    np.testing.assert_allclose(
+        found, [[0.1256, 0.0], [0.053, 2.78], [0.0, 3.14], [0.1256, 0.0]], atol=6e-3
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["algo.returns=monte_carlo", "algo.gae_lambda=0.9"],
+         "algo.gae_lambda is 0.9, but returns is monte_carlo: gae_lambda is an option of gae, so "
+         "give null or returns=gae."),
+        (["algo.std_floor=0.2"],
+         "algo.std_floor is 0.2, but exploration is learned: std_floor is an option of scheduled, "
+         "so give null or exploration=scheduled."),
+        (["algo=paper", "algo.time_out=bootstrap"],
+         "algo.time_out is bootstrap, but returns is monte_carlo: give terminal or leak."),
+        (["algo.time_out=leak"],
+         "algo.time_out is leak, but returns is gae: give bootstrap or terminal."),
+        (["algo=paper", "algo.std_floor=0.7"],
+         "algo.std_floor is 0.7, but initial_std is 0.6: give at most 0.6."),
+        (["algo.output=tanh", "algo.activation=relu"],
+         "algo.output is tanh, but activation is relu, and a policy's file has one for all "
+         "layers: give activation=tanh or output=linear."),
+        (["algo=paper", "budget=3e9"],
+         "budget is 3000000000, but algo.exploration is scheduled by control steps that are "
+         "counted in 32 bits: give at most 2147483647."),
+        (["algo=paper", "curriculum.normalizer=relearn"],
+         "curriculum.normalizer is relearn, but algo.normalize_observations is false: give keep "
+         "or algo.normalize_observations=true."),
+        (["algo=paper", "budget=5999"],
+         "budget is 5999, but one update takes arenas x algo.rollout = 6000 control steps: give "
+         "at least 6000."),
+        (["algo.name=paper"], "algo.name cannot be given: choose a file, as in algo=ppo."),
+    ],
+)  # fmt: skip
+def test_what_makes_no_sense_is_refused(words: list[str], sentence: str) -> None:
+    assert refusal(load_train, words) == sentence
+
+
+def test_options_take_their_defaults_where_they_have_a_meaning() -> None:
+    plain = AlgoConfig()
+    assert (plain.gae_lambda, plain.time_out) == (0.95, "bootstrap")
+    assert (plain.std_decrement, plain.std_interval, plain.std_floor) == (None, None, None)
+    other = AlgoConfig(returns="monte_carlo", exploration="scheduled")
+    assert (other.gae_lambda, other.time_out) == (None, "terminal")
+    assert (other.std_decrement, other.std_interval, other.std_floor) == (0.05, 250_000, 0.1)
+    assert config.build(AlgoConfig, config.to_dict(other)) == other

@@ -1,0 +1,145 @@
+"""When the deviation falls, when an update falls, where episodes end: against a replay in NumPy.
+
+The replay is the loop of PPO-PyTorch's train.py (commit 728cce8), in words of our own.
+"""
+
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmjax import curriculum, loop, rollout
+from swarmjax.config import SimConfig, StageConfig, TrainConfig, load_train
+from swarmjax.loop import Program, TrainState
+from swarmjax.ppo import exploration
+
+PAPER = load_train(["algo=paper", "sim.impl=jax"])
+
+
+class Replay(NamedTuple):
+    """Of each step the deviation it acts with; of each update the steps before it and its own."""
+
+    std: np.ndarray
+    updates: list[tuple[int, float]]
+    ends: list[int]
+
+
+def _replay(config: TrainConfig, steps: int, arrived: np.ndarray) -> Replay:
+    """Replays `steps` steps of one environment, which is done where `arrived` says."""
+    algo = config.algo
+    assert algo.std_interval is not None
+    assert algo.std_decrement is not None
+    assert algo.std_floor is not None
+    std, time_step, stds, updates, ends = algo.initial_std, 0, np.zeros(steps), [], []
+    while time_step < steps:
+        for _ in range(config.task.step_limit):
+            stds[time_step] = std
+            done = arrived[time_step]
+            time_step += 1
+            if time_step % algo.rollout == 0:
+                updates.append((time_step, std))
+            if time_step % algo.std_interval == 0:
+                std = max(round(std - algo.std_decrement, 4), algo.std_floor)
+            if done or time_step == steps:
+                break
+        ends.append(time_step - 1)
+    return Replay(stds, updates, ends)
+
+
+def test_the_deviation_of_every_one_of_a_million_steps() -> None:
+    steps = 1_000_000
+    replay = _replay(PAPER, steps, np.zeros(steps, bool))
+    found = exploration.scheduled_std(PAPER.algo, jnp.arange(steps))
+    np.testing.assert_array_equal(found, replay.std.astype(np.float32))
+    counts = np.unique(replay.std, return_counts=True)
+    assert [each.tolist() for each in counts] == [[0.45, 0.5, 0.55, 0.6], [250_000] * 4]
+
+
+def test_the_updates_of_a_million_steps() -> None:
+    replay = _replay(PAPER, PAPER.budget, np.zeros(PAPER.budget, bool))
+    assert PAPER.updates == len(replay.updates) == 166
+    made = [(i + 1) * PAPER.arenas * PAPER.algo.rollout for i in range(PAPER.updates)]
+    assert made == [step for step, _ in replay.updates]
+    # An update learns with the deviation of its rollout's last step; one that falls together with
+    # a step down, as at 750,000, comes first.
+    last = exploration.scheduled_std(PAPER.algo, jnp.array(made) - 1)
+    np.testing.assert_array_equal(last, np.float32([std for _, std in replay.updates]))
+    assert (750_000, 0.5) in replay.updates
+
+
+def _drive(config: TrainConfig, updates: int) -> dict[str, np.ndarray]:
+    """Drives one arena for so many rollouts, learning nothing; [updates, T, ...] of each step."""
+    program, schedule = loop.load(config)
+    state = jax.jit(partial(loop.init, program))(schedule)
+    rounds = jax.jit(lambda s: jax.lax.scan(partial(_round, program, schedule), s, length=updates))
+    _, found = rounds(state)
+    return jax.tree.map(np.asarray, found)
+
+
+def _round(
+    program: Program, schedule: curriculum.Schedule, state: TrainState, _: None
+) -> tuple[TrainState, dict[str, jax.Array]]:
+    """One rollout as in `loop.update`, and what is needed to see with which deviation."""
+    config, world = program.config, program.world
+    key, level_key, rollout_key = jax.random.split(state.key, 3)
+    index = jnp.zeros(rollout.waiting(config.algo.rollout), jnp.int32)
+    starts = rollout.draw_starts(world, schedule.stages, index, jnp.int32(0), level_key)
+    arenas, path, ended = rollout.collect(world, state.learners, state.arenas, starts, rollout_key)
+    learners = rollout.explore(world, state.learners, config.algo.rollout)
+    mean = jax.vmap(lambda one, seen: loop.ppo.mode(one, config.algo, seen), in_axes=(0, 1))(
+        learners, path.observation
+    )
+    found = {
+        "square": jnp.sum((path.action[:, 0, 0, 0] - mean[0, :, 0, 0]) ** 2, axis=-1),
+        "log_prob": path.log_prob[:, 0, 0, 0],
+        "done": ended.episodes[:, 0],
+        "arrived": ended.all_reached[:, 0],
+        "cohort": ended.cohort[:, 0],
+        "std": jnp.exp(learners.params["actor"]["log_std"][0, 0]),
+    }
+    return replace(state, learners=learners, arenas=arenas, key=key), found
+
+
+def _check_run(config: TrainConfig, updates: int) -> None:
+    """Drives, and compares every step with the replay."""
+    steps = updates * config.algo.rollout
+    found = _drive(config, updates)
+    path = {name: found[name].reshape(-1) for name in ("square", "log_prob", "done", "arrived")}
+    replay = _replay(config, steps, path["arrived"].astype(bool))
+    assert np.flatnonzero(path["done"]).tolist() in (replay.ends, replay.ends[:-1])
+    # Both kinds of end, or nothing is tested; every episode counts for the curriculum.
+    assert 0 < path["arrived"].sum() < path["done"].sum()
+    assert set(found["cohort"].ravel()) <= {-1, 0}
+    # The density of a normal of two dimensions tells the deviation; float32.
+    std = replay.std
+    log_prob = -path["square"] / (2 * std**2) - 2 * np.log(std) - np.log(2 * np.pi)
+    np.testing.assert_allclose(path["log_prob"], log_prob, atol=2e-4)
+    # Deviations are kept as logarithms in float32.
+    np.testing.assert_allclose(found["std"], [std for _, std in replay.updates], rtol=1e-6)
+
+
+def _config(scale: int) -> TrainConfig:
+    """The paper's numbers of steps divided by `scale`: one robot, with a target nearby."""
+    algo = replace(PAPER.algo, rollout=6000 // scale, std_interval=250_000 // scale)
+    return replace(
+        PAPER,
+        stage=(StageConfig(name="one", robots=1, side=0.4),),
+        stage_name="one",
+        task=replace(PAPER.task, step_limit=1500 // scale, target_radius=0.1),
+        sim=SimConfig(impl="jax", max_robots=1, max_obstacles=0),
+        algo=algo,
+        budget=10**6 // scale,
+    )
+
+
+def test_a_run_of_a_twentieth_of_the_steps() -> None:
+    _check_run(_config(20), 166)
+
+
+@pytest.mark.slow
+def test_a_run_of_a_million_steps() -> None:
+    _check_run(_config(1), 166)

@@ -1,0 +1,93 @@
+"""The preset's whole loop, with fewer steps of everything: two seeds side by side."""
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from swarmjax import export, loop, policy, seeds
+from swarmjax.checkpoint import to_leaves
+from swarmjax.config import TrainConfig, load_train
+from swarmjax.ppo import learner as ppo
+
+ROLLOUT, LIMIT, UPDATES = 128, 32, 8
+KERNEL = "learners/params/actor/mean/kernel"
+
+
+@pytest.fixture(scope="module")
+def config() -> TrainConfig:
+    paper = load_train(["algo=paper", "sim.impl=jax"])
+    return replace(
+        paper,
+        stage=paper.stage[1:3],  # of two robots and of three, with the fence
+        sim=replace(paper.sim, max_robots=3, max_obstacles=1),
+        algo=replace(paper.algo, hidden=(8,), rollout=ROLLOUT, epochs=3, std_interval=250),
+        # Nobody arrives in so short a time, so that promotion is by the deadline.
+        task=replace(paper.task, step_limit=LIMIT),
+        curriculum=replace(paper.curriculum, exploration="reset"),
+        budget=ROLLOUT * UPDATES,
+        seeds=2,
+    )
+
+
+def test_it_trains_and_judges_in_one_trace(config: TrainConfig) -> None:
+    program, schedule = loop.load(config)
+    traces = []
+
+    def chunk(state: loop.TrainState, n: np.int32) -> tuple[loop.TrainState, dict]:
+        traces.append(None)
+        return seeds.train_chunk(program, schedule, state, n)
+
+    start = jax.jit(partial(seeds.init, program))(schedule)
+    run = jax.jit(chunk)
+    early, first = run(start, np.int32(3))
+    state, rest = run(early, np.int32(5))
+    found = {
+        name: np.concatenate([first[name][:, :3], rest[name][:, :5]], axis=1) for name in first
+    }
+    assert len(traces) == 1
+    # Four episodes of 32 steps in a rollout of 128. The first one after the promotion had begun
+    # before it, on the stage that was left.
+    assert found["episodes"].tolist() == [[4, 4, 4, 4, 3, 4, 4, 4]] * 2
+    # Every one counts, and is judged an update later with all that began in the same one; with
+    # those of the first update there is the one that the run began with.
+    assert found["episodes_by_stage"][:, 1:4, 0].tolist() == [[5, 4, 4]] * 2
+    # Half of the eight updates for the first stage of two.
+    assert found["stage"].tolist() == [[0] * 4 + [1] * 4] * 2
+    # Each level for 250 steps: the updates end with the steps 127, 255, 383 and 511. The promotion
+    # then begins it anew, as told here. Logarithms in float32.
+    std = [0.6, 0.55, 0.55, 0.5] * 2
+    np.testing.assert_allclose(found["std"], [std] * 2, rtol=1e-6)
+    for name in ("policy_loss", "value_loss", "grad_norm"):
+        assert np.isfinite(found[name]).all()
+    before, middle, after = (to_leaves(each)[KERNEL] for each in (start, early, state))
+    # Two of three robots are there at first: the learner of the third stands still.
+    assert (np.abs(middle - before).max(axis=(2, 3)) > 1e-5).tolist() == [[True, True, False]] * 2
+    assert (np.abs(after - middle).max(axis=(2, 3)) > 1e-5).all()
+    assert not np.array_equal(after[0], after[1])  # seeds
+    # No normaliser: it has counted nothing.
+    assert not to_leaves(state)["learners/normalizer/count"].any()
+    assert to_leaves(state)["learners/explored"].tolist() == [[512] * 3] * 2
+
+
+def test_an_exported_policy_has_the_output_of_tanh(config: TrainConfig, tmp_path: Path) -> None:
+    program, schedule = loop.load(config)
+    state = jax.jit(partial(seeds.init, program))(schedule)
+    # As drawn the last layer is small; ten times as large, tanh bends it.
+    actor = state.learners.params["actor"]
+    actor = {**actor, "mean": jax.tree.map(lambda x: 10.0 * x, actor["mean"])}
+    learners = state.learners.replace(params={**state.learners.params, "actor": actor})
+    state = state.replace(learners=learners)
+    leaves = {name: np.asarray(leaf) for name, leaf in to_leaves(state).items()}
+    export.write_policy(tmp_path / "p.npz", leaves, config, update=0, seed=1)
+    observation = np.random.default_rng(0).uniform(0.0, 1.0, (5, 3, 10)).astype(np.float32)
+    found = policy.mean_action(policy.load(tmp_path / "p.npz"), observation)
+    second = jax.tree.map(lambda x: x[1], learners)
+    mode = jax.vmap(partial(ppo.mode, config=config.algo))
+    expected = mode(second, observation=observation.swapaxes(0, 1)).swapaxes(0, 1)
+    # float32, in two libraries.
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert np.abs(expected).max() > 0.5

@@ -1,0 +1,91 @@
+"""Policies that steer by bearing, and what they do on small stages, for the tests of replays."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import policies
+
+from swarmjax import cells, config, evaluate_judge, evaluate_run, replay_record
+from swarmjax.config import ReplayConfig
+from swarmjax.evaluate_judge import Judge
+from swarmjax.replay_record import Episode, Recording, Scene
+from swarmjax.task import observation
+
+# Action of a policy by hand: at bearing 0, and what each radian to the left and right adds.
+STEER = ((1.0, 0.0), (-2.0, 2.0), (-2.0, -2.0))
+AHEAD = ((1.0, 0.0), (0.0, 0.0), (0.0, 0.0))
+SMALL = ("stage.robots=3", "stage.side=0.9", "stage.obstacles=2")
+
+
+def steering(path: Path, drive: tuple = STEER, **changes: Any) -> Path:
+    """Writes a policy of one hidden layer, relu(bearing) and relu(-bearing)."""
+    bearing = np.zeros((1, observation.SIZE, 2))
+    bearing[0, observation.NAMES.index("target_bearing")] = [1.0, -1.0]
+    zero = np.zeros((1, observation.SIZE))
+    arrays = {
+        "actor/hidden_0/kernel": bearing,
+        "actor/hidden_0/bias": zero[:, :2],
+        "actor/mean/kernel": np.array([drive[1:]]),
+        "actor/mean/bias": np.array([drive[0]]),
+        "actor/log_std": zero[:, :2],
+        "normalizer/mean": zero,
+        "normalizer/std": zero + 1.0,
+    }
+    given = {name: array.astype(np.float32) for name, array in arrays.items()}
+    policies.saved(path, given, activation="relu", config={}, **changes)
+    return path
+
+
+def judge(settings: ReplayConfig) -> Judge:
+    """The judge of the first policy on the stage of a replay."""
+    cell = cells.load(settings.evaluation).cells[0]
+    (entrant,) = evaluate_run.read_policies(settings.policies[:1])
+    return evaluate_judge.load(settings.evaluation, entrant.policy, cell.half)
+
+
+def recorded(path: Path, *words: str) -> tuple[Judge, list[Recording]]:
+    """Records the levels of a replay with the first policy."""
+    settings = config.load_replay([f"policy={path}", *words])
+    found = judge(settings)
+    levels = cells.split(cells.load(settings.evaluation).cells[0].levels)
+    return found, replay_record.record(found, [levels[number] for number in settings.levels])
+
+
+def wandering(robots: int, frames: int, seed: int = 0) -> Recording:
+    """A recording that is hard to pack: all but what stands still is random at every step.
+
+    A ray in fifty is lit, a robot in fifty touches something, and a contact in a hundred begins.
+    """
+    draw = np.random.default_rng(seed)
+    stride = draw.uniform(-4e-3, 4e-3, (frames, robots, 2))  # m; full speed for a control step
+    turn = draw.uniform(-0.1, 0.1, (frames, robots, 1))  # rad; full turn rate likewise
+    lit = draw.random((frames, robots, 8)) < 0.02
+    begins = draw.random((frames, robots, 3)) < 0.01 / 3
+    earning = {
+        "progress": stride[..., 0],
+        "proximity": -0.001 * lit.any(axis=-1),
+        "arrival": np.zeros((frames, robots)),
+        "contact": -0.02 * begins.sum(axis=-1),
+        "time": np.full((frames, robots), -1e-3),
+    }
+    return Recording(
+        scene=Scene(
+            side=1.2,
+            target=draw.uniform(-0.5, 0.5, (robots, 2)),
+            box=np.array([[0.1, -0.2, 0.3, 0.05, 0.05]]),
+            sensor=np.tile([0.03, 0.01, 1.0, 0.0], (robots, 8, 1)),
+        ),
+        pose=np.concatenate([stride, turn], axis=-1).cumsum(axis=0),
+        ray=np.where(lit, draw.uniform(0.0, 0.04, lit.shape), 0.04),
+        distance=np.ones((frames, robots)),
+        reward=earning,
+        touching=draw.random((frames, robots, 3)) < 0.02 / 3,
+        contacts=begins.cumsum(axis=0),
+        arrival=np.zeros(robots, int),
+    )
+
+
+def episode(*runs: Recording, level: int = 0) -> Episode:
+    """An episode of these runs."""
+    return Episode(f"level {level}", level, list(runs))

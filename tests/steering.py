@@ -1,0 +1,54 @@
+"""Policies written by hand, which steer by the bearing of their target alone."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from policies import EMBODIMENT
+
+from swarmjax import policy_file
+from swarmjax.task import observation
+
+SPEED = 0.1256  # m/s, the largest command
+STEP = 0.032  # s, a control step
+STRIDE = SPEED * STEP  # m; the servo has the speed within one control step
+# Action of a policy by hand: at bearing 0, and what each radian to the left and right adds.
+STEER = ((1.0, 0.0), (-2.0, 2.0), (-2.0, -2.0))
+AHEAD = ((1.0, 0.0), (0.0, 0.0), (0.0, 0.0))
+STAY = ((-1.0, 0.0), (0.0, 0.0), (0.0, 0.0))
+SPIN = ((-1.0, 1.0), (0.0, 0.0), (0.0, 0.0))
+
+
+def write(path: Path, drive: tuple = STEER, learners: int = 1, **meta: Any) -> Path:
+    """Writes a policy of one hidden layer, relu(bearing) and relu(-bearing)."""
+    bearing = np.zeros((1, observation.SIZE, 2))
+    bearing[0, observation.NAMES.index("target_bearing")] = [1.0, -1.0]
+    zero = np.zeros((1, observation.SIZE))
+    arrays = {
+        "actor/hidden_0/kernel": bearing,
+        "actor/hidden_0/bias": zero[:, :2],
+        "actor/mean/kernel": np.array([drive[1:]]),
+        "actor/mean/bias": np.array([drive[0]]),
+        "actor/log_std": zero[:, :2],
+        "normalizer/mean": zero,
+        "normalizer/std": zero + 1.0,
+    }
+    arrays = {n: np.repeat(a, learners, 0).astype(np.float32) for n, a in arrays.items()}
+    full = {
+        "policy": "shared",
+        "learners": learners,
+        "activation": "relu",
+        "observation": observation.describe("metric") | {"limit": 10.0},
+        "action": {
+            "names": ["speed", "turn_rate"],
+            "units": ["m/s", "rad/s"],
+            "low": [0.0, -3.14],
+            "high": [SPEED, 3.14],
+        },
+        "config": {},
+        **EMBODIMENT,
+        "versions": {},
+        "update": 0,
+    }
+    policy_file.write(path, arrays, full | meta)
+    return path

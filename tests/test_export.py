@@ -1,0 +1,244 @@
+"""The command that exports: which policy, in which form, where to, and what it refuses."""
+
+import hashlib
+import json
+import re
+import sys
+from pathlib import Path
+
+import policies
+import pytest
+from policies import saved
+from sentences import refusal
+
+from swarmjax import command, config, export, export_folder, policy_file
+from swarmjax.config import ConfigError, ExportConfig, TrainConfig
+
+FORMATS = {"npz": "policy.npz", "onnx": "policy.onnx", "c": "policy_c", "webots": "swarmjax_epuck"}
+
+
+def _refusal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str
+) -> str:
+    """Runs the command and returns the sentence with which it is refused."""
+    monkeypatch.setattr(sys, "argv", ["export", *words])
+    capsys.readouterr()
+    assert command.run("export", export.main, ExportConfig) == command.USER_ERROR
+    said = capsys.readouterr()
+    assert (said.out, said.err.count("\n")) == ("", 1)
+    return said.err
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.mark.parametrize("form", ["onnx", "c", "webots"])
+def test_a_policy_file_is_exported_beside_itself(
+    form: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if form == "onnx":
+        pytest.importorskip("onnx", reason="needs the package onnx")
+    path = tmp_path / "policy.npz"
+    saved(path)
+    assert export.main([f"policy={path}", f"format={form}"]) == 0
+    out = tmp_path / FORMATS[form]
+    assert capsys.readouterr().out == f"{out}: the policy of {path}.\n"
+    assert {found.name for found in tmp_path.iterdir()} == {"policy.npz", FORMATS[form]}
+    # Once more, somewhere else and in the same place: the same bytes.
+    other = tmp_path / "other" / FORMATS[form]
+    assert export.main([f"policy={path}", f"format={form}", f"out={other}"]) == 0
+    once = _digests(tmp_path / "other")
+    assert export.main([f"policy={path}", f"format={form}", f"out={other}"]) == 0
+    assert _digests(tmp_path / "other") == once
+    if form == "onnx":
+        assert other.read_bytes() == out.read_bytes()
+    else:
+        assert _digests(out) == _digests(other)
+
+
+def test_a_policy_file_is_copied_as_it_is(tmp_path: Path) -> None:
+    path, out = tmp_path / "policy.npz", tmp_path / "far" / "copy.npz"
+    saved(path)
+    assert export.main([f"policy={path}", f"out={out}"]) == 0
+    assert out.read_bytes() == path.read_bytes()
+
+
+def test_the_policy_says_what_it_was_trained_with(tmp_path: Path) -> None:
+    trained = config.load_train(
+        ["stage=s1", "robot=wheeled_v2", "realism=real", "task.control_step=0.064", "seed=4"]
+    )
+    said = export.policy_meta(trained, update=7, seed=4)
+    assert said["robot"] == {
+        "preset": "wheeled_v2",
+        "body": "wheeled",
+        "wheel_radius": 0.02,
+        "track": 0.052,
+        "max_wheel_speed": 7.536,
+    }
+    assert said["sensors"] == {"preset": "real", "response": "real", "range": 0.04}
+    assert said["task"] == {"control_step": 0.064, "target_radius": 0.05}
+    assert said["observation"]["encoding"] == "metric"
+    assert (said["update"], said["seed"]) == (7, 4)
+    assert config.build(TrainConfig, said["config"]) == trained
+    policy_file.write(tmp_path / "policy.npz", policies.arrays(), said)  # refuses nothing of it
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        ([], "planar"),
+        (["robot=wheeled"], "wheeled"),
+        (["robot=planar_v2"], "planar_v2"),
+        (["robot.mass=0.2"], "custom"),
+    ],
+)
+def test_a_robot_is_named_by_the_file_that_has_its_numbers(words: list[str], name: str) -> None:
+    trained = config.load_train(["stage=s1", *words])
+    assert export.policy_meta(trained, 0, 0)["robot"]["preset"] == name
+
+
+def test_export_refuses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "policy.npz"
+    saved(path)
+    (tmp_path / "file").write_text("mine")
+    given = f"policy={path}"
+    for words, sentence in {
+        (): "run is null and policy is null: give one of them, as in run=runs/a or",
+        (given, "out=copy.npy"): "out is copy.npy, but format is npz: end it in .npz.",
+        (given, "format=onnx", "out=a"): "out is a, but format is onnx: end it in .onnx.",
+        (given, "format=webots", "out=a b"): "out is a b, whose name is also the controller's: ",
+        (given, "format=c", f"out={tmp_path / 'file'}"): "file, a file: give a folder.",
+        (given, "format=c", f"out={tmp_path / 'file' / 'c'}"): "which cannot be written: Not a d",
+        (given, f"out={tmp_path / 'file' / 'a.npz'}"): "which cannot be written: ",
+        (given, "format=c", "out=."): "out is ., which others use too: give a name of its own.",
+        (given, "format=webots", "out=a/.."): "out is a/.., which others use too: give a name ",
+        **{
+            (given, "format=webots", f"out={tmp_path / name}"): (
+                f"{name}, whose name is also the controller's, and that of a module that it imports"
+            )
+            for name in ("policy", "controller", "numpy", "json", "random", "zipfile")
+        },
+        ("policy=none.npz", "format=c"): "none.npz is no file: give the path of a policy.npz.",
+    }.items():
+        assert sentence in _refusal(monkeypatch, capsys, *words)
+    assert {found.name for found in tmp_path.iterdir()} == {"policy.npz", "file"}
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_export_says_what_onnx_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "policy.npz"
+    saved(path)
+    monkeypatch.setitem(sys.modules, "onnx", None)  # as if it were not installed
+    sentence = _refusal(monkeypatch, capsys, f"policy={path}", "format=onnx")
+    assert "the package onnx is not installed: run uv sync --extra onnx." in sentence
+    assert [found.name for found in tmp_path.iterdir()] == ["policy.npz"]
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, "[]", "{", "\xff"])
+def test_a_config_that_is_none_is_refused(content: str, tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(content, encoding="latin-1")
+    sentence = refusal(export.read_config, tmp_path)
+    assert str(tmp_path / "config.json") in sentence
+
+
+def test_a_step_is_named_in_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trained = config.load_train(["stage=s1"])
+    (tmp_path / "config.json").write_text(json.dumps(config.to_dict(trained)))
+    final = tmp_path / "policy.npz"
+    before = saved(final)
+    monkeypatch.setattr(export.checkpoint, "restore", lambda run, step: ({}, step, []))
+    monkeypatch.setattr(
+        export,
+        "write_policy",
+        lambda path, leaves, trained, update, seed: saved(path, update=update),
+    )
+    assert export.main([f"run={tmp_path}", "step=100"]) == 0
+    assert policy_file.read(tmp_path / "policy-step100.npz").meta["update"] == 100
+    assert policy_file.read(final).digest == before.digest
+    assert export.main([f"run={tmp_path}", "step=100", "format=c"]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "config.json", "policy.npz", "policy-step100.npz", "policy_c-step100"
+    }  # fmt: skip
+
+
+# Folders
+
+
+def test_a_folder_is_replaced_only_as_it_was_exported(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    export_folder.write_folder(out, {"a": b"1", "b": b"2"})
+    (out / "build").mkdir()
+    (out / "build" / "a.o").write_bytes(b"made of a")
+    export_folder.write_folder(out, {"a": b"3"})
+    assert {path.name: path.read_bytes() for path in out.iterdir() if path.name != "export.json"} \
+        == {"a": b"3"}  # fmt: skip
+    assert json.loads((out / "export.json").read_text()) == {"a": hashlib.sha256(b"3").hexdigest()}
+    (out / "a").write_bytes(b"changed by hand")
+    with pytest.raises(ConfigError, match=r"out, where a is not as an export left it: "):
+        export_folder.write_folder(out, {"a": b"4"})
+    assert (out / "a").read_bytes() == b"changed by hand"
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("thesis.tex", b"words"), ("export.json", b"[]"), ("export.json", b"{"), ("a", b"1")],
+)
+def test_a_folder_of_somebody_elses_is_left_alone(
+    name: str, content: bytes, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ConfigError, match=rf", where {re.escape(name)} is not as an export left"):
+        export_folder.write_folder(tmp_path, {"a": b"1"})
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {name: content}
+
+
+def test_a_link_in_an_export_is_not_followed(tmp_path: Path) -> None:
+    out, precious = tmp_path / "out", tmp_path / "precious"
+    export_folder.write_folder(out, {"a": b"1"})
+    precious.write_bytes(b"1")
+    (out / "a").unlink()
+    (out / "a").symlink_to(precious)
+    with pytest.raises(ConfigError, match=r", where a is not as an export left it"):
+        export_folder.write_folder(out, {"a": b"2"})
+
+
+def test_a_folder_whose_writing_breaks_off_is_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    export_folder.write_folder(out, {"a": b"1"})
+    before, rename = _digests(tmp_path), Path.rename
+
+    def crash(self: Path, target: Path) -> Path:
+        if self.name.endswith(".new"):
+            raise KeyboardInterrupt
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", crash)
+    with pytest.raises(KeyboardInterrupt):
+        export_folder.write_folder(out, {"a": b"2"})
+    assert _digests(tmp_path) == before
+
+
+def test_a_file_whose_writing_breaks_off_is_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    export_folder.write_file(tmp_path / "a", b"1")
+
+    def crash(_: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("os.fsync", crash)
+    with pytest.raises(KeyboardInterrupt):
+        export_folder.write_file(tmp_path / "a", b"2")
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a": b"1"}

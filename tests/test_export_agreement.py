@@ -1,0 +1,95 @@
+"""Flax, NumPy, ONNX and compiled C compute the same actions."""
+
+import ctypes
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import policies
+import pytest
+from policies import Arrays, saved, several
+
+from swarmjax import export_c, export_folder, export_onnx, policy
+from swarmjax.config import AlgoConfig
+from swarmjax.policy import Policy
+from swarmjax.ppo import networks, normalizer
+
+OBSERVATIONS = 10_000
+# What is asked for. Sums of 64 float32 terms differ in their order alone: actions up to 2.5 units
+# (tanh) by 1.1e-6, those up to 16 (relu, swish) by 8.2e-6, where 2 units span all commands.
+TOLERANCE = 1e-5
+Activation = Literal["tanh", "relu", "swish"]
+
+
+def _by_flax(arrays: Arrays, activation: Activation, seen: np.ndarray) -> np.ndarray:
+    """Actions [B, R, U] of the networks that were trained, robot i by learner i."""
+    config = AlgoConfig(activation=activation)
+
+    def act(mine: dict[str, jax.Array], observation: jax.Array) -> jax.Array:
+        def layer(name: str) -> dict[str, jax.Array]:
+            return {part: mine[f"actor/{name}/{part}"] for part in ("kernel", "bias")}
+
+        torso = {f"hidden_{i}": layer(f"hidden_{i}") for i in range(len(config.hidden))}
+        actor = {"torso": torso, "mean": layer("mean"), "log_std": mine["actor/log_std"]}
+        moments = normalizer.Normalizer(
+            count=jnp.ones(()),
+            mean=mine["normalizer/mean"],
+            variance=mine["normalizer/std"] ** 2,
+        )
+        features = normalizer.normalize(moments, observation, 10.0)
+        return networks.action_distribution({"actor": actor}, config, features)[0]
+
+    mapped = jax.jit(jax.vmap(act, in_axes=(0, 1), out_axes=1))
+    return np.asarray(mapped({name: jnp.asarray(array) for name, array in arrays.items()}, seen))
+
+
+def _by_onnx(trained: Policy, seen: np.ndarray) -> np.ndarray:
+    pytest.importorskip("onnx", reason="needs the package onnx")
+    runtime = pytest.importorskip("onnxruntime", reason="needs the package onnxruntime")
+    session = runtime.InferenceSession(
+        export_onnx.render(trained), providers=["CPUExecutionProvider"]
+    )
+    fed = seen[:, 0] if trained.is_shared else seen
+    (action,) = session.run(["action"], {"observation": fed})
+    return action.reshape(*seen.shape[:2], -1)
+
+
+def _by_c(trained: Policy, seen: np.ndarray, folder: Path) -> np.ndarray:
+    export_folder.write_folder(folder, export_c.render(trained))
+    flags = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC")
+    built = [*("gcc", *flags, "policy.c", "-lm", "-o", "policy.so")]
+    subprocess.run(built, cwd=folder, check=True)
+    act = ctypes.CDLL(str(folder / "policy.so")).policy_action
+    action = np.zeros((*seen.shape[:2], 2), np.float32)
+    into = ctypes.c_void_p
+    width, step, size = seen.shape[2] * 4, 8, seen.shape[1]
+    source, target = seen.ctypes.data, action.ctypes.data
+    for i in range(seen.shape[0] * size):
+        act(i % size, into(source + i * width), into(target + i * step))
+    return action
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs Debian's package gcc")
+@pytest.mark.parametrize("learners", [1, 3])
+@pytest.mark.parametrize("activation", ["tanh", "relu", "swish"])
+def test_all_forms_of_a_policy_agree(activation: Activation, learners: int, tmp_path: Path) -> None:
+    arrays = policies.arrays(hidden=AlgoConfig().hidden, learners=learners)
+    given = several(learners)
+    trained = saved(tmp_path / "policy.npz", arrays, activation=activation, **given)
+    seen = policies.seen(trained, OBSERVATIONS)
+    clipped = np.abs((seen - trained.mean) / trained.std) > 10
+    assert 0.1 < clipped.mean() < 0.5
+    expected = policy.mean_action(trained, seen)
+    assert 1 < np.abs(expected).max() < 20
+    found = {
+        "Flax": _by_flax(arrays, activation, seen),
+        "ONNX": _by_onnx(trained, seen),
+        "C": _by_c(trained, seen, tmp_path / "c"),
+    }
+    for name, action in found.items():
+        assert action.dtype == np.float32
+        np.testing.assert_allclose(action, expected, rtol=0, atol=TOLERANCE, err_msg=name)

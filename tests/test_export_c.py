@@ -1,0 +1,154 @@
+"""The C files: they build without a warning, hold themselves to NumPy, and fit on the robot."""
+
+import ctypes
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import policies
+import pytest
+from policies import saved, several
+
+from swarmjax import epuck, export_c, export_folder, policy
+from swarmjax.config import AlgoConfig, RobotConfig
+from swarmjax.policy import Policy
+from swarmjax.sim import drive
+
+STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wshadow",
+          "-Wconversion", "-Wdouble-promotion")  # fmt: skip
+CORTEX_M4F = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
+HIDDEN = AlgoConfig().hidden
+
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs Debian's package gcc")
+needs_arm = pytest.mark.skipif(
+    shutil.which("arm-none-eabi-gcc") is None,
+    reason="needs Debian's packages gcc-arm-none-eabi and libnewlib-arm-none-eabi",
+)
+
+
+def _written(folder: Path, trained: Policy) -> Path:
+    export_folder.write_folder(folder, export_c.render(trained))
+    return folder
+
+
+def _run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
+
+
+@needs_gcc
+@pytest.mark.parametrize("learners", [1, 3])
+@pytest.mark.parametrize("activation", ["tanh", "relu", "swish"])
+def test_it_builds_without_warnings_and_its_self_test_passes(
+    activation: str, learners: int, tmp_path: Path
+) -> None:
+    given = policies.arrays(hidden=(16, 7), learners=learners)
+    trained = saved(tmp_path / "p.npz", given, activation=activation, **several(learners))
+    folder = _written(tmp_path / "c", trained)
+    built = _run(folder, "gcc", *STRICT, "policy.c", "policy_test.c", "-lm", "-o", "self_test")
+    assert (built.returncode, built.stdout, built.stderr) == (0, "", "")
+    assert _run(folder, "./self_test").returncode == 0
+
+
+@needs_gcc
+def test_the_self_test_notices_a_changed_weight(tmp_path: Path) -> None:
+    folder = _written(tmp_path / "c", saved(tmp_path / "p.npz"))
+    source = (folder / "policy.c").read_text()
+    bias = re.search(r"BIAS_2\[POLICY_LEARNERS\]\[2\] = \{\n\{\n +(\S+)f,", source)
+    assert bias is not None
+    changed = source.replace(f"{bias[1]}f", f"{float(bias[1]) + 1e-4!r}f")
+    (folder / "policy.c").write_text(changed)
+    _run(folder, "gcc", "-std=c99", "policy.c", "policy_test.c", "-lm", "-o", "self_test")
+    assert _run(folder, "./self_test").returncode == 1  # the first case
+
+
+@needs_gcc
+def test_make_builds_and_runs_the_self_test(tmp_path: Path) -> None:
+    if shutil.which("make") is None:
+        pytest.skip("needs Debian's package make")
+    folder = _written(tmp_path / "c", saved(tmp_path / "p.npz"))
+    made = _run(folder, "make", "test")
+    assert (made.returncode, made.stderr) == (0, "")
+    assert made.stdout.endswith("policy_test: all actions agree\n")
+    export_folder.check_folder(folder)  # what was built does not keep an export from coming again
+
+
+@needs_gcc
+def test_from_quantities_to_wheel_speeds(tmp_path: Path) -> None:
+    layout = policies.meta()["observation"] | {
+        "encoding": "webots",
+        "offset": [*[0.0] * 9, -np.pi],
+        "scale": [*[1023.0] * 8, 1.5, 2 * np.pi],
+    }
+    trained = saved(tmp_path / "p.npz", observation=layout)
+    folder = _written(tmp_path / "c", trained)
+    _run(folder, "gcc", "-std=c99", "-O2", "-shared", "-fPIC", "policy.c", "-lm", "-o", "p.so")
+    library = ctypes.CDLL(str(folder / "p.so"))
+    draw = np.random.default_rng(0)
+
+    def call(function: str, given: np.ndarray, size: int) -> np.ndarray:
+        found = np.zeros((len(given), size), np.float32)
+        for row, result in zip(np.ascontiguousarray(given), found, strict=True):
+            pointers = (ctypes.c_void_p(array.ctypes.data) for array in (row, result))
+            getattr(library, function)(*pointers)
+        return found
+
+    quantity = draw.uniform(0, 500, (50, 10)).astype(np.float32)
+    expected = (quantity - np.float32(layout["offset"])) / np.float32(layout["scale"])
+    # The same operations on the same float32 numbers, here and in the two below.
+    np.testing.assert_array_equal(call("policy_observe", quantity, 10), expected)
+    action = draw.normal(size=(50, 2)).astype(np.float32)
+    command = policy.command(trained, action)
+    np.testing.assert_array_equal(call("policy_command", action, 2), command)
+    robot = drive.from_config(RobotConfig())
+    wheels = drive.wheel_speeds(command, robot, np)
+    assert (np.abs(wheels) == np.float32(epuck.MAX_WHEEL_SPEED)).any()  # the clamp is there
+    np.testing.assert_allclose(call("policy_wheel_speeds", command, 2), wheels, rtol=1e-6)
+
+
+@needs_arm
+def test_it_fits_on_a_cortex_m4f(tmp_path: Path) -> None:
+    given = policies.arrays(hidden=HIDDEN)
+    folder = _written(tmp_path / "c", saved(tmp_path / "p.npz", given))
+    gcc = ("arm-none-eabi-gcc", *CORTEX_M4F, *STRICT)
+    built = _run(folder, *gcc, "-fstack-usage", "-c", "policy.c", "-o", "policy.o")
+    assert (built.returncode, built.stderr) == (0, "")
+    listed = _run(folder, "arm-none-eabi-size", "policy.o").stdout.splitlines()[1].split()
+    text, data, bss = (int(word) for word in listed[:3])
+    assert (data, bss) == (0, 0)  # RAM is used on the stack alone
+    # Two layers of 64 between 10 and 2, the normaliser's 20 and the scaling of 20 numbers.
+    floats = 10 * 64 + 64 + 64 * 64 + 64 + 64 * 2 + 2 + 20 + 20
+    assert 4 * floats < text < 4 * floats + 1024
+    stack = (folder / "policy.su").read_text()
+    used = {line.split()[0].split(":")[-1]: int(line.split()[1]) for line in stack.splitlines()}
+    assert 2 * 64 * 4 <= used["policy_action"] < 2 * 64 * 4 + 128
+    # The whole self-test links with newlib, and asks of libm for no function in double precision.
+    whole = _run(
+        folder, *gcc, "--specs=nosys.specs", "policy.c", "policy_test.c", "-lm", "-o", "t.elf"
+    )
+    assert (whole.returncode, whole.stderr) == (0, "")
+    needed = _run(folder, "arm-none-eabi-nm", "--undefined-only", "policy.o").stdout.split()
+    assert set(needed) - {"U"} == {"tanhf"}
+
+
+def test_the_layout_stands_in_the_header(tmp_path: Path) -> None:
+    trained = saved(tmp_path / "p.npz")
+    header = export_c.render(trained)["policy.h"].decode()
+    assert f'#define POLICY_DIGEST "{trained.digest}"' in header
+    names = re.findall(r"^ \*   \[(\d)\] (\S+) +(\S+) +offset (\S+), scale (\S+)$", header, re.M)
+    layout = trained.meta["observation"]
+    assert [(name, unit) for _, name, unit, *_ in names] == list(
+        zip(layout["names"], layout["units"], strict=True)
+    )
+    assert re.search(r"^ \*   turn_rate +rad/s +-3\.14 to 3\.14$", header, re.M)
+
+
+def test_numbers_are_written_so_that_c_reads_the_same() -> None:
+    draw = np.random.default_rng(0)
+    bits = draw.integers(0, 2**32, 2000, dtype=np.uint32).view(np.float32)
+    bits = np.append(bits[np.isfinite(bits)], np.float32([0, -0.0, 1, 1e-45, 3.4028235e38]))
+    for value in bits:
+        text = export_c.number(value)
+        assert re.fullmatch(r"-?\d\.\d+e[+-]\d+f", text)  # a float constant of C99
+        assert np.float32(text[:-1]).tobytes() == value.tobytes()

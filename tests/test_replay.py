@@ -1,0 +1,289 @@
+"""The command: which levels it chooses, what it writes, and what it refuses."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import replays
+from sentences import refusal
+
+from swarmjax import cells, command, config, policy_file, replay
+from swarmjax.config import CellConfig, ReplayConfig, StageConfig
+from swarmjax.policy import PolicyError
+from swarmjax.replay import Pick
+
+ROOT = Path(replay.__file__).resolve().parents[1]
+QUICK = (*replays.SMALL, "steps=40", "workers=1")
+
+
+@pytest.fixture(scope="module")
+def steer(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return replays.steering(tmp_path_factory.mktemp("replay") / "steer.npz")
+
+
+def _trial(reached: list, contacts: list, time: list):
+    found = {
+        "targets_reached": np.array([reached]),
+        "contacts_per_robot": np.array([contacts]),
+        "episode_time_s": np.array([time]),
+    }
+    return SimpleNamespace(cell=SimpleNamespace(episodes=np.arange(len(reached))), found=found)
+
+
+def test_the_worst_reached_least_then_touched_most_then_took_longest():
+    trials = [
+        _trial([1.0, 0.4, 0.4, 0.4], [9.0, 1.0, 2.0, 1.0], [48.0, 48.0, 48.0, 30.0]),
+        _trial([0.4, 0.2], [1.0, 0.0], [48.0, 48.0]),
+    ]
+    order = [Pick(1, 1), Pick(0, 2), Pick(0, 1), Pick(1, 0), Pick(0, 3), Pick(0, 0)]
+    assert replay.worst(trials, 6) == order
+    assert replay.worst(trials, 2) == order[:2]
+
+
+def _labels(capsys: pytest.CaptureFixture[str]) -> str:
+    return capsys.readouterr().out.split(": ", 1)[1].rsplit(";", 1)[0]
+
+
+def test_levels_are_written_in_the_order_in_which_they_were_named(steer, tmp_path, capsys):
+    out = tmp_path / "new" / "a.html"
+    assert replay.main([f"policy={steer}", *QUICK, "level=3,1", f"out={out}"]) == 0
+    assert _labels(capsys) == "level 3; level 1"
+    assert out.read_text().startswith("<!DOCTYPE html>")
+
+
+def test_the_worst_are_replayed(steer, tmp_path, capsys):
+    words = [f"policy={steer}", *QUICK, "steps=150", "episodes=8"]
+    _, every = replays.recorded(steer, *words[1:], "level=0,1,2,3,4,5,6,7")
+    reached = np.array([(each.arrival > 0).sum() for each in every])
+    contacts = np.array([each.contacts[-1].sum() for each in every])
+    frames = np.array([len(each.pose) for each in every])
+    assert len(set(zip(reached, contacts, frames, strict=True))) > 2  # there is something to tell
+    order = sorted(range(8), key=lambda i: (reached[i], -contacts[i], -frames[i], i))
+    assert replay.main([*words, "worst=3", f"out={tmp_path / 'a.html'}"]) == 0
+    assert _labels(capsys) == "; ".join(f"level {i}" for i in order[:3])
+
+
+def test_policies_replay_the_same_levels(steer, tmp_path):
+    ahead = replays.steering(tmp_path / "ahead.npz", replays.AHEAD)
+    settings = config.load_replay([f"policy={steer},{ahead}", *QUICK, "level=2", "shape=cross"])
+    entrants = replay.evaluate_run.read_policies(settings.policies)
+    progress = replay.Progress(disable=True)
+    (episode,) = replay.replay(settings, entrants, progress)
+    first, second = episode.runs
+    np.testing.assert_array_equal(first.pose[0], second.pose[0])
+    np.testing.assert_array_equal(first.scene.target, second.scene.target)
+    assert np.abs(first.pose[-1] - second.pose[-1]).max() > 0.01
+    assert len(first.scene.box) == 2 * 2  # a cross is two boxes
+
+
+@pytest.fixture
+def suite(tmp_path: Path) -> Path:
+    """Two cells, of one robot and of two."""
+    drawn = []
+    for robots in (1, 2):
+        stage = StageConfig(name=f"r{robots}", robots=robots, side=0.8)
+        numbers = (4, 0, 7)[: 4 - robots]
+        drawn.append(
+            cells.draw_cell(
+                CellConfig(
+                    name=stage.name,
+                    stage=stage,
+                    levels=len(numbers),
+                    episodes=numbers,
+                    seed=config.SUITE_SEED,
+                )
+            )
+        )
+    cells.write(tmp_path / "suite.npz", cells.Suite("mine", tuple(drawn)))
+    return tmp_path / "suite.npz"
+
+
+def test_the_worst_of_a_suite_are_replayed(steer, suite, tmp_path, capsys):
+    words = [f"policy={steer}", f"suite={suite}", f"out={tmp_path / 'a.html'}", "workers=1"]
+    assert replay.main([*words, "worst=5", "steps=1"]) == 0
+    # No one arrives or touches anything in a single step, so that they come as they stand.
+    assert _labels(capsys) == "; ".join(
+        ["r1, level 4", "r1, level 0", "r1, level 7", "r2, level 4", "r2, level 0"]
+    )
+    assert replay.main([*words, "cell=r2", "level=0", "steps=20"]) == 0
+    assert _labels(capsys) == "level 0"
+
+
+def test_only_levels_that_are_named_are_drawn(steer, monkeypatch):
+    words = [f"policy={steer}", *QUICK, "shape=cross", "seed=5", "robot.hull_radius=0.035"]
+    settings = config.load_replay([*words, "level=7,2"])
+    every = cells.load(settings.evaluation).cells[0]
+    drawn, draw = [], replay.evaluate_judge.draw_level
+
+    def count(stage, spacing, seed, episode):
+        drawn.append(episode)
+        return draw(stage, spacing, seed, episode)
+
+    monkeypatch.setattr(replay.evaluate_judge, "draw_level", count)
+    entrants = replay.evaluate_run.read_policies(settings.policies)
+    seven, two = replay.replay(settings, entrants, replay.Progress(disable=True))
+    assert drawn[:2] == [7, 2]
+    assert set(drawn[2:]) <= {0}  # which the engine is compiled with
+    levels = cells.split(every.levels)
+    for episode, number in ((seven, 7), (two, 2)):
+        scene, level = episode.runs[0].scene, levels[number]
+        np.testing.assert_array_equal(scene.target, level.target)
+        np.testing.assert_array_equal(scene.box, level.obstacle[level.obstacle_present])
+        # Float32 as drawn, and as the engine has it.
+        np.testing.assert_allclose(episode.runs[0].pose[0], level.start, atol=1e-6)
+
+
+def test_a_file_that_is_read_is_not_written_over(steer, suite, tmp_path):
+    page, film = tmp_path / "a.html", tmp_path / "a.mp4"
+    for path in (page, film):
+        path.write_bytes(steer.read_bytes())
+    same = f"{tmp_path}/../{tmp_path.name}/a"
+    for words, sentence in {
+        (f"policy={page}", f"out={same}.html"): f"out is {same}.html, which is given as another",
+        (f"policy={steer},{film}", f"out={tmp_path / 'b.html'}", f"video={film}"): (
+            f"video is {film}, which is given as another file: give a new name."
+        ),
+        (f"policy={steer}", f"out={steer}"): f"out is {steer}: give a name that ends with .html.",
+        (f"policy={steer}", f"out={page}", f"video={page}"): f"out is {page}, which is given as a",
+    }.items():
+        assert refusal(replay.main, [*words, *QUICK]).startswith(sentence)
+    for path in (page, film):
+        assert path.read_bytes() == steer.read_bytes()
+
+
+def test_a_page_whose_writing_breaks_off_is_as_it_was(steer, tmp_path, monkeypatch):
+    out = tmp_path / "a.html"
+    out.write_text("before")
+
+    def crash(_: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("os.fsync", crash)
+    with pytest.raises(KeyboardInterrupt):
+        replay.main([f"policy={steer}", *QUICK, f"out={out}"])
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a.html": "before"}
+
+
+def test_a_film_that_cannot_be_written_says_why(steer, tmp_path, monkeypatch):
+    def fail(*_: object) -> None:
+        raise OSError("ffmpeg ended")  # as imageio does, without a number
+
+    monkeypatch.setattr(replay.replay_video, "check", lambda: None)
+    monkeypatch.setattr(replay.replay_video, "write", fail)
+    film = tmp_path / "a.mp4"
+    words = [f"policy={steer}", *QUICK, f"out={tmp_path / 'a.html'}", f"video={film}"]
+    sentence = f"video is {film}, which cannot be written: ffmpeg ended."
+    assert refusal(replay.main, words) == sentence
+
+
+def test_what_a_suite_has_not_is_refused(steer, suite):
+    words = [f"policy={steer}", f"suite={suite}"]
+    for more, sentence in {
+        ("cell=r3",): "cell is 'r3': give one of r1, r2.",
+        ("worst=6",): f"worst is 6, but suite {suite} has 5 levels: give 1 to 5.",
+        ("worst=4", "cell=r1"): (
+            f"worst is 4, but suite {suite}, cell r1, has 3 levels: give 1 to 3."
+        ),
+        ("level=4",): f"suite {suite} has several cells: give worst=5, or cell=NAME of r1, r2.",
+        ("cell=r2", "level=7"): (
+            "level is 7, but cell r2 has the 2 levels 0 to 4: give one of them."
+        ),
+    }.items():
+        assert refusal(replay.main, [*words, *more]) == sentence
+    assert refusal(config.load_replay, [*words, "seed=3"]).startswith("seed cannot be given with")
+
+
+def test_defaults():
+    settings = config.load_replay(["policy=a.npz,b.npz"])
+    stage = config.load_evaluate(["policy=a"]).stage
+    assert settings == ReplayConfig(policy="a.npz,b.npz", stage=stage)
+    assert settings.policies == ("a.npz", "b.npz")
+    assert (settings.levels, settings.robot.body, settings.steps) == ((0,), "wheeled", 1500)
+    assert settings.evaluation.episodes == 1
+    assert config.load_replay(["policy=a", "worst=5"]).evaluation.episodes == 1000
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["level=1000"], "level is 1000, but episodes is 1000: give 0 to 999."),
+        (["level=x"], "level is 'x': give whole numbers with commas between them, as in 0,7,12."),
+        (["level=-1"], "level is '-1': give whole numbers with commas between them, as in 0,7,12."),
+        (["level=2,2"], "level is '2,2': give each level once, 100 at most."),
+        (["level=1", "worst=2"], "level is 1, but worst is 2: give one of the two."),
+        (["worst=6", "episodes=5"], "worst is 6, but episodes is 5: give 1 to 5."),
+        (["worst=0"], "worst is 0: give 1 to 100."),
+        (["cell=s6"], "cell is 's6', but suite is null: give suite=NAME."),
+        (["video_speed=0"], "video_speed is 0: give 0.05 to 100."),
+        (
+            ["stage=curriculum"],
+            "stage is curriculum, a curriculum: give one stage, as in stage=s6.",
+        ),
+    ],
+)
+def test_settings_are_refused(words, sentence):
+    assert refusal(config.load_replay, ["policy=a.npz", *words]) == sentence
+
+
+@pytest.mark.parametrize("policies", ["a,b,c", "a,", ",a"])
+def test_one_or_two_policies(policies):
+    assert refusal(config.load_replay, [f"policy={policies}"]) == (
+        f"policy is '{policies}': give one file, or two with a comma between them."
+    )
+
+
+def test_files_that_cannot_be_written_are_refused(steer, tmp_path):
+    (tmp_path / "file").write_text("")
+    words = [f"policy={steer}", *QUICK]
+    out = tmp_path / "file" / "a.html"
+    assert refusal(replay.main, [*words, f"out={out}"]) == (
+        f"out is {out}, which cannot be written: File exists."
+    )
+    folder = tmp_path / "b.html"
+    folder.mkdir()
+    assert refusal(replay.main, [*words, f"out={folder}"]) == (
+        f"out is {folder}, which cannot be written: it is a folder."
+    )
+    words += [f"out={tmp_path / 'a.html'}", "video=a.gif"]
+    assert refusal(replay.main, words) == "video is a.gif: give a name that ends with .mp4."
+    assert not (tmp_path / "a.html").exists()
+
+
+def test_a_policy_that_does_not_fit_is_refused(steer, tmp_path):
+    path = tmp_path / "two.npz"
+    trained = replays.policies.arrays(learners=2)
+    policy_file.write(path, trained, replays.policies.meta(**replays.policies.several(2)))
+    words = [f"policy={steer},{path}", *QUICK, f"out={tmp_path / 'a.html'}"]
+    with pytest.raises(PolicyError, match=r"two\.npz holds a network for each of 2 robots"):
+        replay.main(words)
+
+
+def test_a_mistake_ends_in_one_sentence_and_code_2(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["replay", "policy=none.npz"])
+    assert command.run("replay", replay.main, ReplayConfig) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("swarmjax.replay: error: none.npz ")
+    assert error.count("\n") == 1
+
+
+def test_it_runs_without_jax(steer, tmp_path):
+    code = (
+        "import sys, runpy\n"
+        "sys.modules.update(dict.fromkeys(['jax', 'flax', 'chex', 'mujoco.mjx', 'imageio']))\n"
+        f"sys.argv = ['replay', 'policy={steer}', *{QUICK}, 'out=a.html']\n"
+        "runpy.run_module('swarmjax.replay', run_name='__main__', alter_sys=True)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "a.html").exists()

@@ -1,0 +1,334 @@
+"""The page in a browser: Chromium without a window, from a file, without a network."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import replays
+
+from swarmjax import config, policy_file, replay_pack, replay_page
+from swarmjax.replay_record import Recording
+
+webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+from selenium.webdriver.chrome.service import Service  # noqa: E402
+from selenium.webdriver.common.action_chains import ActionChains  # noqa: E402
+from selenium.webdriver.common.keys import Keys  # noqa: E402
+from selenium.webdriver.support.ui import WebDriverWait  # noqa: E402
+
+CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+pytestmark = pytest.mark.skipif(
+    not (CHROMIUM and DRIVER), reason="needs Debian's chromium and chromium-driver"
+)
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+HOSTILE = "</script><script>document.title='in'</script>.npz"
+WORDS = (*replays.SMALL, "level=0,3", "steps=120")
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    options = webdriver.ChromeOptions()
+    options.binary_location = str(CHROMIUM)
+    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"performance": "ALL", "browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=Service(str(DRIVER)))
+    yield driver
+    driver.quit()
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[list[Recording]]:
+    """Two levels, by a policy that steers and by one that drives straight ahead."""
+    folder = tmp_path_factory.mktemp("policies")
+    steer = replays.steering(folder / "steer.npz")
+    ahead = replays.steering(folder / "ahead.npz", replays.AHEAD)
+    by_policy = [replays.recorded(path, *WORDS)[1] for path in (steer, ahead)]
+    return [list(each) for each in zip(*by_policy, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory, runs: list[list[Recording]]) -> Path:
+    """The page of both."""
+    folder = tmp_path_factory.mktemp("page")
+    settings = config.load_replay([f"policy={HOSTILE},ahead.npz", *WORDS])
+    trained = policy_file.read(replays.steering(folder / "steer.npz"))
+    episodes = [
+        replays.episode(*each, level=level)
+        for each, level in zip(runs, settings.levels, strict=True)
+    ]
+    path = folder / "replay.html"
+    path.write_text(replay_page.page(settings, [trained] * 2, episodes, "the command"))
+    return path
+
+
+def _open(browser: Any, file: Path, width: int = 1200, height: int = 900) -> None:
+    size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    for log in ("performance", "browser"):
+        browser.get_log(log)  # reading empties it
+    browser.get(file.as_uri())
+    WebDriverWait(browser, 20).until(lambda _: _js(browser, "!!window.replay?.ready"))
+
+
+def _js(browser: Any, expression: str, *arguments: Any) -> Any:
+    return browser.execute_script(f"return {expression}", *arguments)
+
+
+def _shade(browser: Any, kind: str, number: int = 0) -> int:
+    """How many colours a canvas shows."""
+    script = """
+      const canvas = document.querySelectorAll(arguments[0])[arguments[1]];
+      const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+      return new Set(new Uint32Array(data.buffer)).size;
+    """
+    return browser.execute_script(script, kind, number)
+
+
+def test_it_opens_from_a_file_and_asks_for_nothing_else(browser, file):
+    _open(browser, file)
+    _js(browser, "replay.play()")
+    _js(browser, "replay.open(1)")
+    seen = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
+    asked = {
+        each["params"]["request"]["url"]
+        for each in seen
+        if each["method"] == "Network.requestWillBeSent"
+    }
+    # The icon is empty, and inside the page.
+    assert asked - {"data:,"} == {file.as_uri()}
+    assert _js(browser, "performance.getEntriesByType('resource').map((each) => each.name)") == []
+    assert browser.get_log("browser") == []  # no errors, and nothing that the page forbids itself
+
+
+def test_positions_are_those_that_were_recorded(browser, file, runs):
+    _open(browser, file)
+    assert _js(browser, "replay.episodes") == 2
+    for number, both in enumerate(runs):
+        _js(browser, "replay.open(arguments[0])", number)
+        frames = max(len(run.pose) for run in both)
+        assert _js(browser, "replay.frames") == frames
+        for frame in (0, frames // 2, frames - 1):
+            _js(browser, "replay.seek(arguments[0])", frame)
+            assert _js(browser, "replay.frame") == frame
+            for i, run in enumerate(both):
+                row = min(frame, len(run.pose) - 1)
+                found = np.array(_js(browser, "replay.positions(undefined, arguments[0])", i))
+                error = np.abs(found - run.pose[row])
+                # Half of 0.2 mm and of 1 mrad, and what float64 makes of them.
+                assert error[:, :2].max() <= 1e-4 + 1e-9
+                assert error[:, 2].max() <= 5e-4 + 1e-9
+                _check_numbers(browser, run, frame, row, i)
+
+
+def _check_numbers(browser: Any, run: Recording, frame: int, row: int, i: int) -> None:
+    """Compares distances, rewards and rays."""
+    where = (frame, i)
+    distance = _js(browser, "replay.distances(...arguments)", *where)
+    # Position and target are off by half of 0.2 mm and by 5 um along each axis.
+    np.testing.assert_allclose(distance, run.distance[row], atol=1.05e-4 * 2**0.5)
+    reward = sum(term[: row + 1].sum(axis=0) for term in run.reward.values())
+    # Half of 1e-4 of each term, and what float64 makes of it.
+    found = _js(browser, "replay.rewards(...arguments)", *where)
+    np.testing.assert_allclose(found, reward, atol=0.5e-4 * len(run.reward) + 1e-9)
+    rays = np.array(_js(browser, "replay.rays(...arguments)", *where), float)  # null: nan
+    lit = run.ray[row] < 0.04
+    np.testing.assert_array_equal(~np.isnan(rays), lit)
+    assert (np.abs(rays - run.ray[row])[lit] <= 2.5e-4 + 1e-9).all()
+
+
+def test_robots_are_drawn_where_they_are(browser, file, runs):
+    _open(browser, file)
+    (run, _), frame = runs[0], 40
+    _js(browser, "replay.seek(arguments[0])", frame)
+    canvas = browser.find_element("css selector", ".arena").size
+    # 22 px are for the scale, and 12 mm of wall are shown all around.
+    scale = min(canvas["width"], canvas["height"] - 22) / (run.scene.side + 2 * 0.012)
+    for colour, (x, y, yaw) in zip(replay_pack.colours(3), run.pose[frame], strict=True):
+        # Well behind the middle of the robot, where there is neither its number nor its arrow.
+        x, y = x - 0.022 * np.cos(yaw), y - 0.022 * np.sin(yaw)
+        pixel = (canvas["width"] / 2 + scale * x, (canvas["height"] - 22) / 2 - scale * y)
+        script = """
+          const context = document.querySelector(".arena").getContext("2d");
+          return [...context.getImageData(arguments[0], arguments[1], 1, 1).data];
+        """
+        found = browser.execute_script(script, *map(round, pixel))
+        assert found == [*bytes.fromhex(colour[1:]), 255]
+
+
+def test_it_plays_to_the_last_frame(browser, file):
+    _open(browser, file)
+    _js(browser, "document.getElementById('speed').value = 16")
+    assert not _js(browser, "replay.playing")
+    _js(browser, "document.getElementById('play').click()")
+    assert _js(browser, "replay.playing")
+    WebDriverWait(browser, 20).until(lambda _: not _js(browser, "replay.playing"))
+    assert _js(browser, "replay.frame") == _js(browser, "replay.frames") - 1
+    last = _js(browser, "replay.frames") - 1
+    assert _js(browser, "document.getElementById('clock').textContent") == (
+        f"{last * 0.032:.2f} of {last * 0.032:.2f} s, step {last} of {last}"
+    )
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A page of 400 steps, 12.8 s, and of robots whose trails are cut after 10 s."""
+    folder = tmp_path_factory.mktemp("long")
+    settings = config.load_replay(["policy=a.npz"])
+    trained = policy_file.read(replays.steering(folder / "steer.npz"))
+    episodes = [replays.episode(replays.wandering(1, 401))]
+    path = folder / "replay.html"
+    path.write_text(replay_page.page(settings, [trained], episodes, "the command"))
+    return path
+
+
+def test_a_trail_is_drawn_beyond_its_ten_seconds(browser, long):
+    _open(browser, long)
+    script = """
+      const line = CanvasRenderingContext2D.prototype.lineTo;
+      let bad = 0, longest = 0, now = 0;
+      const begin = CanvasRenderingContext2D.prototype.beginPath;
+      CanvasRenderingContext2D.prototype.beginPath = function () { now = 0; begin.call(this); };
+      CanvasRenderingContext2D.prototype.lineTo = function (x, y) {
+        if (Number.isFinite(x) && Number.isFinite(y)) longest = Math.max(longest, ++now);
+        else bad++;
+        line.call(this, x, y);
+      };
+      const trails = document.getElementById("trails");
+      trails.selectedIndex = 1; // 10 s
+      replay.seek(400); // the chart's layer, whose curves are as long as the episode, is there
+      [bad, longest] = [0, 0];
+      trails.dispatchEvent(new Event("change"));
+      CanvasRenderingContext2D.prototype.lineTo = line;
+      CanvasRenderingContext2D.prototype.beginPath = begin;
+      return [bad, longest];
+    """
+    # 10 s are 312.5 steps, which round to 313 in JavaScript, and their ends are one more.
+    assert browser.execute_script(script) == [0, 314]
+
+
+def test_the_numbers_are_those_of_the_picture_once_it_pauses(browser, long):
+    _open(browser, long)
+    # At once after a reading of the numbers, of which there is one in 100 ms at most.
+    script = """
+      const done = arguments[0];
+      const clock = document.getElementById("clock");
+      document.getElementById("speed").value = 16;
+      replay.play();
+      const wait = () => {
+        const read = Number(clock.textContent.match(/step (\\d+)/)[1]);
+        if (replay.frame > 0 && replay.frame !== read) {
+          replay.pause();
+          done([replay.frame, Number(clock.textContent.match(/step (\\d+)/)[1])]);
+        } else if (replay.playing) requestAnimationFrame(wait);
+        else done(null);
+      };
+      requestAnimationFrame(wait);
+    """
+    frame, read = browser.execute_async_script(script)
+    assert frame == read
+
+
+def test_it_is_played_by_keyboard(browser, file):
+    _open(browser, file)
+
+    def press(*keys: str) -> None:
+        ActionChains(browser).send_keys(*keys).perform()
+
+    press(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_LEFT)
+    assert _js(browser, "replay.frame") == 2
+    press(Keys.END)
+    assert _js(browser, "replay.frame") == _js(browser, "replay.frames") - 1
+    press(Keys.HOME)
+    assert _js(browser, "replay.frame") == 0
+    press("+", "+", "-")
+    assert _js(browser, "replay.speed") == 2
+    press("n")
+    assert _js(browser, "[replay.episode, replay.level]") == [1, 3]
+    press("p")
+    assert _js(browser, "[replay.episode, replay.level]") == [0, 0]
+    press(Keys.SPACE)
+    assert _js(browser, "replay.playing")
+    press(Keys.SPACE)
+    assert not _js(browser, "replay.playing")
+    # A button that has the focus is pressed by the space bar, and is not overruled.
+    browser.execute_script("document.getElementById('forth').focus()")
+    frame = _js(browser, "replay.frame")
+    press(Keys.SPACE)
+    assert _js(browser, "[replay.frame, replay.playing]") == [frame + 1, False]
+
+
+def test_a_drag_on_a_chart_goes_to_that_time(browser, file):
+    _open(browser, file)
+    chart = browser.find_element("css selector", ".chart")
+    width = chart.size["width"]
+    # The plot lies between 50 pixels on the left and 14 on the right; offsets are from the middle.
+    middle = 50 + (width - 64) / 2 - width / 2
+    drag = ActionChains(browser).move_to_element_with_offset(chart, round(middle) - 60, 0)
+    drag.click_and_hold().move_by_offset(60, 0).release().perform()
+    last = _js(browser, "replay.frames") - 1
+    pixel = last / (width - 64)
+    assert abs(_js(browser, "replay.frame") - last / 2) <= 1 + pixel  # rounded to a pixel
+
+
+def test_a_hostile_name_is_shown_as_it_is(browser, file):
+    _open(browser, file)
+    names = _js(browser, "[...document.querySelectorAll('h2')].map((each) => each.textContent)")
+    assert names == [HOSTILE, "ahead.npz"]
+    assert HOSTILE in browser.title
+    assert _js(browser, "document.scripts.length") == 2
+
+
+@pytest.mark.parametrize(("width", "dark"), [(400, False), (1600, False), (900, True)])
+def test_it_fits_and_is_drawn(browser, file, width, dark):
+    scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
+    _open(browser, file, width)
+    _js(browser, "replay.seek(60)")
+    assert _js(browser, "document.documentElement.scrollWidth") <= width
+    for number in range(2):
+        # Robots, targets, walls, boxes and the edges between them; an empty canvas has one.
+        assert _shade(browser, ".arena", number) > 20
+        assert _shade(browser, ".chart", number) > 20
+    left = [_js(browser, f"document.querySelectorAll('.run')[{i}].offsetLeft") for i in range(2)]
+    assert (left[0] == left[1]) == (width < 760)  # below each other, or side by side
+    card = _js(browser, "getComputedStyle(document.body).backgroundColor")
+    assert card == ("rgb(20, 21, 23)" if dark else "rgb(251, 251, 250)")
+
+
+def test_everything_to_be_pressed_has_a_name(browser, file):
+    _open(browser, file)
+    script = """
+      const inputs = [...document.querySelectorAll("button, select, input, canvas")];
+      return inputs.filter((each) => !(each.getAttribute("aria-label") ?? each.textContent.trim())
+        && !each.labels?.length).map((each) => each.outerHTML);
+    """
+    assert browser.execute_script(script) == []
+
+
+def test_a_robot_is_singled_out(browser, file, runs):
+    _open(browser, file)
+    browser.find_element("css selector", ".robots li:nth-child(2) button").click()
+    last = len(runs[0][0].pose) - 1
+    _js(browser, "replay.seek(arguments[0])", last)
+    details = _js(browser, "[...document.querySelectorAll('.detail')].map((p) => p.textContent)")
+    distance = runs[0][0].distance[last, 1]
+    assert details[0].startswith("Robot 2: ")
+    # Three digits are shown of what is off by 0.15 mm at most.
+    assert float(details[0].split()[2]) == pytest.approx(distance, abs=7e-4)
+    pressed = "document.querySelectorAll('[aria-pressed=true]').length"
+    assert _js(browser, pressed) == 2  # in both views
+    browser.find_element("css selector", ".robots li:nth-child(2) button").click()
+    assert _js(browser, pressed) == 0

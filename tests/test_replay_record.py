@@ -1,0 +1,145 @@
+"""What is recorded is what the judge saw, and the reward is the one that trains."""
+
+import dataclasses
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import replays
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sentences import refusal
+
+from swarmjax import cells, config, evaluate_c, policy_file, replay_record
+from swarmjax.config import RewardConfig, TaskConfig
+from swarmjax.policy import PolicyError
+from swarmjax.replay_record import Steps
+from swarmjax.sim import infrared
+from swarmjax.task import reward
+
+WEIGHTS = RewardConfig(progress=2.0, proximity=-0.01, arrival=0.5, contact=-0.3, time=-1e-4)
+
+
+@pytest.fixture(scope="module")
+def steer(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return replays.steering(tmp_path_factory.mktemp("replay") / "steer.npz")
+
+
+@settings(max_examples=25)
+@given(
+    seed=st.integers(0, 2**16),
+    off=st.sets(st.sampled_from([field.name for field in dataclasses.fields(RewardConfig)])),
+)
+def test_the_reward_is_that_of_training(seed, off):
+    draw = np.random.default_rng(seed)
+    weights = dataclasses.replace(WEIGHTS, **dict.fromkeys(off, 0.0))
+    given = (
+        draw.uniform(0.0, 2.0, 6).astype(np.float32),
+        draw.uniform(0.0, 2.0, 6).astype(np.float32),
+        draw.uniform(0.02, 0.08, (6, 8)).astype(np.float32),
+        0.04,
+        draw.random(6) < 0.5,
+        draw.random((6, 3)) < 0.3,
+    )
+    found = replay_record.terms(Steps(*given), weights)
+    assert set(found) == {name for name in reward.TERMS if name not in off}
+    arrays = (jnp.asarray(each) if isinstance(each, np.ndarray) else each for each in given)
+    expected = reward.total(reward.Step(*arrays), weights)
+    # Float32 holds rewards of a few units to some 1e-7.
+    np.testing.assert_allclose(sum(found.values(), np.zeros(6)), expected, atol=1e-6)
+
+
+def test_equation_3_by_hand():
+    steps = Steps(
+        distance_before=np.array([1.0, 0.5]),
+        distance=np.array([0.996, 0.5]),
+        infrared=np.array([[0.04] * 8, [0.04] * 7 + [0.039]]),
+        sensor_range=0.04,
+        arrives=np.array([False, True]),
+        contact_begins=np.ones((2, 3), bool),
+    )
+    paper = RewardConfig(progress=1.0, proximity=-0.001, arrival=0.0, contact=0.0, time=0.0)
+    found = replay_record.terms(steps, paper)
+    np.testing.assert_allclose(found["progress"], [0.004, 0.0], atol=1e-12)  # 1 - 0.996 rounds
+    np.testing.assert_array_equal(found["proximity"], [0.0, -0.001])
+    assert list(found) == ["progress", "proximity"]
+
+
+def test_weights_are_those_of_training(tmp_path):
+    stored = {"task": {"reward": {"contact": -0.02}}}
+    path = replays.steering(tmp_path / "a.npz")
+    trained = policy_file.read(path)
+    own = TaskConfig(reward=WEIGHTS)
+    assert replay_record.weights(trained, own) == WEIGHTS  # it does not say
+    trained.meta["config"] = stored
+    assert replay_record.weights(trained, own) == RewardConfig(contact=-0.02)
+    trained.meta["config"] = {"task": [1]}
+    with pytest.raises(PolicyError, match=r"^meta\.config\.task is \[1\]: expected an object\.$"):
+        replay_record.weights(trained, own)
+    trained.meta["config"] = stored
+    stored["task"]["reward"] = {"contacts": 1.0}
+    sentence = refusal(replay_record.weights, trained, own)
+    assert sentence.startswith("the policy's config.task.reward.contacts is not a key")
+
+
+def test_a_recording_is_what_the_judge_saw(steer):
+    words = [*replays.SMALL, "level=0,3", "steps=200", "realism=real"]
+    judge, found = replays.recorded(steer, *words)
+    settings = config.load_replay([f"policy={steer}", *words])
+    levels = cells.split(cells.load(settings.evaluation).cells[0].levels)
+    for number, recording in zip(settings.levels, found, strict=True):
+        alone = evaluate_c.simulate(judge, [levels[number]])
+        assert len(recording.pose) == alone.clock[0] + 1
+        np.testing.assert_array_equal(recording.arrival, alone.arrival[0])
+        np.testing.assert_array_equal(recording.contacts[-1], alone.contacts[0])
+        np.testing.assert_array_equal(
+            (recording.ray[1:] < 0.04).any(axis=-1)[:, alone.arrival[0] == 0].sum(axis=0),
+            alone.sensed[0][alone.arrival[0] == 0],
+        )
+        level = levels[number]
+        np.testing.assert_allclose(recording.pose[0], level.start, atol=1e-6)  # of float32
+        away = np.linalg.norm(recording.pose[..., :2] - level.target, axis=-1)
+        np.testing.assert_allclose(recording.distance, away, atol=1e-9)  # of float64
+        np.testing.assert_array_equal(
+            recording.scene.box, level.obstacle[level.obstacle_present].astype(float)
+        )
+    # Each robot's sensors sit where this episode has them.
+    nominal, _ = infrared.rays(np.zeros(3), np, None)
+    off = found[0].scene.sensor[..., :2] - nominal
+    assert 0.0 < np.abs(off).max() < 0.01
+    assert not np.array_equal(found[0].scene.sensor, found[1].scene.sensor)
+
+
+def test_rewards_are_those_of_the_steps(steer):
+    _, (recording,) = replays.recorded(steer, *replays.SMALL, "level=2", "steps=300")
+    total = {name: term.sum(axis=0) for name, term in recording.reward.items()}
+    robots = np.arange(3)
+    end = np.where(recording.arrival > 0, recording.arrival, len(recording.pose) - 1)
+    gained = recording.distance[0] - recording.distance[end, robots]
+    np.testing.assert_allclose(total["progress"], gained, atol=1e-9)  # sums of 300 float64
+    near = (recording.ray < 0.04).any(axis=-1)
+    lit = [near[1 : end[i] + 1, i].sum() for i in robots]
+    np.testing.assert_allclose(total["proximity"], -0.001 * np.array(lit), atol=1e-12)
+    assert sum(lit) > 0
+    assert (recording.arrival > 0).any()
+
+
+def test_a_recording_ends_when_all_have_arrived(steer):
+    _, found = replays.recorded(steer, "stage.robots=1", "stage.obstacles=0", "level=0,1,2")
+    for recording in found:
+        assert recording.arrival.tolist() == [len(recording.pose) - 1]
+        assert recording.distance[-1, 0] <= 0.05 < recording.distance[-2, 0]
+    assert len({len(recording.pose) for recording in found}) == 3
+
+
+def test_touching_is_seen_while_it_lasts(tmp_path):
+    ahead = replays.steering(tmp_path / "ahead.npz", replays.AHEAD)
+    _, (recording,) = replays.recorded(
+        ahead, "stage.robots=1", "stage.obstacles=0", "stage.side=0.5", "level=0", "steps=250"
+    )
+    assert recording.arrival[0] == 0
+    first = int(recording.contacts[:, 0, 2].argmax())
+    assert recording.touching[first, 0].tolist() == [False, False, True]  # a wall
+    assert not recording.touching[first - 1].any()
+    assert recording.contacts[-1, 0].tolist() == [0, 0, 1]

@@ -1,0 +1,182 @@
+"""The command that draws suites: what it chooses, writes and refuses."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import steering
+import yaml
+
+from swarmjax import cells, command, compose, config, suite
+from swarmjax.cells import Cell
+from swarmjax.config import StageConfig, SuiteConfig
+from swarmjax.evaluate_run import Trial
+
+TEXT = """# What it is,
+# in two lines.
+name: tiny
+cells:
+  - name: one
+    stage: s1
+    levels: 2
+    seed: 1000001
+  - name: two
+    stage: {robots: 2, side: 0.6, obstacles: 1}
+    levels: 3
+    seed: 1000002
+    shape: cross
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "tiny.yaml"
+    path.write_text(TEXT)
+    return path
+
+
+def _command(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["suite", *words])
+    return command.run("suite", suite.main, SuiteConfig)
+
+
+def test_digests_are_written_and_held_to(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert _command(monkeypatch, f"suite={file}") == 2
+    assert "cell one of suite tiny has no digest" in capsys.readouterr().err
+    assert _command(monkeypatch, f"suite={file}", "write=true") == 0
+    written = file.read_text()
+    lines = [line for line in written.splitlines(keepends=True) if "digest" not in line]
+    assert "".join(lines) == TEXT
+    out = file.with_name("levels.npz")
+    assert _command(monkeypatch, f"suite={file}", f"out={out}") == 0
+    drawn, read = cells.draw(str(file)), cells.read(out)
+    assert [cell.digest for cell in read.cells] == [cell.digest for cell in drawn.cells]
+    printed = capsys.readouterr().out
+    assert drawn.cells[1].digest[:12] in printed
+    assert _command(monkeypatch, f"suite={file}", "write=true") == 0
+    assert file.read_text() == written
+    file.write_text(written.replace("seed: 1000002", "seed: 1000003"))
+    capsys.readouterr()
+    assert _command(monkeypatch, f"suite={file}") == 2
+    assert "cell two of suite tiny has the digest " in capsys.readouterr().err
+
+
+def test_the_levels_that_policies_fail_most_are_chosen() -> None:
+    found: dict[str, Any] = {
+        "targets_reached": [[1.0, 0.5, 0.5, 0.5, 0.0], [1.0, 0.5, 0.5, 0.5, 1.0]],
+        "contacts_per_robot": [[9.0, 1.0, 2.0, 1.0, 0.0], [9.0, 1.0, 2.0, 1.0, 0.0]],
+        "time_to_reach_s": [[9.0, 4.0, 1.0, 5.0, 0.0], [9.0, 4.0, 1.0, 5.0, 0.0]],
+    }
+    stage: Any = StageConfig(name="s", robots=1, side=1.0)
+    levels: Any = None
+    cell = Cell("x", stage, "box", None, 1_000_000, np.array([10, 11, 12, 13, 14]), levels)
+    tables = {name: np.array(table) for name, table in found.items()}
+    trial = Trial(cell, np.zeros((5, 1)), tables, np.zeros((2, 5, 1)))
+    # All others reach half their targets in the mean: most contacts, then longest, then first.
+    assert suite.choose(trial, 1).tolist() == [12]
+    assert suite.choose(trial, 2).tolist() == [12, 13]
+    assert suite.choose(trial, 3).tolist() == [11, 12, 13]
+    assert suite.choose(trial, 4).tolist() == [11, 12, 13, 14]
+
+
+def test_chosen_levels_are_written_with_their_numbers(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = steering.write(tmp_path / "policy.npz")
+    words = (f"suite={file}", f"policies={policy}", "pool=6", "steps=60", "workers=1")
+    assert _command(monkeypatch, *words, "write=true") == 0
+    found = config.read_suite(str(file)).cells
+    for cell, count in zip(found, (2, 3), strict=True):
+        assert len(cell.episodes) == count
+        assert set(cell.episodes) < set(range(6))
+        assert list(cell.episodes) == sorted(cell.episodes)
+    assert [len(cell.episodes) for cell in cells.draw(str(file)).cells] == [2, 3]
+    assert file.read_text().startswith("# What it is,\n# in two lines.\n")
+
+
+def test_a_write_that_fails_leaves_the_file(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fill(path: Path, text: str) -> None:
+        with path.open("w") as half:
+            half.write(text[: len(text) // 2])
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", fill)
+    assert _command(monkeypatch, f"suite={file}", "write=true") == 2
+    assert file.read_text() == TEXT
+    assert list(file.parent.iterdir()) == [file]
+
+
+WORDS = (
+    "no",
+    "ON",
+    "null",
+    "Null",
+    "True",
+    "y",
+    "007",
+    "1_0",
+    "1e5",
+    "0x1f",
+    "-",
+    "2001-01-01",
+    "é",
+)
+
+
+@pytest.mark.parametrize("word", [*WORDS, "12e" + "4" * 61, "real", "a-b_c"])
+def test_words_that_yaml_reads_otherwise_are_quoted(tmp_path: Path, word: str) -> None:
+    content = {"name": word, "cells": [{"name": word, "stage": {"name": word, "robots": 1}}]}
+    path = tmp_path / "x.yaml"
+    path.write_text(suite.to_yaml(content))
+    assert yaml.safe_load(path.read_text()) == compose.read_yaml(path) == content
+    assert (f'"{word}"' in path.read_text()) == (word not in ("real", "a-b_c", "y"))
+
+
+def test_a_written_suite_reads_back(tmp_path: Path) -> None:
+    content: dict[str, Any] = {
+        "name": "x",
+        "cells": [
+            {
+                "name": "007",
+                "stage": {"robots": 3, "side": [0.9, 1.1], "level": "random"},
+                "realism": None,
+                "episodes": list(range(1000, 1300)),
+                "digest": "12" * 32,
+            }
+        ],
+    }
+    path = tmp_path / "x.yaml"
+    path.write_text(suite.to_yaml(content))
+    assert max(map(len, path.read_text().splitlines())) <= 100
+    assert compose.read_yaml(path) == content
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["policies=a.npz"], "policies is given, but write is false: give write=true"),
+        (["policies={tmp}/no.npz", "write=true"], "{tmp}/no.npz "),
+        (["policies={tmp}/p.npz", "write=true", "pool=1"], "pool is 1, but cell one takes 2 "),
+        (["out={tmp}/x.csv"], "out is {tmp}/x.csv: give a file .npz."),
+        (["write=true", "out={tmp}/tiny.yaml/x.npz"], "{tmp}/tiny.yaml/x.npz cannot be written: "),
+        (["level=1"], "level is not a key"),
+    ],
+)
+def test_the_command_refuses_in_one_sentence(
+    file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    sentence: str,
+) -> None:
+    steering.write(tmp_path / "p.npz")
+    words = [word.format(tmp=tmp_path) for word in words]
+    assert _command(monkeypatch, f"suite={file}", *words) == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith(f"swarmjax.suite: error: {sentence.format(tmp=tmp_path)}")
+    assert printed.count("\n") == 1
