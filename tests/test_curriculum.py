@@ -141,7 +141,7 @@ def _advance(
 
 
 def test_schedule(tiny_config: TrainConfig) -> None:
-    found = curriculum.schedule(_config(tiny_config, 3))
+    found = curriculum.schedule(_config(tiny_config, 3, curriculum=OPTIONS))
     assert found.stages.robots.tolist() == [1, 2, 3]
     # Half of 20 updates in two equal parts; the last stage has no end.
     assert found.deadline.tolist() == [5, 10, NEVER]
