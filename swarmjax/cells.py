@@ -6,7 +6,6 @@ that they are the same to the last bit. Levels of a suite are drawn for the nomi
 
 import io
 import json
-import os
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,9 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from swarmjax import config as settings
-from swarmjax import epuck, policy
+from swarmjax import epuck, evaluate_judge, policy, policy_file
 from swarmjax.config import CellConfig, ConfigError, EvaluateConfig, Shape, StageConfig, TaskConfig
-from swarmjax.evaluate_judge import draw_level
 from swarmjax.settings import build, show, to_dict
 from swarmjax.task import level, shapes
 from swarmjax.task import stage as task_stage
@@ -80,12 +78,7 @@ def load(config: EvaluateConfig) -> Suite:
         ConfigError: If the suite is unsound, or made for smaller robots or other targets.
     """
     if config.suite is None:
-        stage, shape, numbers = config.stage, config.shape, range(config.episodes)
-        radii = (config.robot.hull_radius, config.task.target_radius)
-        levels = _draw(stage, shape, config.seed, numbers, radii)
-        episodes = np.array(numbers)
-        one = Cell(stage.name, stage, shape, None, config.seed, episodes, levels)
-        return Suite(None, (one,))
+        return Suite(None, (draw_stage(config, range(config.episodes)),))
     if config.robot.hull_radius > epuck.HULL_RADIUS:
         raise ConfigError(
             f"robot.hull_radius is {show(config.robot.hull_radius)}, but suites are drawn for "
@@ -135,6 +128,22 @@ def draw(choice: str) -> Suite:
     return Suite(file.name, tuple(found))
 
 
+def draw_stage(config: EvaluateConfig, numbers: Sequence[int]) -> Cell:
+    """Draws levels of an evaluation's stage, for its robot and targets.
+
+    Args:
+        config: Of the evaluation; its suite is not read.
+        numbers: [E] of the levels.
+
+    Returns:
+        The cell, under the stage's name.
+    """
+    stage, shape = config.stage, config.shape
+    radii = (config.robot.hull_radius, config.task.target_radius)
+    levels = _draw(stage, shape, config.seed, numbers, radii)
+    return Cell(stage.name, stage, shape, None, config.seed, np.array(numbers), levels)
+
+
 def draw_cell(cell: CellConfig) -> Cell:
     """Draws the levels of a cell of a suite, whatever its digest."""
     numbers, radii = cell.episodes or range(cell.levels), (epuck.HULL_RADIUS, _TARGET_RADIUS)
@@ -153,13 +162,14 @@ def _draw(
     """Draws levels of these numbers, for hulls and targets of these radii, m."""
     one = task_stage.select(task_stage.stack([stage]), np.intp(0))
     spacing = level.Spacing(stage.robots, stage.obstacles, *radii)
-    drawn = [shapes.expand(draw_level(one, spacing, seed, each), shape) for each in numbers]
+    draw = evaluate_judge.draw_level
+    drawn = [shapes.expand(draw(one, spacing, seed, each), shape) for each in numbers]
     return Level(*(np.stack(fields) for fields in zip(*drawn, strict=True)))
 
 
-def split(levels: Level, rows: slice = slice(None)) -> list[Level]:
+def split(levels: Level) -> list[Level]:
     """Takes stacked levels [E] apart."""
-    return [Level(*each) for each in zip(*(field[rows] for field in levels), strict=True)]
+    return [Level(*each) for each in zip(*levels, strict=True)]
 
 
 def _check_digest(cell: Cell, expected: str, where: str) -> None:
@@ -194,15 +204,9 @@ def write(path: Path, suite: Suite) -> None:
         for cell in suite.cells
     ]
     meta = json.dumps({"format": FORMAT, "suite": suite.name, "cells": about})
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with temporary.open("wb") as file:
-                np.savez_compressed(file, allow_pickle=False, **{"meta": np.array(meta), **arrays})
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with policy_file.replacing(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **{"meta": np.array(meta), **arrays})
     except OSError as error:
         raise ConfigError(f"{path} cannot be written: {error.strerror or error}.") from None
 

@@ -32,8 +32,6 @@ from swarmjax.cells import Cell
 from swarmjax.config import ConfigError, ReplayConfig
 from swarmjax.evaluate_run import Entrant, Trial
 from swarmjax.replay_record import Episode
-from swarmjax.task import level, shapes
-from swarmjax.task import stage as task_stage
 
 
 class Pick(NamedTuple):
@@ -79,7 +77,7 @@ def replay(
 def _cells(settings: ReplayConfig) -> list[Cell]:
     """Draws the levels that there are to choose from; of a stage no more than are named."""
     if settings.suite is None and settings.worst is None:
-        return [_draw(settings)]
+        return [cells.draw_stage(settings.evaluation, settings.levels)]
     suite = cells.load(settings.evaluation)
     if settings.cell is None:
         return list(suite.cells)
@@ -88,22 +86,6 @@ def _cells(settings: ReplayConfig) -> list[Cell]:
         names = ", ".join(cell.name for cell in suite.cells)
         raise ConfigError(f"cell is {config.show(settings.cell)}: give one of {names}.")
     return found
-
-
-def _draw(settings: ReplayConfig) -> Cell:
-    """Draws the levels of a stage that are named, the same as `cells.load` does among others."""
-    given, radii = settings.stage, (settings.robot.hull_radius, settings.task.target_radius)
-    stage = task_stage.select(task_stage.stack([given]), np.intp(0))
-    spacing = level.Spacing(given.robots, given.obstacles, *radii)
-    drawn = [
-        shapes.expand(
-            evaluate_judge.draw_level(stage, spacing, settings.seed, number), settings.shape
-        )
-        for number in settings.levels
-    ]
-    levels = level.Level(*(np.stack(fields) for fields in zip(*drawn, strict=True)))
-    numbers = np.array(settings.levels)
-    return Cell(given.name, given, settings.shape, None, settings.seed, numbers, levels)
 
 
 def _check_worst(settings: ReplayConfig, count: int) -> None:

@@ -5,7 +5,6 @@ levels of each cell are chosen: those of a pool that these policies fail most.
 """
 
 import json
-import os
 import re
 import sys
 import textwrap
@@ -22,7 +21,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from swarmjax import cells, command, compose, config, evaluate, evaluate_run
+from swarmjax import cells, command, compose, config, evaluate, evaluate_run, policy_file
 from swarmjax.cells import Cell, Suite
 from swarmjax.config import CellConfig, ConfigError, EvaluateConfig, SuiteConfig
 from swarmjax.evaluate_run import Entrant, Trial
@@ -89,13 +88,9 @@ def _renew(settings: SuiteConfig) -> Suite:
 
 def _replace(path: Path, text: str) -> None:
     """Puts a text in the place of a file's, whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        try:
+        with policy_file.replacing(path) as temporary:
             temporary.write_text(text)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
     except OSError as error:
         raise ConfigError(f"{path} cannot be written: {error.strerror or error}.") from None
 

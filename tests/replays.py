@@ -1,40 +1,15 @@
-"""Policies that steer by bearing, and what they do on small stages, for the tests of replays."""
+"""What policies do on small stages, for the tests of replays."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import policies
 
 from swarmjax import cells, config, evaluate_judge, evaluate_run, replay_record
 from swarmjax.config import ReplayConfig
 from swarmjax.evaluate_judge import Judge
 from swarmjax.replay_record import Episode, Recording, Scene
-from swarmjax.task import observation
 
-# Action of a policy by hand: at bearing 0, and what each radian to the left and right adds.
-STEER = ((1.0, 0.0), (-2.0, 2.0), (-2.0, -2.0))
-AHEAD = ((1.0, 0.0), (0.0, 0.0), (0.0, 0.0))
 SMALL = ("stage.robots=3", "stage.side=0.9", "stage.obstacles=2")
-
-
-def steering(path: Path, drive: tuple = STEER, **changes: Any) -> Path:
-    """Writes a policy of one hidden layer, relu(bearing) and relu(-bearing)."""
-    bearing = np.zeros((1, observation.SIZE, 2))
-    bearing[0, observation.NAMES.index("target_bearing")] = [1.0, -1.0]
-    zero = np.zeros((1, observation.SIZE))
-    arrays = {
-        "actor/hidden_0/kernel": bearing,
-        "actor/hidden_0/bias": zero[:, :2],
-        "actor/mean/kernel": np.array([drive[1:]]),
-        "actor/mean/bias": np.array([drive[0]]),
-        "actor/log_std": zero[:, :2],
-        "normalizer/mean": zero,
-        "normalizer/std": zero + 1.0,
-    }
-    given = {name: array.astype(np.float32) for name, array in arrays.items()}
-    policies.saved(path, given, activation="relu", config={}, **changes)
-    return path
 
 
 def judge(settings: ReplayConfig) -> Judge:

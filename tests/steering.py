@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from policies import EMBODIMENT
+import policies
 
 from swarmjax import policy_file
 from swarmjax.task import observation
@@ -34,21 +34,6 @@ def write(path: Path, drive: tuple = STEER, learners: int = 1, **meta: Any) -> P
         "normalizer/std": zero + 1.0,
     }
     arrays = {n: np.repeat(a, learners, 0).astype(np.float32) for n, a in arrays.items()}
-    full = {
-        "policy": "shared",
-        "learners": learners,
-        "activation": "relu",
-        "observation": observation.describe("metric") | {"limit": 10.0},
-        "action": {
-            "names": ["speed", "turn_rate"],
-            "units": ["m/s", "rad/s"],
-            "low": [0.0, -3.14],
-            "high": [SPEED, 3.14],
-        },
-        "config": {},
-        **EMBODIMENT,
-        "versions": {},
-        "update": 0,
-    }
-    policy_file.write(path, arrays, full | meta)
+    said = {"learners": learners, "activation": "relu", "config": {}, "versions": {}, "update": 0}
+    policy_file.write(path, arrays, policies.meta(**{**said, **meta}))
     return path

@@ -7,8 +7,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import policies
 import pytest
 import replays
+import steering
 from sentences import refusal
 
 from swarmjax import cells, command, config, policy_file, replay
@@ -22,7 +24,7 @@ QUICK = (*replays.SMALL, "steps=40", "workers=1")
 
 @pytest.fixture(scope="module")
 def steer(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return replays.steering(tmp_path_factory.mktemp("replay") / "steer.npz")
+    return steering.write(tmp_path_factory.mktemp("replay") / "steer.npz")
 
 
 def _trial(reached: list, contacts: list, time: list):
@@ -68,7 +70,7 @@ def test_the_worst_are_replayed(steer, tmp_path, capsys):
 
 
 def test_policies_replay_the_same_levels(steer, tmp_path):
-    ahead = replays.steering(tmp_path / "ahead.npz", replays.AHEAD)
+    ahead = steering.write(tmp_path / "ahead.npz", steering.AHEAD)
     settings = config.load_replay([f"policy={steer},{ahead}", *QUICK, "level=2", "shape=cross"])
     entrants = replay.evaluate_run.read_policies(settings.policies)
     progress = replay.Progress(disable=True)
@@ -255,8 +257,8 @@ def test_files_that_cannot_be_written_are_refused(steer, tmp_path):
 
 def test_a_policy_that_does_not_fit_is_refused(steer, tmp_path):
     path = tmp_path / "two.npz"
-    trained = replays.policies.arrays(learners=2)
-    policy_file.write(path, trained, replays.policies.meta(**replays.policies.several(2)))
+    trained = policies.arrays(learners=2)
+    policy_file.write(path, trained, policies.meta(**policies.several(2)))
     words = [f"policy={steer},{path}", *QUICK, f"out={tmp_path / 'a.html'}"]
     with pytest.raises(PolicyError, match=r"two\.npz holds a network for each of 2 robots"):
         replay.main(words)

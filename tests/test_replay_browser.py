@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import replays
+import steering
 
 from swarmjax import config, policy_file, replay_pack, replay_page
 from swarmjax.replay_record import Recording
@@ -53,8 +54,8 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[list[Recording]]:
     """Two levels, by a policy that steers and by one that drives straight ahead."""
     folder = tmp_path_factory.mktemp("policies")
-    steer = replays.steering(folder / "steer.npz")
-    ahead = replays.steering(folder / "ahead.npz", replays.AHEAD)
+    steer = steering.write(folder / "steer.npz")
+    ahead = steering.write(folder / "ahead.npz", steering.AHEAD)
     by_policy = [replays.recorded(path, *WORDS)[1] for path in (steer, ahead)]
     return [list(each) for each in zip(*by_policy, strict=True)]
 
@@ -64,7 +65,7 @@ def file(tmp_path_factory: pytest.TempPathFactory, runs: list[list[Recording]]) 
     """The page of both."""
     folder = tmp_path_factory.mktemp("page")
     settings = config.load_replay([f"policy={HOSTILE},ahead.npz", *WORDS])
-    trained = policy_file.read(replays.steering(folder / "steer.npz"))
+    trained = policy_file.read(steering.write(folder / "steer.npz"))
     episodes = [
         replays.episode(*each, level=level)
         for each, level in zip(runs, settings.levels, strict=True)
@@ -187,7 +188,7 @@ def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A page of 400 steps, 12.8 s, and of robots whose trails are cut after 10 s."""
     folder = tmp_path_factory.mktemp("long")
     settings = config.load_replay(["policy=a.npz"])
-    trained = policy_file.read(replays.steering(folder / "steer.npz"))
+    trained = policy_file.read(steering.write(folder / "steer.npz"))
     episodes = [replays.episode(replays.wandering(1, 401))]
     path = folder / "replay.html"
     path.write_text(replay_page.page(settings, [trained], episodes, "the command"))

@@ -6,6 +6,7 @@ import zlib
 import numpy as np
 import pytest
 import replays
+import steering
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
@@ -91,7 +92,7 @@ def _check(recording: Recording, series: dict[str, np.ndarray]) -> None:
 
 
 def test_recordings_come_back_to_the_quantum(tmp_path):
-    steer = replays.steering(tmp_path / "steer.npz")
+    steer = steering.write(tmp_path / "steer.npz")
     words = [*replays.SMALL, "realism=real", "level=0,1", "steps=150"]
     _, found = replays.recorded(steer, *words)
     packed = replay_pack.pack(

@@ -6,6 +6,7 @@ import re
 from html.parser import HTMLParser
 
 import replays
+import steering
 
 from swarmjax import config, policy_file, replay_page
 
@@ -41,7 +42,7 @@ def test_a_hostile_title_stays_text():
 
 
 def test_hostile_names_are_nowhere_in_the_page(tmp_path):
-    path = replays.steering(tmp_path / "steer.npz")
+    path = steering.write(tmp_path / "steer.npz")
     names = [f"policy={HOSTILE},{HOSTILE}b", "worst=2", "realism=real"]
     settings = config.load_replay(names)
     trained = policy_file.read(path)

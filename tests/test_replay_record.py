@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import replays
+import steering
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sentences import refusal
@@ -23,7 +24,7 @@ WEIGHTS = RewardConfig(progress=2.0, proximity=-0.01, arrival=0.5, contact=-0.3,
 
 @pytest.fixture(scope="module")
 def steer(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return replays.steering(tmp_path_factory.mktemp("replay") / "steer.npz")
+    return steering.write(tmp_path_factory.mktemp("replay") / "steer.npz")
 
 
 @settings(max_examples=25)
@@ -68,7 +69,7 @@ def test_equation_3_by_hand():
 
 def test_weights_are_those_of_training(tmp_path):
     stored = {"task": {"reward": {"contact": -0.02}}}
-    path = replays.steering(tmp_path / "a.npz")
+    path = steering.write(tmp_path / "a.npz")
     trained = policy_file.read(path)
     own = TaskConfig(reward=WEIGHTS)
     assert replay_record.weights(trained, own) == WEIGHTS  # it does not say
@@ -134,7 +135,7 @@ def test_a_recording_ends_when_all_have_arrived(steer):
 
 
 def test_touching_is_seen_while_it_lasts(tmp_path):
-    ahead = replays.steering(tmp_path / "ahead.npz", replays.AHEAD)
+    ahead = steering.write(tmp_path / "ahead.npz", steering.AHEAD)
     _, (recording,) = replays.recorded(
         ahead, "stage.robots=1", "stage.obstacles=0", "stage.side=0.5", "level=0", "steps=250"
     )
