@@ -21,7 +21,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import fidelity_body, fidelity_infrared, fidelity_motion, rig
+from benchmarks import fidelity_body, fidelity_infrared, fidelity_motion, pages, rig
 from benchmarks.fidelity_row import Row
 from benchmarks.rig import Rig
 from swarmjax import command, compose, config, provenance
@@ -29,7 +29,7 @@ from swarmjax.settings import ConfigError, Section, about, build
 
 ROBOTS = ("planar", "wheeled", "planar_v2", "wheeled_v2")  # files of configs/robot/
 PAGE = "robot.md"
-BEGIN, END = "<!-- fidelity -->", "<!-- /fidelity -->"
+MARKER = "fidelity"
 PLAIN_WIDTH = 180  # columns
 HEADS = ("quantity", "unit", "theirs", "source", "planar", "wheeled", "error")
 
@@ -131,26 +131,6 @@ def markdown(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def insert(page: str, table: str) -> str:
-    """Puts a table between the markers of a page.
-
-    Args:
-      page: the whole text.
-      table: what comes between.
-
-    Returns:
-      The new text.
-
-    Raises:
-      ConfigError: the page has not both markers, in order.
-    """
-    before, begin, rest = page.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not (begin and end):
-        raise ConfigError(f"{PAGE} has no place for the table: give it {BEGIN} and {END}.")
-    return f"{before}{BEGIN}\n\n{table}\n{END}{after}"
-
-
 def write_docs(folder: Path, rows: Sequence[Row], benches: Sequence[Rig]) -> None:
     """Writes the table into the page, and the plots beside it.
 
@@ -167,7 +147,7 @@ def write_docs(folder: Path, rows: Sequence[Row], benches: Sequence[Rig]) -> Non
 
     path = folder / PAGE
     try:
-        path.write_text(insert(path.read_text(), markdown(rows)))
+        path.write_text(pages.insert(path.read_text(), PAGE, MARKER, markdown(rows)))
         fidelity_figures.draw(folder / "figures", benches[0], benches[1])
     except OSError as error:
         raise ConfigError(f"docs is {folder}, which cannot be used: {error.strerror}.") from None

@@ -1,17 +1,19 @@
 """How many steps a second: physics alone, the environment with it, training with both?
 
-`python -m benchmarks.steps_per_second [key=value ...]` takes the keys of `swarmjax.train` and
-prints a JSON line for each of the three, the median of `REPEATS` timed calls after one that is
-not counted; compile time is apart. All robots of the last stage act at random (physics and
-environment) or by the policy that is being trained. Speeds are those of all `seeds` together.
+`python -m benchmarks.steps_per_second [key=value ...]` takes the keys of `swarmjax.train`, and
+numbers of arenas with commas between them, as in `arenas=1024,65536`. It prints a JSON line for
+each of the three at every number of arenas, the median of `timing.REPEATS` timed calls after one
+that is not counted; compile time is apart. All robots of the last stage act at random (physics and
+environment) or by the policy that is being trained. Speeds are those of all `seeds` together. What
+a device has no memory for gives a line that says so, as `failed`.
 """
 
 import json
 import statistics
 import sys
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -20,34 +22,67 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from swarmjax import command, config, curriculum, loop, provenance, rollout, seeds
+from benchmarks import timing
+from swarmjax import command, config, loop, provenance, rollout, seeds
 from swarmjax.config import TrainConfig
-from swarmjax.loop import Program
+from swarmjax.curriculum import Schedule
+from swarmjax.loop import Program, TrainState
 from swarmjax.sim import drive, physics
 from swarmjax.task import env
 from swarmjax.task.env import EnvState
 
-REPEATS = 5
-CONTROL_STEPS = 64  # of one call of physics and environment
-TRAIN_SECONDS = 2.0  # of one call of training, about
+# Of one call of physics and environment; whole rollouts of the default algorithm.
+CONTROL_STEPS = {"planar": 64, "wheeled": 32}
+TRAIN_SECONDS = 1.0  # of one call of training, about
+THREADS = 4  # sizes that are compiled side by side
+# Said in every line, as peers say it in theirs.
+COUNTED = {
+    "step": "control step: command, rigid bodies with contacts, 8 infrared rays, reward",
+    "resets": "at once, each on a fresh random level that was drawn ahead of the rollout",
+    "precision": "float32",
+}
 
 
-def measure(call: Callable[[Any, Any], Any], state: Any, argument: Any) -> tuple[float, float, Any]:
-    """Times `call(state, argument) -> (state, rest)`, the state donated.
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """One size, compiled and not yet run.
 
-    Returns:
-      Seconds that compiling took, median seconds of a call, and the last result.
+    Attributes:
+      program: the compiled side.
+      schedule: the curriculum's numbers.
+      start: makes the first state of a schedule.
+      keys: [N] a random key for each seed.
+      physics: steps the physics alone.
+      environment: steps the environment.
+      training: trains.
     """
-    began = time.perf_counter()
-    compiled = jax.jit(call, donate_argnums=0).lower(state, argument).compile()
-    compile_s = time.perf_counter() - began
-    taken, rest = [], None
-    for _ in range(1 + REPEATS):
-        began = time.perf_counter()
-        state, rest = compiled(state, argument)
-        jax.block_until_ready(rest)
-        taken.append(time.perf_counter() - began)
-    return compile_s, statistics.median(taken[1:]), rest
+
+    program: Program
+    schedule: Schedule
+    start: Any
+    keys: Array
+    physics: timing.Program
+    environment: timing.Program
+    training: timing.Program
+
+
+def prepare(settings: TrainConfig) -> Prepared:
+    """Compiles all programs of one size; several sizes may be prepared in threads."""
+    program, schedule = loop.load(settings)
+    init = partial(seeds.init, program)
+    template: TrainState = jax.eval_shape(init, schedule)
+    keys = jax.vmap(jax.random.key)(np.array(seeds.numbers(settings), np.uint32))
+    train = partial(seeds.train_chunk, program, schedule)
+    environments, arenas = partial(_environments, program), template.arenas
+    return Prepared(
+        program=program,
+        schedule=schedule,
+        start=jax.jit(init).lower(schedule).compile(),
+        keys=keys,
+        physics=timing.compile_program(partial(_physics, program), arenas, keys),
+        environment=timing.compile_program(environments, arenas, (schedule, keys)),
+        training=timing.compile_program(train, template, np.int32(1)),
+    )
 
 
 def physics_alone(program: Program, arenas: EnvState, key: Array) -> tuple[EnvState, Array]:
@@ -62,13 +97,14 @@ def physics_alone(program: Program, arenas: EnvState, key: Array) -> tuple[EnvSt
         wheels = drive.wheel_speeds(command, world.drive, jnp)
         return move(data, level.side, level.obstacle, wheels), None
 
-    data, _ = jax.lax.scan(body, data, jax.random.split(key, CONTROL_STEPS))
+    steps = CONTROL_STEPS[program.config.robot.body]
+    data, _ = jax.lax.scan(body, data, jax.random.split(key, steps))
     packed = jax.vmap(physics.pack)(data)
     return replace(arenas, sim=packed), jnp.sum(packed.qpos)
 
 
 def environment(
-    program: Program, schedule: curriculum.Schedule, arenas: EnvState, key: Array
+    program: Program, schedule: Schedule, arenas: EnvState, key: Array
 ) -> tuple[EnvState, Array]:
     """Steps all arenas with random actions, resets and all; returns them and the reward."""
     world = program.world
@@ -96,7 +132,7 @@ def environment(
 
 def _rollouts(settings: TrainConfig) -> int:
     """How many rollouts a call of the environment is."""
-    return max(1, CONTROL_STEPS // settings.algo.rollout)
+    return max(1, CONTROL_STEPS[settings.robot.body] // settings.algo.rollout)
 
 
 def _actions(program: Program, key: Array) -> Array:
@@ -106,57 +142,125 @@ def _actions(program: Program, key: Array) -> Array:
 
 
 def _line(
-    program: Program,
+    prepared: Prepared,
     name: str,
     control_steps: int,
-    timing: Sequence[float],
-    transitions: float | None,
-) -> dict:
+    calls_s: list[float],
+    transitions: float | None = None,
+) -> dict[str, Any]:
     """Puts a result together under the names of docs/interface.md."""
-    settings = program.config
-    compile_s, seconds = timing
+    settings, compiled = prepared.program.config, getattr(prepared, name)
+    seconds = statistics.median(calls_s)
     arena_steps = control_steps * settings.seeds * settings.arenas / seconds
-    robots = settings.stage[-1].robots
-    substeps = config.substeps(settings.robot, settings.sim.substeps)
+    count = config.substeps(settings.robot, settings.sim.substeps)
     return {
         "benchmark": f"steps_per_second.{name}",
+        **about(settings),
+        "arena_steps_per_s": arena_steps,
+        "robot_steps_per_s": arena_steps * settings.stage[-1].robots,
+        "physics_steps_per_s": arena_steps * count,
+        "transitions_per_s": None if transitions is None else transitions / seconds,
+        "compile_s": compiled.compile_s,
+        "program_bytes": compiled.size,
+        **timing.spread(calls_s),
+        **made_with(),
+    }
+
+
+def about(settings: TrainConfig, impl: str | None = None) -> dict[str, Any]:
+    """The fields of a line that say what was simulated, and how it is counted.
+
+    Args:
+      settings: of training.
+      impl: that was used; None looks for it, which takes the card if it is to be found out.
+
+    Returns:
+      Fields under the names of docs/interface.md.
+    """
+    return {
         "robot": settings.robot.body,
-        "impl": physics.resolve_impl(settings.sim.impl),
+        "impl": physics.resolve_impl(settings.sim.impl) if impl is None else impl,
         "arenas": settings.arenas,
         "seeds": settings.seeds,
-        "robots": robots,
-        "substeps": substeps,
-        "arena_steps_per_s": arena_steps,
-        "robot_steps_per_s": arena_steps * robots,
-        "physics_steps_per_s": arena_steps * substeps,
-        "transitions_per_s": None if transitions is None else transitions / seconds,
-        "compile_s": compile_s,
+        "robots": settings.stage[-1].robots,
+        "obstacles": settings.stage[-1].obstacles,
+        "side": settings.stage[-1].side,
+        "substeps": config.substeps(settings.robot, settings.sim.substeps),
+        "control_step": settings.task.control_step,
+        **COUNTED,
+        "matmul_precision": timing.matmul_precision(),
+    }
+
+
+def made_with() -> dict[str, Any]:
+    """The fields of a line that say where it was made."""
+    return {
         "device": provenance.device(),
         "versions": provenance.versions(),
         "commit": provenance.commit(),
     }
 
 
-def results(settings: TrainConfig) -> list[dict]:
-    """Runs the three benchmarks and returns their lines."""
-    program, schedule = loop.load(settings)
-    start = jax.jit(partial(seeds.init, program))
-    keys = jax.vmap(jax.random.key)(np.array(seeds.numbers(settings), np.uint32))
-    lines = []
-    *timing, _ = measure(partial(_physics, program), start(schedule).arenas, keys)
-    lines.append(_line(program, "physics", CONTROL_STEPS, timing, None))
-    arenas = start(schedule).arenas
-    *timing, _ = measure(partial(_environments, program), arenas, (schedule, keys))
+def time_physics(prepared: Prepared) -> dict[str, Any]:
+    """Times the physics alone; returns the line."""
+    arenas = prepared.start(prepared.schedule).arenas
+    calls_s, _ = timing.time_program(prepared.physics, arenas, prepared.keys)
+    steps = CONTROL_STEPS[prepared.program.config.robot.body]
+    return _line(prepared, "physics", steps, calls_s)
+
+
+def time_environment(prepared: Prepared) -> dict[str, Any]:
+    """Times the environment; returns the line."""
+    settings = prepared.program.config
+    arenas, argument = prepared.start(prepared.schedule).arenas, (prepared.schedule, prepared.keys)
+    calls_s, _ = timing.time_program(prepared.environment, arenas, argument)
     steps = _rollouts(settings) * settings.algo.rollout
-    lines.append(_line(program, "environment", steps, timing, None))
+    return _line(prepared, "environment", steps, calls_s)
+
+
+def time_training(prepared: Prepared, arena_steps_per_s: float) -> dict[str, Any]:
+    """Times training, in calls whose length follows from the environment's speed.
+
+    Args:
+      prepared: what to run.
+      arena_steps_per_s: of the environment; training is taken to be half as fast.
+
+    Returns:
+      The line.
+    """
+    settings = prepared.program.config
     per_update = settings.seeds * settings.arenas * settings.algo.rollout
-    rate = lines[-1]["arena_steps_per_s"] / per_update
-    n = int(np.clip(TRAIN_SECONDS * rate / 2, 1, settings.updates))
-    train = partial(seeds.train_chunk, program, schedule)
-    *timing, metrics = measure(train, start(schedule), np.int32(n))
+    updates = TRAIN_SECONDS * arena_steps_per_s / per_update / 2
+    n = int(np.clip(updates, 1, prepared.program.rows))
+    state = prepared.start(prepared.schedule)
+    calls_s, metrics = timing.time_program(prepared.training, state, np.int32(n))
     transitions = float(np.sum(np.asarray(metrics["transitions"], np.float64)[:, :n]))
-    lines.append(_line(program, "training", n * settings.algo.rollout, timing, transitions))
-    return lines
+    return _line(prepared, "training", n * settings.algo.rollout, calls_s, transitions)
+
+
+def results(prepared: Prepared) -> list[dict[str, Any]]:
+    """Runs the three benchmarks of one size; returns their lines."""
+    environment = time_environment(prepared)
+    training = time_training(prepared, environment["arena_steps_per_s"])
+    return [time_physics(prepared), environment, training]
+
+
+def sweep(points: Sequence[TrainConfig]) -> Iterator[list[dict[str, Any]]]:
+    """Compiles all sizes, then runs one after the other; yields the lines of each.
+
+    Compiling, not running, is what takes long; it is done in threads, and over before the first
+    call is timed.
+    """
+    with ThreadPoolExecutor(THREADS) as pool:
+        futures = [pool.submit(prepare, settings) for settings in points]
+    for settings in points:
+        try:
+            # Taken out of the list: what one size holds on the device is not to outlive it.
+            yield results(futures.pop(0).result())
+        except jax.errors.JaxRuntimeError as error:
+            reason = str(error).partition("\n")[0][:300]
+            line = {"benchmark": "steps_per_second", **about(settings), "failed": reason}
+            yield [line | made_with()]
 
 
 def _physics(program: Program, arenas: EnvState, keys: Array) -> tuple[EnvState, Array]:
@@ -165,7 +269,7 @@ def _physics(program: Program, arenas: EnvState, keys: Array) -> tuple[EnvState,
 
 
 def _environments(
-    program: Program, arenas: EnvState, argument: tuple[curriculum.Schedule, Array]
+    program: Program, arenas: EnvState, argument: tuple[Schedule, Array]
 ) -> tuple[EnvState, Array]:
     """`environment` for all seeds."""
     schedule, keys = argument
@@ -173,12 +277,28 @@ def _environments(
     return seeds.each(program.config, lambda lane: step(*lane), (arenas, keys))
 
 
+def split(words: Sequence[str], key: str) -> tuple[list[str], list[str]]:
+    """Takes a key with several values out of the words of a command line.
+
+    Args:
+      words: `key=value`.
+      key: the one with commas in its value.
+
+    Returns:
+      Its values, none if it is not there, and the other words.
+    """
+    given = [word.partition("=")[2] for word in words if word.startswith(f"{key}=")]
+    rest = [word for word in words if not word.startswith(f"{key}=")]
+    return given[-1].split(",") if given else [], rest
+
+
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    settings = config.load_train(["stage=s6", *arguments])
-    settings = replace(settings, stage=settings.stage[-1:])
-    for line in results(settings):
-        sys.stdout.write(json.dumps(line) + "\n")
+    sizes, words = split(arguments, "arenas")
+    given = [[f"arenas={size}"] for size in sizes] or [[]]
+    points = [config.load_train(["stage=s6", *words, *size]) for size in given]
+    for lines in sweep([replace(point, stage=point.stage[-1:]) for point in points]):
+        sys.stdout.write("".join(json.dumps(line) + "\n" for line in lines))
         sys.stdout.flush()
     return 0
 

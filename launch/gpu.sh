@@ -3,8 +3,6 @@
 # Needs the extra `gpu`: uv sync --extra gpu. Keys given here win over those below.
 set -euo pipefail
 
-# Programs that take many seconds to compile are kept between runs.
-export JAX_COMPILATION_CACHE_DIR="${JAX_COMPILATION_CACHE_DIR:-${XDG_CACHE_HOME:-$HOME/.cache}/swarmjax/xla}"
 # JAX's own default, written out because it matters here: JAX takes this share of the card at once,
 # and Warp's kernels and temporary arrays live in what is left.
 export XLA_PYTHON_CLIENT_MEM_FRACTION="${XLA_PYTHON_CLIENT_MEM_FRACTION:-0.75}"
@@ -12,7 +10,7 @@ export XLA_PYTHON_CLIENT_MEM_FRACTION="${XLA_PYTHON_CLIENT_MEM_FRACTION:-0.75}"
 # goes through them: Warp's kernels are float32. With sim.impl=jax set this to `highest`.
 export JAX_DEFAULT_MATMUL_PRECISION="${JAX_DEFAULT_MATMUL_PRECISION:-default}"
 
-# arenas: where an H100's speed levels off. budget: about a minute of training there; the share of
-# targets reached levels off within the first ten seconds.
+# arenas: where an H100's speed levels off; `arenas=auto` fills the card. budget: about a minute of
+# training there; the share of targets reached levels off within the first ten seconds.
 exec uv run --extra gpu python -m swarmjax.train \
   sim.impl=warp stage=s6 arenas=65536 budget=500e6 "$@"

@@ -10,6 +10,7 @@ files hold what tells robots, realism, algorithms and stages apart; each default
 import itertools
 import math
 import re
+import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -29,9 +30,12 @@ SUITE_SEED = 1_000_000
 DISC = 0.15  # m, edge of the square about the disc of a start or a target
 PASSAGE = 0.10  # m; between obstacles, and between an obstacle and a wall
 FILLING = 0.4  # boxes per square of a grid that random placing surely reaches
+# Arenas of all seeds whose episodes are written down one by one: more end thousands a second.
+MOST_LOGGED = 8192
 
 # What may change when a run goes on; everything else fixes what it has computed so far.
 _RESUME_KEYS = ("budget", "resume", "run.*")
+_REPRODUCE_RESUME_KEYS = ("resume", "minutes", "device", "arms", "episodes", "workers")
 # The options of a curriculum that not all modes take: those that do, and what null stands for.
 _STEPWISE = ("sequential", "mixed")
 _MODE_OPTIONS: dict[str, tuple[tuple[str, ...], float | str | None]] = {
@@ -274,11 +278,11 @@ class RewardConfig(Section):
 
     progress: float = field(default=1.0, metadata=about("per metre nearer to the target"))
     proximity: float = field(
-        default=-0.001, metadata=about("per control step with something in infrared range")
+        default=0.0, metadata=about("per control step with something in infrared range")
     )
     arrival: float = field(default=0.0, metadata=about("once, on arrival"))
     contact: float = field(default=-0.02, metadata=about("per contact event"))
-    time: float = field(default=-0.001, metadata=about("per control step until arrival"))
+    time: float = field(default=-0.002, metadata=about("per control step until arrival"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -605,7 +609,18 @@ class RunConfig(Section):
         metadata=about("updates after which the run saves and stops", 0, MAX_COUNT),
     )
     tensorboard: bool = field(default=True, metadata=about("write TensorBoard events"))
+    episodes: bool = field(
+        default=False, metadata=about("write episodes.jsonl: each episode, robot by robot")
+    )
     dry: bool = field(default=False, metadata=about("check and describe the run, train nothing"))
+    compile_cache: Literal["auto"] | str | None = field(
+        default="auto",
+        metadata=about("directory that keeps compiled programs; auto: the user's; null: none"),
+    )
+    memory_share: float = field(
+        default=0.8,
+        metadata=about("of the GPU's memory, what arenas=auto fills", above=0.0, high=1.0),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -790,11 +805,17 @@ class TrainConfig(Section):
     seeds: int = field(
         default=1, metadata=about("runs trained at once, of seed, seed + 1, ...", 1, 4096)
     )
-    seeds_by: Literal["vmap", "map"] = field(
+    seeds_by: Literal["vmap", "map", "cores"] = field(
         default="vmap",
-        metadata=about("vmap: side by side; map: in turn, each as it would be alone, bit for bit"),
+        metadata=about(
+            "vmap: side by side; map: in turn, each as it would be alone, bit for bit; cores: "
+            "vmap, in a group for each core of a CPU"
+        ),
     )
-    arenas: int = field(default=128, metadata=about("arenas simulated at once", 1, 2**20))
+    arenas: int = field(
+        default=128,
+        metadata=about("arenas simulated at once; auto: by run.memory_share", 1, 2**20),
+    )
     budget: int = field(
         default=3_000_000, metadata=about("control steps of all arenas together", 1, 10**15)
     )
@@ -828,6 +849,7 @@ class TrainConfig(Section):
         self._check_budget()
         self._check_counts()
         self._check_algo()
+        self._check_episodes()
         _check_realism(self.realism, self.robot, self.task, self.task.step_limit)
         names = [stage.name for stage in self.stage]
         if len(names) == 1 or not self.stage_name:
@@ -858,6 +880,13 @@ class TrainConfig(Section):
                 f"arenas is {self.arenas}, but robot steps are counted in 32 bits, and "
                 f"{self.sim.max_robots} robots for {steps} control steps leave room for {most}: "
                 f"give at most {most}."
+            )
+
+    def _check_episodes(self) -> None:
+        if self.run.episodes and self.arenas * self.seeds > MOST_LOGGED:
+            raise ConfigError(
+                f"run.episodes is true, but arenas is {self.arenas} and seeds is {self.seeds}: "
+                f"give at most {MOST_LOGGED} arenas of all seeds together, or run.episodes=false."
             )
 
     def _check_algo(self) -> None:
@@ -1187,13 +1216,118 @@ class ReplayConfig(Section):
         )
 
 
-def load_train(overrides: Sequence[str]) -> TrainConfig:
+# The runs of a reproduction: docs/paper.md.
+Arm = Literal[
+    "curriculum",
+    "baseline",
+    "curriculum_expanded",
+    "baseline_expanded",
+    "modern_curriculum",
+    "modern_baseline",
+]
+ARMS: tuple[Arm, ...] = typing.get_args(Arm)
+LEAST_SEEDS = 3  # for an interval
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReproduceConfig(Section):
+    """The published experiment, several times over.
+
+    What is not said here is as in `algo=paper`.
+    """
+
+    seeds: int = field(default=10, metadata=about("of each arm; an interval takes 3", 1, 4096))
+    seed: int = field(default=0, metadata=about("the first of them", 0, MAX_COUNT))
+    seeds_by: Literal["vmap", "map", "cores"] = field(
+        default="cores", metadata=about("as in training")
+    )
+    budget: int = field(
+        default=1_000_000,
+        metadata=about("control steps of a seed: 'max training timesteps'", 1, MAX_COUNT),
+    )
+    fine_tune: int = field(
+        default=250_000, metadata=about("control steps of a seed in the 1.5 m arena", 1, MAX_COUNT)
+    )
+    arms: tuple[Arm, ...] = field(
+        default=ARMS, metadata=about("which runs; *_expanded goes on with the one before it")
+    )
+    rollout: int = field(
+        default=6000, metadata=about("control steps of an update of the paper's", 1, MAX_COUNT)
+    )
+    epochs: int = field(
+        default=80, metadata=about("of an update of the paper's: 'PPO K epochs'", 1, MAX_COUNT)
+    )
+    step_limit: int = field(
+        default=1500, metadata=about("'Max timesteps per episode'", 1, MAX_COUNT)
+    )
+    time_out: Literal["terminal", "leak"] = field(
+        default="terminal", metadata=about("the paper's return at the step limit: algo.time_out")
+    )
+    threshold: float = field(
+        default=0.8, metadata=about("share of the targets that promotes", 0.0, 1.0)
+    )
+    robot: Literal["paper", "planar"] = field(
+        default="paper", metadata=about("range of the commands: printed, or of the hardware")
+    )
+    impl: Literal["auto", "jax", "warp"] = field(
+        default="auto", metadata=about("MJX implementation, as sim.impl")
+    )
+    device: Literal["auto", "cpu", "gpu"] = field(
+        default="auto", metadata=about("that trains; auto: a GPU if there is one")
+    )
+    minutes: float | None = field(
+        default=None,
+        metadata=about("after which it saves and stops, to go on with resume", above=0.0),
+    )
+    episodes: int = field(
+        default=20, metadata=about("on which each policy is judged on each stage", 1, MAX_COUNT)
+    )
+    workers: int | None = field(
+        default=None, metadata=about("processes that judge; null: one a core", 1, 1024)
+    )
+    out: str | None = field(
+        default=None, metadata=about("directory; null: runs/<date>-<time>-reproduce")
+    )
+    resume: str | None = field(
+        default=None, metadata=about("directory of a reproduction to go on with")
+    )
+
+    def _check(self) -> None:
+        if self.seeds < LEAST_SEEDS:
+            raise ConfigError(
+                f"seeds is {self.seeds}, too few for an interval: give {LEAST_SEEDS} or more."
+            )
+        for key in ("budget", "fine_tune"):
+            if getattr(self, key) < self.rollout:
+                raise ConfigError(
+                    f"{key} is {getattr(self, key)}, which ends before the first update: give at "
+                    f"least {self.rollout}, the control steps of one."
+                )
+        if not self.arms:
+            raise ConfigError(f"arms is []: give some of {', '.join(ARMS)}.")
+        for arm in self.arms:
+            if self.arms.count(arm) > 1:
+                raise ConfigError(f"arms names {arm} more than once: give each once.")
+            first = arm.removesuffix("_expanded")
+            if first not in self.arms:
+                raise ConfigError(f"arms names {arm}, but not {first}, which it goes on with.")
+
+
+def load_train(overrides: Sequence[str], *, auto: bool = False) -> TrainConfig:
     """Make the configuration of `swarmjax.train` from its `key=value` words.
+
+    Args:
+        overrides: the words.
+        auto: whether `arenas=auto` may be among them. It leaves the fewest arenas there can be,
+            algo.minibatches; `memory.fill` chooses how many there will be.
 
     Raises:
         ConfigError: see the module.
     """
     mapping, chosen = compose.compose(TrainConfig, "train", overrides)
+    if auto and mapping.get("arenas") == "auto":
+        algo = build(AlgoConfig, mapping.get("algo", {}), "algo.")
+        mapping["arenas"] = algo.minibatches
     stages = _stages(mapping.get("stage", {}), chosen["stage"])
     made = build(TrainConfig, mapping | {"stage": stages, "stage_name": chosen["stage"]})
     if "start_std" in mapping and made.start is None:
@@ -1318,6 +1452,33 @@ def load_replay(overrides: Sequence[str]) -> ReplayConfig:
     _check_suite_alone(ReplayConfig, mapping.get("suite"), overrides)
     stage = _one_stage(mapping.get("stage", {}), chosen["stage"])
     return build(ReplayConfig, mapping | {"stage": stage})
+
+
+def load_reproduce(
+    overrides: Sequence[str], stored: Mapping[str, Any] | None = None
+) -> ReproduceConfig:
+    """Make the configuration of `swarmjax.reproduce` from its `key=value` words.
+
+    Args:
+        overrides: the words.
+        stored: configuration of the reproduction to go on with, as `to_dict` gave it, if any; only
+            what does not change what has been computed may then be given.
+
+    Raises:
+        ConfigError: see the module.
+    """
+    if stored is None:
+        mapping, _ = compose.compose(ReproduceConfig, "reproduce", overrides)
+        return build(ReproduceConfig, mapping)
+    words = compose.split_words(ReproduceConfig, overrides)
+    for key, word in words.items():
+        if key not in _REPRODUCE_RESUME_KEYS:
+            raise ConfigError(
+                f"{word} cannot be given: resume keeps the rest of the stored reproduction and "
+                f"takes {', '.join(_REPRODUCE_RESUME_KEYS)} only."
+            )
+    kept = to_dict(build(ReproduceConfig, stored, "stored ")) | {"minutes": None}
+    return build(ReproduceConfig, kept | compose.values(words))
 
 
 def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainConfig:

@@ -137,14 +137,15 @@ def _by_mjx(
     report: Callable[[int], None],
 ) -> Iterator[tuple[list[Outcome], np.ndarray]]:
     """Runs each cell at once by the engine that trains."""
-    from swarmjax import evaluate_mjx  # the one that needs JAX
+    from swarmjax import compile_cache, evaluate_mjx  # those that need JAX
 
     for cell in cells:
         mine, outcomes = specialise(config, cell, entrants[0].path), []
-        world = evaluate_mjx.load(mine, cell.half, len(cell.episodes))
-        for each in entrants:
-            outcomes.append(evaluate_mjx.play(world, cell.levels, each.policy, config.steps))
-            report(len(cell.episodes))
+        with compile_cache.use(compile_cache.AUTO):
+            world = evaluate_mjx.load(mine, cell.half, len(cell.episodes))
+            for each in entrants:
+                outcomes.append(evaluate_mjx.play(world, cell.levels, each.policy, config.steps))
+                report(len(cell.episodes))
         yield outcomes, ways(mine, cell.levels)
 
 
@@ -161,7 +162,7 @@ def _by_c(
         for cell in cells
     ]
     flat = [job for by_policy in jobs for mine in by_policy for job in mine]
-    done = _work(flat, min(workers, len(flat)))
+    done = work(_simulate, flat, min(workers, len(flat)))
     for by_policy in jobs:
         outcomes, lengths = [], []
         for mine in by_policy:
@@ -186,15 +187,23 @@ def _jobs(
     return [_Job(mine, entrant.policy, cell.half, part, find_ways) for part in parts]
 
 
-def _work(jobs: Sequence[_Job], workers: int) -> Iterator[tuple[Outcome, np.ndarray | None]]:
-    """Does jobs in their order."""
+def work[Job, Result](
+    function: Callable[[Job], Result], jobs: Sequence[Job], workers: int
+) -> Iterator[Result]:
+    """Does jobs, yielding what comes of them in their order.
+
+    Args:
+        function: Of a module, so that other processes find it.
+        jobs: What it takes.
+        workers: Processes; with one there is no other than this.
+    """
     if workers == 1:
-        yield from map(_simulate, jobs)
+        yield from map(function, jobs)
         return
     # Ctrl-C ends the others at once and without a word; this process says what happened.
     end = (signal.SIGINT, signal.SIG_DFL)
     with ProcessPoolExecutor(workers, get_context("spawn"), signal.signal, end) as pool:
-        yield from pool.map(_simulate, jobs)
+        yield from pool.map(function, jobs)
 
 
 def _simulate(job: _Job) -> tuple[Outcome, np.ndarray | None]:

@@ -13,7 +13,7 @@ from flax import struct
 from jax import Array
 
 from swarmjax import curriculum as curricula
-from swarmjax import promotion, rollout
+from swarmjax import episodes, promotion, rollout
 from swarmjax.config import TrainConfig
 from swarmjax.curriculum import Curriculum, Decision, Mode, Schedule
 from swarmjax.curriculum_modes import MODES
@@ -44,7 +44,10 @@ class Program:
     @property
     def rows(self) -> int:
         """Most updates of one call."""
-        return min(self.config.updates, max(1, MAX_ROWS // self.config.seeds))
+        most = max(1, MAX_ROWS // self.config.seeds)
+        if self.config.run.episodes:
+            most = min(most, episodes.rows_of_call(self.config))
+        return min(self.config.updates, most)
 
     @property
     def mode(self) -> Mode:
@@ -170,6 +173,8 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
         **_learner_metrics(learned, batch),
         **_episode_metrics(ended, state.curriculum.stage),
     }
+    if config.run.episodes:
+        metrics[episodes.KEY] = episodes.pack(ended, episodes.room(config))
     new = TrainState(
         learners=learners,
         arenas=arenas,

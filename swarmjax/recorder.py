@@ -1,4 +1,4 @@
-"""What a run writes while it trains: `metrics.jsonl`, `curriculum.jsonl` and TensorBoard."""
+"""What a run writes while it trains: metrics, decisions, episodes (all JSONL) and TensorBoard."""
 
 import json
 import math
@@ -11,7 +11,7 @@ from tensorboardX import SummaryWriter
 
 from swarmjax.sim import gaps
 
-METRICS, DECISIONS = "metrics.jsonl", "curriculum.jsonl"
+METRICS, DECISIONS, EPISODES = "metrics.jsonl", "curriculum.jsonl", "episodes.jsonl"
 BOARDS = 16  # seeds that TensorBoard is written for: a board holds three files open
 
 Row = dict[str, Any]
@@ -91,17 +91,19 @@ class Recorder:
         tensorboard: bool,
         update: int,
         arena_steps: int = 0,
+        episodes: bool = False,
     ) -> None:
         """Opens the files, dropping what a stopped run wrote after the checkpoint `update`.
 
         `arena_steps` is where that checkpoint stands, on TensorBoard's axis. Of several seeds the
-        first `BOARDS` have a folder of TensorBoard each.
+        first `BOARDS` have a folder of TensorBoard each. `episodes` opens a file for them.
         """
         run.mkdir(parents=True, exist_ok=True)
-        for name in (METRICS, DECISIONS):
+        for name in (METRICS, DECISIONS, EPISODES):
             _truncate(run / name, update)
         self._metrics = (run / METRICS).open("a")
         self._decisions = (run / DECISIONS).open("a")
+        self._episodes = (run / EPISODES).open("a") if episodes else None
         purge = arena_steps + 1 if update else None  # TensorBoard hides what it has from here on
         folder = run / "tensorboard"
         folders = {k: folder / f"seed{k}" if len(seeds) > 1 else folder for k in seeds[:BOARDS]}
@@ -128,6 +130,12 @@ class Recorder:
                     _add_scalars(boards[row["seed"]], row, row["arena_steps"])
             _add_scalars(next(iter(boards.values())), speeds, found[-1]["arena_steps"])
 
+    def write_episodes(self, found: Iterable[Row]) -> None:
+        """Writes the episodes of a call, where there is a file for them."""
+        if self._episodes is not None:
+            self._episodes.writelines(json.dumps(row) + "\n" for row in found)
+            self._episodes.flush()
+
     def __enter__(self) -> "Recorder":
         """Returns itself."""
         return self
@@ -136,6 +144,8 @@ class Recorder:
         """Closes the files."""
         self._metrics.close()
         self._decisions.close()
+        if self._episodes is not None:
+            self._episodes.close()
         for board in self._boards.values():
             board.close()
 

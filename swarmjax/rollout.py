@@ -57,6 +57,26 @@ class Trajectory(NamedTuple):
     valid: Array
 
 
+class Robots(NamedTuple):
+    """What became of the robots of episodes that ended, [T, A, R], zero where none did.
+
+    Attributes:
+      present: took part; where not, the rest means nothing.
+      reached: arrived.
+      reward: sum over the episode, nothing discounted.
+      robot_steps: control steps before arrival.
+      sensed: those with an infrared ray shorter than its range.
+      contacts: of all kinds.
+    """
+
+    present: Array
+    reached: Array
+    reward: Array
+    robot_steps: Array
+    sensed: Array
+    contacts: Array
+
+
 class Ended(NamedTuple):
     """Episodes that ended, [T, A, ...], zero where none did.
 
@@ -73,6 +93,7 @@ class Ended(NamedTuple):
       contacts: [.., 3] of each kind, over all robots.
       reward: sum over all robots, nothing discounted.
       broken: 1 where it ended because the physics was no longer finite.
+      robots: each robot by itself, if `run.episodes` asks for it.
     """
 
     episodes: Array
@@ -87,6 +108,7 @@ class Ended(NamedTuple):
     contacts: Array
     reward: Array
     broken: Array
+    robots: Robots | None = None
 
 
 def to_learners(x: Array, learners: int) -> Array:
@@ -277,7 +299,7 @@ def _step(
     )
     arenas, came = jax.vmap(functools.partial(env.step, world))(arenas, to_arenas(action))
     next_value = _values(world, learners, came.observation)
-    ended = _ended(arenas, came)
+    ended = _ended(arenas, came, by_robot=world.config.run.episodes)
     starts, start_value = _next(waits, begun)
     arenas = restart(arenas, starts, came.done)
     over = jnp.broadcast_to(came.done[None, :, None], next_value.shape)
@@ -341,7 +363,7 @@ def _pick[Tree](done: Array, yes: Tree, no: Tree) -> Tree:
     return jax.tree.map(pick, yes, no)
 
 
-def _ended(arenas: EnvState, came: env.TimeStep) -> Ended:
+def _ended(arenas: EnvState, came: env.TimeStep, *, by_robot: bool) -> Ended:
     """Sums up the episodes that ended in this step, [A]."""
     done, episode = came.done, arenas.episode
     present = arenas.level.present
@@ -363,4 +385,18 @@ def _ended(arenas: EnvState, came: env.TimeStep) -> Ended:
         contacts=mine(jnp.sum(episode.contacts, axis=-2)),
         reward=mine(jnp.sum(episode.reward, axis=-1)),
         broken=(~came.sound).astype(jnp.int32),
+        robots=jax.tree.map(mine, _robots(arenas)) if by_robot else None,
+    )
+
+
+def _robots(arenas: EnvState) -> Robots:
+    """Tells what became of each robot, [A, R]."""
+    present, episode = arenas.level.present, arenas.episode
+    return Robots(
+        present=present,
+        reached=present & arenas.arrived,
+        reward=episode.reward,
+        robot_steps=episode.moving,
+        sensed=episode.sensed,
+        contacts=jnp.sum(episode.contacts, axis=-1),
     )

@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -61,7 +62,8 @@ def each(config: TrainConfig, function: Callable[[Any], Any], lanes: Any) -> Any
 
     Side by side (`vmap`) the matrix products are batched, which rounds differently from one seed
     alone, but the same in every lane; one seed is not batched at all. In turn (`map`) a seed comes
-    to the same bits however many there are.
+    to the same bits however many there are. With `cores` they go side by side in groups, of which
+    each call has one.
 
     Args:
       config: the run's config.
@@ -73,10 +75,37 @@ def each(config: TrainConfig, function: Callable[[Any], Any], lanes: Any) -> Any
     """
     if config.seeds_by == "map":
         return jax.lax.map(function, lanes)
-    if config.seeds == 1:
+    if jax.tree.leaves(lanes)[0].shape[0] == 1:
         alone = function(jax.tree.map(lambda x: x[0], lanes))
         return jax.tree.map(lambda x: x[None], alone)
     return jax.vmap(function)(lanes)
+
+
+def groups(config: TrainConfig, cores: int) -> int:
+    """Returns into how many groups of as many seeds a run is cut, to be called at once.
+
+    Args:
+      config: the run's config.
+      cores: that the process may use.
+    """
+    if config.seeds_by != "cores" or jax.default_backend() != "cpu":
+        return 1
+    return next(n for n in range(min(cores, config.seeds), 0, -1) if config.seeds % n == 0)
+
+
+def split(lanes: Any, parts: int) -> list[Any]:
+    """Cuts a tree with a leading axis N into trees with N / parts each."""
+
+    def cut(x: Array, i: int) -> Array:
+        size = x.shape[0] // parts
+        return x[i * size : (i + 1) * size]
+
+    return [jax.tree.map(partial(cut, i=i), lanes) for i in range(parts)]
+
+
+def join(parts: list[Any]) -> Any:
+    """Undoes `split`."""
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 
 def stepped_together(program: Program, state: TrainState) -> PhysicsState:

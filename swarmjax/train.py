@@ -6,6 +6,7 @@ With no argument it trains the default curriculum. `--help` lists every key.
 import json
 import math
 import sys
+import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
@@ -14,7 +15,19 @@ from pathlib import Path
 
 import jax
 
-from swarmjax import checkpoint, command, config, curriculum, export, loop, provenance, seeds, start
+from swarmjax import (
+    checkpoint,
+    command,
+    compile_cache,
+    config,
+    curriculum,
+    export,
+    loop,
+    memory,
+    provenance,
+    seeds,
+    start,
+)
 from swarmjax.checkpoint import CheckpointError
 from swarmjax.config import ConfigError, TrainConfig
 from swarmjax.curriculum import Schedule
@@ -22,51 +35,104 @@ from swarmjax.display import Display
 from swarmjax.loop import Program, TrainState
 from swarmjax.sim import physics
 from swarmjax.start import Source
-from swarmjax.trainer import Stop, Tally, TrainingError, compile_chunk, train
+from swarmjax.trainer import (
+    Stop,
+    Tally,
+    TrainingError,
+    compile_chunk,
+    measure,
+    prepare,
+    train,
+)
 
 FAILED = 1
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    settings = _settings(arguments)
-    source = start.read(settings)
-    program, schedule = loop.load(settings)
-    template = jax.eval_shape(partial(seeds.init, program), schedule)
+    settings, auto = _settings(arguments)
+    with compile_cache.use(settings.run.compile_cache):
+        if auto:
+            available = None if jax.default_backend() == "cpu" else memory.limit()
+            with memory.refusal(settings):
+                settings, why = memory.fill(settings, measure, available)
+            sys.stdout.write(f"{why}\n")
+        with memory.refusal(settings):
+            return _run(settings)
+
+
+def _run(settings: TrainConfig) -> int:
+    """Does what the config says; returns the exit code."""
     if settings.run.dry:
-        return _dry_run(program, schedule, template)
-    state, skipped = _first_state(program, schedule, template, source)
-    run = _open_run(settings)
+        return _dry_run(settings)
+    run = _find_run(settings)
     with Stop() as stop, Display(settings.updates) as display:
-        for sentence in skipped:
-            display.say(f"{sentence}: it was passed over.")
-        if source is not None:
-            display.say(
-                f"starting with what {source.run} had learned after {source.update} updates"
-            )
-        display.say(f"{_opening(settings)}, into {run}; compiling")
-        for sentence in _short_budget(settings, schedule):
-            display.say(sentence)
         try:
-            state, tally = train(run, program, schedule, state, display, stop)
+            tally = carry_out(settings, run, stop, display)
         except TrainingError as error:
             display.say(f"swarmjax.train: error: {error} What was saved before is in {run}.")
             return FAILED
-    _write_results(run, program, state, tally)
     sys.stdout.write(_closing(run, settings, tally) + "\n")
     return command.INTERRUPTED if stop.asked else 0
 
 
-def _settings(arguments: Sequence[str]) -> TrainConfig:
-    """Reads the command line; with `resume=` the stored config and what may be changed of it."""
+def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) -> Tally:
+    """Trains as a config says, and writes what a run directory holds.
+
+    Args:
+      settings: the config; with `resume` it goes on.
+      run: the run directory, in which there is no other run.
+      stop: notices signals.
+      display: shows the run.
+
+    Returns:
+      What came of the run.
+
+    Raises:
+      ConfigError: if it cannot begin as the config says, or needs more memory than there is.
+      CheckpointError: if what it goes on with is damaged.
+      TrainingError: if a loss is no longer finite.
+    """
+    source = start.read(settings)
+    program, schedule, template = _load(settings)
+    state, skipped = _first_state(program, schedule, template, source)
+    for sentence in skipped:
+        display.say(f"{sentence}: it was passed over.")
+    if source is not None:
+        display.say(f"starting with what {source.run} had learned after {source.update} updates")
+    display.say(f"{_opening(settings)}, into {run}; compiling")
+    for sentence in _short_budget(settings, schedule):
+        display.say(sentence)
+    compiled, state = prepare(program, schedule, state, memory.limit())
+    _open_run(run, settings)
+    state, tally = train(run, program, schedule, compiled, state, display, stop)
+    _write_results(run, program, state, tally)
+    return tally
+
+
+def _load(settings: TrainConfig) -> tuple[Program, Schedule, TrainState]:
+    """Builds the program, the curriculum's numbers and the shapes of the state."""
+    program, schedule = loop.load(settings)
+    template = jax.eval_shape(partial(seeds.init, program), schedule)
+    memory.check_state(settings, memory.size(template), memory.limit())
+    return program, schedule, template
+
+
+def _settings(arguments: Sequence[str]) -> tuple[TrainConfig, bool]:
+    """Reads the command line; with `resume=` the stored config and what may be changed of it.
+
+    Returns:
+      The config, and whether its number of arenas is still to be chosen.
+    """
     given = {key: value for key, _, value in (word.partition("=") for word in arguments)}
     resumed = given.get("resume", "null").strip("'\"")
     if resumed in ("", "null"):
-        return config.load_train(arguments)
+        auto = given.get("arenas", "").strip("'\"") == memory.AUTO
+        return config.load_train(arguments, auto=auto), auto
     settings = config.load_resume(export.read_config(Path(resumed)), arguments)
     kept = given.get("run.dir", "null") in ("", "null") or settings.run.dir is None
     directory = settings.resume if kept else settings.run.dir
-    return replace(settings, run=replace(settings.run, dir=directory))
+    return replace(settings, run=replace(settings.run, dir=directory)), False
 
 
 def _first_state(
@@ -91,8 +157,8 @@ def _first_state(
     return checkpoint.from_leaves(leaves, template), skipped
 
 
-def _open_run(settings: TrainConfig) -> Path:
-    """Makes the run directory and writes `config.json` into it."""
+def _find_run(settings: TrainConfig) -> Path:
+    """Finds a run directory that can be written and holds no other run; writes nothing."""
     every = seeds.numbers(settings)
     seed = f"seed{every[0]}" if len(every) == 1 else f"seeds{every[0]}-{every[-1]}"
     name = f"{datetime.now():%Y%m%d-%H%M%S}-{settings.stage_name}-{seed}"
@@ -104,20 +170,36 @@ def _open_run(settings: TrainConfig) -> Path:
             f"resume={run} to go on with it."
         )
     try:
+        there = next(path for path in (run, *run.resolve().parents) if path.exists())
+        tempfile.TemporaryFile(dir=there).close()
+    except OSError as error:
+        raise _unwritable(run, error) from None
+    return run
+
+
+def _open_run(run: Path, settings: TrainConfig) -> None:
+    """Makes the run directory and writes `config.json` into it."""
+    try:
         run.mkdir(parents=True, exist_ok=True)
         stored = config.to_dict(replace(settings, resume=None))
         (run / "config.json").write_text(json.dumps(stored, indent=2) + "\n")
     except OSError as error:
-        raise ConfigError(f"run.dir is {run}, which cannot be written: {error.strerror}.") from None
-    return run
+        raise _unwritable(run, error) from None
 
 
-def _dry_run(program: Program, schedule: Schedule, template: TrainState) -> int:
+def _unwritable(run: Path, error: OSError) -> ConfigError:
+    return ConfigError(f"run.dir is {run}, which cannot be written: {error.strerror or error}.")
+
+
+def _dry_run(settings: TrainConfig) -> int:
     """Compiles, says what it took and what a run needs, and stops."""
+    start.read(settings)
+    program, schedule, template = _load(settings)
     compiled = compile_chunk(program, schedule, template)
+    memory.check(settings, compiled.total_bytes, memory.limit())
     state, work = compiled.state_bytes / 2**20, compiled.work_bytes / 2**20
     sys.stdout.write(
-        f"{'\n'.join([_opening(program.config), *_short_budget(program.config, schedule)])}\n"
+        f"{'\n'.join([_opening(settings), *_short_budget(settings, schedule)])}\n"
         f"compiled in {compiled.seconds:.1f} s; memory: {state:.1f} MiB of state, "
         f"{work:.1f} MiB to work with; nothing was trained (run.dry).\n"
     )
@@ -128,7 +210,9 @@ def _opening(settings: TrainConfig) -> str:
     """Says what is about to be trained."""
     names = ", ".join(stage.name for stage in settings.stage)
     steps, every = settings.arenas * settings.algo.rollout, seeds.numbers(settings)
-    how = {"vmap": "side by side", "map": "in turn"}[settings.seeds_by]
+    how = {"vmap": "side by side", "map": "in turn", "cores": "spread over cores"}[
+        settings.seeds_by
+    ]
     several = f", seeds {every[0]} to {every[-1]} {how}" if len(every) > 1 else ""
     return (
         f"swarmjax: {settings.stage_name} ({names}), {settings.updates:,} updates of {steps:,} "

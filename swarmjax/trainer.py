@@ -1,10 +1,12 @@
 """The host side of a run: calls the compiled chunk, records, shows, saves, and stops when asked."""
 
+import math
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from swarmjax import config, curriculum, recorder, seeds
+from swarmjax import config, curriculum, episodes, loop, memory, provenance, recorder, seeds
 from swarmjax.checkpoint import Checkpoints
 from swarmjax.config import TrainConfig
 from swarmjax.curriculum import Schedule
@@ -45,6 +47,11 @@ class Compiled:
     state_bytes: int
     work_bytes: int
 
+    @property
+    def total_bytes(self) -> int:
+        """Device memory that training needs."""
+        return self.state_bytes + self.work_bytes
+
 
 @dataclass
 class Tally:
@@ -74,9 +81,15 @@ class Tally:
 class Stop:
     """Notices SIGINT and SIGTERM while in a `with`, so that the run can save before it stops."""
 
-    def __init__(self) -> None:
-        """Nobody has asked yet."""
-        self.asked = False
+    def __init__(self, until: float = math.inf) -> None:
+        """Nobody has asked yet; it stops by itself at `until`, of `time.monotonic`."""
+        self.signalled = False
+        self._until = until
+
+    @property
+    def asked(self) -> bool:
+        """Whether to stop, because of a signal or of the time."""
+        return self.signalled or time.monotonic() >= self._until
 
     def __enter__(self) -> "Stop":
         """Begins to listen."""
@@ -90,9 +103,9 @@ class Stop:
             signal.signal(number, handler)
 
     def _ask(self, *_: object) -> None:
-        if self.asked:  # asked twice: not even to wait for the end of the call
+        if self.signalled:  # asked twice: not even to wait for the end of the call
             raise KeyboardInterrupt
-        self.asked = True
+        self.signalled = True
         sys.stderr.write("stopping after this call, to save; once more stops at once\n")
 
 
@@ -108,19 +121,71 @@ def compile_chunk(program: Program, schedule: Schedule, state: Any) -> Compiled:
       The program to call.
     """
     began = time.perf_counter()
+    groups = seeds.groups(program.config, provenance.cores())
     chunk = jax.jit(partial(seeds.train_chunk, program), donate_argnums=1)
-    call = chunk.lower(schedule, state, np.int32(1)).compile()
-    memory = call.memory_analysis()
-    assert memory is not None  # both CPU and GPU tell
-    work = memory.temp_size_in_bytes + memory.output_size_in_bytes
+    part = jax.eval_shape(partial(seeds.split, parts=groups), state)[0]
+    call = chunk.lower(schedule, part, np.int32(1)).compile()
+    found = call.memory_analysis()
+    assert found is not None  # both CPU and GPU tell
+    # What is returned lies where the donated state lay, but for the metrics.
+    returned = found.output_size_in_bytes - found.alias_size_in_bytes
+    work = groups * (found.temp_size_in_bytes + returned)
+    if groups > 1:
+        call = partial(_call_at_once, call, groups)
     seconds = time.perf_counter() - began
-    return Compiled(call, seconds, memory.argument_size_in_bytes, work)
+    return Compiled(call, seconds, groups * found.argument_size_in_bytes, work)
+
+
+def _call_at_once(
+    call: Callable[..., Any], groups: int, schedule: Schedule, state: TrainState, n: np.int32
+) -> tuple[TrainState, dict]:
+    """Calls the program of a group of seeds in a thread for each: XLA uses one core for it."""
+
+    def one(part: TrainState) -> tuple[TrainState, dict]:
+        return jax.block_until_ready(call(schedule, part, n))
+
+    parts = jax.jit(seeds.split, static_argnums=1)(state, groups)
+    with ThreadPoolExecutor(groups) as pool:
+        return jax.jit(seeds.join)(list(pool.map(one, parts)))
+
+
+def prepare(
+    program: Program, schedule: Schedule, state: TrainState, available: int | None
+) -> tuple[Compiled, TrainState]:
+    """Compiles, and takes all the memory that training needs, so that nothing can lack it later.
+
+    Args:
+      program: the compiled side.
+      schedule: the curriculum's numbers.
+      state: [N] where to start; donated.
+      available: memory of the device, bytes; None if it is not known.
+
+    Returns:
+      The program to call, its `seconds` with those that Warp's kernels took, and the same state.
+
+    Raises:
+      ConfigError: if it needs more than there is.
+    """
+    compiled = compile_chunk(program, schedule, state)
+    memory.check(program.config, compiled.total_bytes, available)
+    seconds = compiled.seconds + _build_kernels(program, state)
+    # A call of no updates changes nothing, but takes what the program works with.
+    state, _ = jax.block_until_ready(compiled.call(schedule, state, np.int32(0)))
+    return replace(compiled, seconds=seconds), state
+
+
+def measure(settings: TrainConfig) -> int:
+    """Compiles a config's program and returns the device memory that training needs, bytes."""
+    program, schedule = loop.load(settings)
+    template = jax.eval_shape(partial(seeds.init, program), schedule)
+    return compile_chunk(program, schedule, template).total_bytes
 
 
 def train(
     run: Path,
     program: Program,
     schedule: Schedule,
+    compiled: Compiled,
     state: TrainState,
     display: Display,
     stop: Stop,
@@ -131,6 +196,7 @@ def train(
       run: the run directory.
       program: the compiled side.
       schedule: the curriculum's numbers.
+      compiled: the program to call, as `prepare` made it.
       state: [N] where to start; donated.
       display: shows the run.
       stop: notices signals.
@@ -142,10 +208,8 @@ def train(
       TrainingError: if a loss of any seed is no longer finite; the checkpoint before that is kept.
     """
     settings = program.config.run
-    compiled = compile_chunk(program, schedule, state)
     done = int(state.update[0])
-    compile_s = compiled.seconds + _build_kernels(program, state)
-    tally = _tally(program, done, compile_s)
+    tally = _tally(program, done, compiled.seconds)
     saved_at = time.monotonic()
     with (
         _recorder(run, program, done) as record,
@@ -155,7 +219,10 @@ def train(
             began = time.perf_counter()
             state, metrics = compiled.call(schedule, state, np.int32(n))
             metrics = jax.device_get(metrics)
+            log = metrics.pop(episodes.KEY, None)
             _report(program, tally, metrics, n, time.perf_counter() - began, record, display)
+            if log is not None:
+                _log_episodes(program.config, log, np.arange(tally.update)[-n:], record, display)
             if time.monotonic() - saved_at >= 60.0 * settings.checkpoint_minutes:
                 checkpoints.save(state, tally.update)
                 saved_at = time.monotonic()
@@ -199,6 +266,7 @@ def _recorder(run: Path, program: Program, done: int) -> Recorder:
         run,
         seeds=seeds.numbers(settings),
         tensorboard=settings.run.tensorboard,
+        episodes=settings.run.episodes,
         update=done,
         arena_steps=done * settings.arenas * settings.algo.rollout,
     )
@@ -258,6 +326,25 @@ def _report(
             display.say(_sentence(settings, entry))
     pace = tally.seconds / (tally.update - tally.first)
     display.show(summarize(rows, names), speeds, pace * (settings.updates - tally.update))
+
+
+def _log_episodes(
+    settings: TrainConfig,
+    log: episodes.Log,
+    updates: np.ndarray,
+    record: Recorder,
+    display: Display,
+) -> None:
+    """Writes the episodes of a call down."""
+    names, numbers = [stage.name for stage in settings.stage], seeds.numbers(settings)
+    steps = settings.arenas * settings.algo.rollout
+    rows, lost = episodes.rows(log, updates, names, numbers, steps)
+    record.write_episodes(rows)
+    if lost:
+        display.say(
+            f"{lost:,} episodes up to update {updates[-1]:,} were too short for their number to "
+            f"be foreseen, and are missing from {recorder.EPISODES}."
+        )
 
 
 def _decisions(settings: TrainConfig, rows: list[Row]) -> list[Row]:

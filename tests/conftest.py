@@ -31,13 +31,19 @@ hypothesis.settings.load_profile("swarmjax")
 def pytest_configure(config: pytest.Config) -> None:
     """Keeps compiled programs in `.pytest_cache`, so that a second run compiles less.
 
-    Each process has its own: one may read what another has half written.
+    Each process has its own, with the commands that it starts: one may read what another has half
+    written. Without `.pytest_cache` nothing is kept: a test never touches the user's cache.
     """
     cache = getattr(config, "cache", None)  # absent with -p no:cacheprovider
-    if cache is not None:
-        process = os.environ.get("PYTEST_XDIST_WORKER", "alone")
-        jax.config.update("jax_compilation_cache_dir", str(cache.mkdir(f"jax-{process}")))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    if cache is None:
+        os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
+        jax.config.update("jax_enable_compilation_cache", False)
+        return
+    process = os.environ.get("PYTEST_XDIST_WORKER", "alone")
+    directory = str(cache.mkdir(f"jax-{process}"))
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = directory
+    jax.config.update("jax_compilation_cache_dir", directory)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 @pytest.fixture(scope="session")
@@ -49,7 +55,9 @@ def tiny_config() -> TrainConfig:
             StageConfig(name="trio", robots=3, side=0.8, obstacles=2),
         ),
         # Equation 3 alone, whose sums are easily worked out.
-        task=TaskConfig(step_limit=16, reward=RewardConfig(contact=0.0, time=0.0)),
+        task=TaskConfig(
+            step_limit=16, reward=RewardConfig(proximity=-0.001, contact=0.0, time=0.0)
+        ),
         algo=AlgoConfig(hidden=(8,), rollout=8, minibatches=2, epochs=2),
         sim=SimConfig(impl="jax", max_robots=3, max_obstacles=2),
         arenas=8,

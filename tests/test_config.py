@@ -76,7 +76,7 @@ def test_train_defaults_to_the_whole_curriculum():
 
 
 def test_defaults_of_the_reward_are_equation_3_and_two_prices():
-    assert dataclasses.astuple(RewardConfig()) == (1.0, -0.001, 0.0, -0.02, -0.001)
+    assert dataclasses.astuple(RewardConfig()) == (1.0, 0.0, 0.0, -0.02, -0.002)
 
 
 def test_robot_defaults_are_the_epuck():
@@ -250,7 +250,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["seeds=0"], "seeds is 0: give 1 to 4096."),
         (["seed=2147483647", "seeds=2"], "seed is 2147483647, but seeds is 2 and the last seed "
          "may be 2147483647: give at most 2147483646."),
-        (["seeds_by=pmap"], "seeds_by is 'pmap': give vmap or map."),
+        (["seeds_by=pmap"], "seeds_by is 'pmap': give vmap, map or cores."),
         (["arenas=100"], "arenas is 100, but algo.minibatches is 8: give a multiple of 8."),
         (["budget=4095"], "budget is 4095, but one update takes arenas x algo.rollout = 4096 "
          "control steps: give at least 4096."),
@@ -503,7 +503,10 @@ def test_help_gives_default_meaning_and_allowed_values():
     assert lines[0] == "usage: python -m swarmjax.train key=value ..."
     assert f"stage=curriculum ({CHOICES})" in lines
     assert "stage.robots=<the stage> active robots (a whole number 1 to 100)" in lines
-    assert "arenas=128 arenas simulated at once (a whole number 1 to 1048576)" in lines
+    assert (
+        "arenas=128 arenas simulated at once; auto: by run.memory_share "
+        "(a whole number 1 to 1048576)" in lines
+    )
     assert (
         "run.chunk=auto updates per call of the compiled program "
         "(a whole number 1 to 2147483647, all or auto)" in lines

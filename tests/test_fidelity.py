@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sentences import refusal
 
-from benchmarks import fidelity, fidelity_body, fidelity_infrared, fidelity_motion, rig
+from benchmarks import fidelity, fidelity_body, fidelity_infrared, fidelity_motion, pages, rig
 from benchmarks.fidelity_row import Row, beside
 from benchmarks.rig import Rig
 from swarmjax import config, evaluate_judge
@@ -171,14 +171,17 @@ def test_the_table_in_markdown() -> None:
 
 def test_the_table_replaces_what_stands_between_the_markers() -> None:
     page = "a\n<!-- fidelity -->\nold\n<!-- /fidelity -->\nb\n"
-    assert fidelity.insert(page, "new\n") == (
+    assert pages.insert(page, "robot.md", fidelity.MARKER, "new\n") == (
         "a\n<!-- fidelity -->\n\nnew\n\n<!-- /fidelity -->\nb\n"
     )
 
 
 @pytest.mark.parametrize("page", ["", "<!-- fidelity -->", "<!-- /fidelity --><!-- fidelity -->"])
 def test_a_page_without_its_markers_is_refused(page: str) -> None:
-    assert "<!-- fidelity -->" in refusal(fidelity.insert, page, "new")
+    sentence = refusal(pages.insert, page, "robot.md", fidelity.MARKER, "new")
+    assert sentence == (
+        "robot.md has no place for the table: give it <!-- fidelity --> and <!-- /fidelity -->."
+    )
 
 
 def test_lines_of_json(tmp_path: Path) -> None:

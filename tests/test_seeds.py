@@ -219,3 +219,24 @@ def test_warp_steps_the_arenas_of_all_seeds_each_with_its_own_model(
     # A robot that pushes sinks in by at most 4 mm (docs/design.md, solver).
     np.testing.assert_allclose(np.ravel(found[:, :, 1, 1]), met, rtol=0.0, atol=4e-3)
     np.testing.assert_array_equal(found.reshape(-1, 3, 3), jax.jit(jax.vmap(drive))(obstacle))
+
+
+@pytest.mark.parametrize(
+    ("count", "cores", "by", "expected"),
+    [(10, 2, "cores", 2), (10, 4, "cores", 2), (10, 16, "cores", 10), (7, 4, "cores", 1),
+     (1, 8, "cores", 1), (10, 2, "vmap", 1), (10, 2, "map", 1)],
+)  # fmt: skip
+def test_cores_have_as_many_seeds_each(
+    count: int, cores: int, by: Literal["vmap", "map", "cores"], expected: int,
+    tiny_config: TrainConfig,
+) -> None:  # fmt: skip
+    assert seeds.groups(replace(tiny_config, seeds=count, seeds_by=by), cores) == expected
+
+
+def test_groups_of_seeds_are_cut_and_joined_in_order() -> None:
+    lanes = {"a": np.arange(6), "key": jax.random.split(jax.random.key(0), 6)}
+    parts = seeds.split(lanes, 3)
+    assert [part["a"].tolist() for part in parts] == [[0, 1], [2, 3], [4, 5]]
+    joined = seeds.join(parts)
+    assert joined["a"].tolist() == list(range(6))
+    assert (joined["key"] == lanes["key"]).all()

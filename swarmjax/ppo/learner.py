@@ -15,7 +15,7 @@ import optax
 from flax import struct
 
 from swarmjax.config import AlgoConfig
-from swarmjax.ppo import exploration, losses, networks, normalizer
+from swarmjax.ppo import exploration, full_batch, losses, networks, normalizer
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
 from swarmjax.ppo.normalizer import Normalizer
@@ -193,12 +193,13 @@ def update(
     """
     _check(config, batch)
     samples = _samples(learner, config, batch)
-    expected_valid = jnp.sum(samples.valid) / config.minibatches
-    step = functools.partial(_step, config, updates, expected_valid)
-    epoch = functools.partial(_epoch, config, step, samples)
-    (params, optimizer_state), metrics = jax.lax.scan(
-        epoch, (learner.params, learner.optimizer_state), jax.random.split(key, config.epochs)
-    )
+    begun = (learner.params, learner.optimizer_state)
+    # Where a step takes the whole batch, no order matters; an accelerator has it all at once.
+    if config.minibatches == 1 and jax.default_backend() == "cpu":
+        learn = full_batch.in_turn(functools.partial(_learn_in_blocks, config, updates))
+        (params, optimizer_state), metrics = learn(begun, samples)
+    else:
+        (params, optimizer_state), metrics = _learn(config, updates, begun, samples, key)
     metrics = {name: jnp.mean(metric) for name, metric in metrics.items()}
     metrics["std"] = jnp.mean(jnp.exp(params["actor"]["log_std"]))
     moments = learner.normalizer
@@ -263,6 +264,29 @@ def _normalize_advantages(advantage: jax.Array, valid: jax.Array) -> jax.Array:
     return (advantage - mean) / (jnp.sqrt(variance) + _ADVANTAGE_EPSILON)
 
 
+def _learn(
+    config: AlgoConfig, updates: int, begun: _Progress, samples: Minibatch, key: jax.Array
+) -> tuple[_Progress, Metrics]:
+    """All epochs, in minibatches; the metrics of each are [epochs, minibatches]."""
+    expected_valid = jnp.sum(samples.valid) / config.minibatches
+    step = functools.partial(_step, config, updates, expected_valid)
+    epoch = functools.partial(_epoch, config, step, samples)
+    return jax.lax.scan(epoch, begun, jax.random.split(key, config.epochs))
+
+
+def _learn_in_blocks(
+    config: AlgoConfig, updates: int, begun: _Progress, samples: Minibatch
+) -> tuple[_Progress, Metrics]:
+    """All epochs, each one step on all samples; the metrics of each are [epochs]."""
+    blocks, count = full_batch.arrange(samples), jnp.sum(samples.valid)
+
+    def epoch(progress: _Progress, _: None) -> tuple[_Progress, Metrics]:
+        found = full_batch.gradient(progress[0], blocks, config, count)
+        return _take(config, updates, progress, found, count > 0)
+
+    return jax.lax.scan(epoch, begun, length=config.epochs)
+
+
 def _epoch(
     config: AlgoConfig,
     step: functools.partial[tuple[_Progress, Metrics]],
@@ -288,14 +312,22 @@ def _step(
     progress: _Progress,
     minibatch: Minibatch,
 ) -> tuple[_Progress, Metrics]:
-    """One step of the optimiser; none at all if no sample is valid."""
-    params, optimizer_state = progress
-    gradient, metrics = jax.grad(losses.ppo_loss, has_aux=True)(
-        params, minibatch, config, expected_valid
-    )
+    """One step of the optimiser on a minibatch."""
+    found = jax.grad(losses.ppo_loss, has_aux=True)(progress[0], minibatch, config, expected_valid)
+    return _take(config, updates, progress, found, jnp.any(minibatch.valid))
+
+
+def _take(
+    config: AlgoConfig,
+    updates: int,
+    progress: _Progress,
+    found: tuple[Params, Metrics],
+    any_valid: jax.Array,
+) -> tuple[_Progress, Metrics]:
+    """Takes a step along a gradient; none at all if no sample is valid."""
+    (params, optimizer_state), (gradient, metrics) = progress, found
     metrics["grad_norm"] = optax.tree.norm(gradient)
     steps, stepped_state = _optimizer(config, updates).update(gradient, optimizer_state, params)
     stepped = (optax.apply_updates(params, steps), stepped_state)
     # Adam moves by its momentum even where the gradient is zero.
-    any_valid = jnp.any(minibatch.valid)
     return jax.tree.map(lambda new, old: jnp.where(any_valid, new, old), stepped, progress), metrics

@@ -12,7 +12,7 @@ from swarmjax.task import reward
 
 RANGE = 0.04  # m
 NOTHING = RewardConfig(progress=0.0, proximity=0.0, contact=0.0, time=0.0)
-EQUATION_3 = RewardConfig(contact=0.0, time=0.0)
+EQUATION_3 = RewardConfig(proximity=-0.001, contact=0.0, time=0.0)
 
 
 @pytest.fixture

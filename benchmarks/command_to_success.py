@@ -1,0 +1,112 @@
+"""How many seconds from the command until a swarm reaches its targets, and how good is it then?
+
+`python -m benchmarks.command_to_success seed=0,1,2 [stop_at=0.95] [key=value ...]` takes the keys
+of `swarmjax.train` and runs that command once for each seed, in a process of its own, with whatever
+caches there are. The run is asked to stop as soon as the success of its last stage was measured at
+`stop_at` of the targets, over a whole cohort of training episodes; it saves its policy, which is
+then judged in MuJoCo C on the wheeled body. It prints a JSON line for each seed: the seconds from
+the command, compilation included, until 0.90 and 0.95 were measured, until the policy was saved,
+and the share of targets that it reached before the judge. `benchmarks.time_to_success` says the
+same of a run that is there already, without what comes before its first update.
+"""
+
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import peers, steps_per_second
+from benchmarks.watched_run import MADE_WITH, Watched
+from swarmjax import cells, command, config, evaluate_run, export, report_rows
+from swarmjax.report_rows import Row
+from swarmjax.settings import Section, about
+
+SHARES = (0.90, 0.95)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuccessConfig(Section):
+    """Which seeds, and how they are judged."""
+
+    seed: tuple[int, ...] = field(
+        default=(0,), metadata=about("random seeds, one after the other", 0, config.MAX_COUNT)
+    )
+    stop_at: float = field(
+        default=0.95, metadata=about("share of targets at which training stops", 0.95, 1.0)
+    )
+    episodes: int = field(default=500, metadata=about("that the policy is judged on", 1, 10**6))
+
+
+def train(words: Sequence[str], run: Path, stop_at: float) -> tuple[dict[str, float | None], Row]:
+    """Trains until the last stage is reached at a share of the targets, or the budget is spent.
+
+    Args:
+      words: of training.
+      run: its directory.
+      stop_at: the share.
+
+    Returns:
+      Seconds from the command until each of `SHARES` was measured, None if it was not, and until
+      the policy was saved; and the last row of the metrics.
+    """
+    watched, row = Watched(words, run, {}), {}
+    found: dict[str, float | None] = dict.fromkeys((f"seconds_to_{x:.2f}" for x in SHARES), None)
+    for seconds, row in watched.rows():
+        success = row["success_by_stage"][-1] or 0.0
+        for share, (name, before) in zip(SHARES, list(found.items()), strict=True):
+            if before is None and success >= share:
+                found[name] = seconds
+        if success >= stop_at:
+            watched.stop()
+    return found | {"saved_s": watched.seconds}, row
+
+
+def judge(run: Path, stage: str, episodes: int) -> float:
+    """Share of targets that a run's policy reaches in MuJoCo C, on the wheeled body."""
+    path = run / export.POLICY
+    settings = config.load_evaluate(
+        [f"policy={path}", f"stage={stage}", "robot=wheeled", f"episodes={episodes}"]
+    )
+    policies = evaluate_run.read_policies([str(path)])
+    (trial,) = evaluate_run.run(settings, cells.load(settings).cells, policies)
+    return float(np.mean(trial.found["targets_reached"]))
+
+
+def results(given: SuccessConfig, words: Sequence[str]) -> Iterator[Row]:
+    """Trains and judges every seed; yields a line each."""
+    trained = config.load_train(words)
+    for seed in given.seed:
+        with tempfile.TemporaryDirectory() as name:
+            run = Path(name) / "run"
+            found, row = train([*words, f"seed={seed}"], run, given.stop_at)
+            summary = report_rows.read_object(run / report_rows.SUMMARY)
+            judged = judge(run, trained.stage[-1].name, given.episodes)
+        yield {
+            "benchmark": "command_to_success",
+            "seed": seed,
+            "stage": trained.stage_name,
+            "stop_at": given.stop_at,
+            **found,
+            "judged": judged,
+            "episodes": given.episodes,
+            "measured": row["success_by_stage"][-1],
+            "arena_steps": row["arena_steps"],
+            "compile_s": summary["compile_s"],
+            "train_s": summary["train_s"],
+            **steps_per_second.about(trained, summary["impl"]),
+            **{key: summary[key] for key in MADE_WITH},
+        }
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    given, words = peers.parse(SuccessConfig, arguments)
+    peers.write(results(given, words))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("command_to_success", main, SuccessConfig))

@@ -1,0 +1,206 @@
+"""How fast is the paper's way to train: PPO-PyTorch's update, and one arena of MuJoCo C?
+
+`python -m benchmarks.cpu_paper_way [seconds=30] [rollout=6000] [key=value ...]` takes the keys of
+`swarmjax.evaluate` and needs PyTorch (`torch-peers.txt`). The numbers are those of
+`algo=paper`; the program does what nikhilbarhate99/PPO-PyTorch does (commit 728cce8), written
+anew: each robot has an actor and a critic of its own and is asked for its action by itself, returns
+are Monte Carlo and normalised, and after every `rollout` control steps each pair of networks takes
+80 steps on the whole of it. Whole cycles are timed until `seconds` are over, after a short one that
+is not counted.
+"""
+
+import itertools
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from benchmarks import mujoco_arena, peers, timing
+from benchmarks.mujoco_arena import Arena, Moved
+from swarmjax import config, provenance, settings
+from swarmjax.config import AlgoConfig
+from swarmjax.settings import Section, about
+from swarmjax.task import observation
+
+_WARM = 200  # control steps of the cycle that is not counted
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperWayConfig(Section):
+    """How long it is measured."""
+
+    seconds: float = field(default=30.0, metadata=about("of cycles, at least", above=0.0))
+    rollout: int = field(default=6000, metadata=about("control steps of a cycle", 2, 10**6))
+    epochs: int = field(default=80, metadata=about("steps of each optimiser in a cycle", 1, 10**4))
+
+
+class Robot:
+    """One robot's networks, its optimiser, and what it remembers of a cycle."""
+
+    def __init__(self, torch: Any, algo: AlgoConfig) -> None:
+        """Makes both networks as PyTorch begins them."""
+        self._torch, self._algo = torch, algo
+        self._actor = _network(torch, algo.hidden, mujoco_arena.ACTION_SIZE, last=torch.nn.Tanh())
+        self._critic = _network(torch, algo.hidden, 1)
+        rates = ((self._actor, algo.actor_learning_rate), (self._critic, algo.critic_learning_rate))
+        self._optimizer = torch.optim.Adam(
+            [{"params": net.parameters(), "lr": rate} for net, rate in rates]
+        )
+        self._variance = torch.full((mujoco_arena.ACTION_SIZE,), algo.initial_std**2)
+        self.forget()
+
+    def forget(self) -> None:
+        """Begins a cycle."""
+        self._seen: list[Any] = []
+        self._done: list[Any] = []
+        self._log_prob: list[Any] = []
+        self.reward: list[float] = []
+        self.ended: list[bool] = []
+
+    def act(self, seen: np.ndarray) -> np.ndarray:
+        """Draws an action for an observation [O], and remembers both."""
+        with self._torch.no_grad():
+            state = self._torch.as_tensor(seen)
+            chosen = self._distribution(state)
+            action = chosen.sample()
+            self._log_prob.append(chosen.log_prob(action))
+        self._seen.append(state)
+        self._done.append(action)
+        return action.numpy()
+
+    def _distribution(self, state: Any) -> Any:
+        covariance = self._torch.diag(self._variance)
+        return self._torch.distributions.MultivariateNormal(self._actor(state), covariance)
+
+    def learn(self, epochs: int) -> None:
+        """Takes so many steps on all that it remembers."""
+        torch, algo = self._torch, self._algo
+        seen, done = torch.stack(self._seen), torch.stack(self._done)
+        before = torch.stack(self._log_prob)
+        returns = torch.tensor(discounted(self.reward, self.ended, algo.discount))
+        returns = (returns - returns.mean()) / (returns.std() + 1e-7)
+        with torch.no_grad():
+            advantage = returns - self._critic(seen)[:, 0]
+        for _ in range(epochs):
+            chosen = self._distribution(seen)
+            ratio = torch.exp(chosen.log_prob(done) - before)
+            clipped = torch.clamp(ratio, 1.0 - algo.clip, 1.0 + algo.clip)
+            gain = torch.minimum(ratio * advantage, clipped * advantage)
+            error = 0.5 * (self._critic(seen)[:, 0] - returns).square().mean()
+            loss = error - (gain + algo.entropy_cost * chosen.entropy()).mean()
+            self._optimizer.zero_grad()
+            loss.backward()
+            self._optimizer.step()
+
+
+def _network(torch: Any, hidden: Sequence[int], size: int, last: Any = None) -> Any:
+    """Layers with tanh between them, and `last` behind the last one."""
+    widths, layers = [observation.SIZE, *hidden], []
+    for wide, narrow in itertools.pairwise(widths):
+        layers += [torch.nn.Linear(wide, narrow), torch.nn.Tanh()]
+    layers.append(torch.nn.Linear(widths[-1], size))
+    return torch.nn.Sequential(*layers, *([] if last is None else [last]))
+
+
+def discounted(reward: Sequence[float], ended: Sequence[bool], discount: float) -> np.ndarray:
+    """Adds rewards up to the end of each episode, or of the cycle.
+
+    Args:
+      reward: [T].
+      ended: [T] whether the robot's episode ended with the step.
+      discount: of a control step.
+
+    Returns:
+      [T] discounted sums.
+    """
+    total, found = 0.0, np.zeros(len(reward), np.float32)
+    for t in reversed(range(len(reward))):
+        total = reward[t] + (0.0 if ended[t] else discount * total)
+        found[t] = total
+    return found
+
+
+def cycle(arena: Arena, robots: Sequence[Robot], steps: int, epochs: int) -> None:
+    """Drives for so many control steps from a fresh level on, then lets every robot learn.
+
+    Args:
+      arena: one arena.
+      robots: its robots; one that has arrived waits, and remembers nothing.
+      steps: control steps.
+      epochs: steps of each optimiser.
+    """
+    seen, drives = arena.reset(), list(robots)
+    for _ in range(steps):
+        moved, drives = _control_step(arena, robots, drives, seen)
+        seen = moved.observation
+        if moved.over:
+            seen, drives = arena.reset(), list(robots)
+    for robot in robots:
+        if len(robot.reward) > 1:
+            robot.learn(epochs)
+
+
+def _control_step(
+    arena: Arena, robots: Sequence[Robot], drives: Sequence[Robot], seen: np.ndarray
+) -> tuple[Moved, list[Robot]]:
+    """One control step; returns what it came to, and the robots that are still on their way."""
+    none = np.zeros(mujoco_arena.ACTION_SIZE, np.float32)
+    ask = zip(robots, seen, strict=True)
+    action = np.stack([robot.act(each) if robot in drives else none for robot, each in ask])
+    moved = arena.step(action)
+    for robot, reward, arrived in zip(robots, moved.reward, moved.arrived, strict=True):
+        if robot in drives:
+            robot.reward.append(float(reward))
+            robot.ended.append(bool(arrived or moved.over))
+    return moved, [robot for robot, gone in zip(robots, moved.arrived, strict=True) if not gone]
+
+
+def results(given: PaperWayConfig, words: list[str]) -> Iterator[dict[str, Any]]:
+    """Trains for a while; yields the line."""
+    torch = peers.find("torch", peers.TORCH)
+    judged = mujoco_arena.load_settings(["stage=s6", "robot=planar", "steps=500", *words])
+    algo = config.load_train(["algo=paper"]).algo
+    arena = Arena(judged)
+    robots = [Robot(torch, algo) for _ in range(judged.stage.robots)]
+    calls_s, transitions = [], 0
+    for steps in itertools.chain([min(_WARM, given.rollout)], itertools.repeat(given.rollout)):
+        for robot in robots:
+            robot.forget()
+        began = time.perf_counter()
+        cycle(arena, robots, steps, given.epochs)
+        calls_s.append(time.perf_counter() - began)
+        transitions += sum(len(robot.reward) for robot in robots) if len(calls_s) > 1 else 0
+        if sum(calls_s[1:]) >= given.seconds:
+            break
+    calls_s = calls_s[1:]
+    yield {
+        "benchmark": "cpu_paper_way",
+        "trainer": "PPO-PyTorch's way, MuJoCo C, one arena",
+        "robot": judged.robot.body,
+        "arenas": 1,
+        "robots": len(robots),
+        "substeps": arena.judge.substeps,
+        "arena_steps_per_s": given.rollout * len(calls_s) / sum(calls_s),
+        "robot_steps_per_s": given.rollout * len(calls_s) / sum(calls_s) * len(robots),
+        "transitions_per_s": transitions / sum(calls_s),
+        "compile_s": None,
+        **timing.spread(calls_s),
+        "settings": settings.to_dict(given) | {"algo": config.to_dict(algo)},
+        "device": peers.torch_device_name(torch, "cpu"),
+        "versions": peers.versions("torch"),
+        "commit": provenance.commit(),
+    }
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    mine, rest = peers.parse(PaperWayConfig, arguments)
+    peers.write(results(mine, rest))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(peers.run("cpu_paper_way", main, PaperWayConfig))

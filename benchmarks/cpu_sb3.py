@@ -1,0 +1,210 @@
+"""How fast does Stable-Baselines3's PPO train on a vectorised environment of MuJoCo C?
+
+`python -m benchmarks.cpu_sb3 [arenas=16] [workers=2] [seconds=30] [key=value ...]` takes the keys
+of `swarmjax.evaluate` and needs `torch-peers.txt`. Every robot is one environment of
+Stable-Baselines3, all of them share its policy, and `workers` processes simulate the arenas.
+Networks, batch a robot, epochs, minibatches, discount and clip are those of `algo=ppo`;
+observations are not normalised. It has no mask: a robot that has arrived waits in the batch, with
+reward 0, until its arena is over. An iteration, rollout and update, is timed again and again until
+`seconds` are over, after one that is not counted.
+"""
+
+import itertools
+import multiprocessing
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+
+from benchmarks import mujoco_arena, peers, timing
+from benchmarks.mujoco_arena import Arena
+from swarmjax import config, provenance, settings
+from swarmjax.config import ConfigError, EvaluateConfig
+from swarmjax.settings import Section, about
+from swarmjax.task import observation
+
+_LEVELS = 1_000_000  # numbers of levels that each arena has to itself
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sb3Config(Section):
+    """How it is measured."""
+
+    arenas: int = field(default=16, metadata=about("arenas", 1, 4096))
+    workers: int = field(default=2, metadata=about("processes that simulate", 1, 256))
+    seconds: float = field(default=30.0, metadata=about("of iterations, at least", above=0.0))
+
+    def _check(self) -> None:
+        if self.arenas % self.workers:
+            raise ConfigError(
+                f"arenas is {self.arenas}, but workers is {self.workers}: give a multiple."
+            )
+
+
+def serve(pipe: Connection, judged: EvaluateConfig, numbers: Sequence[int]) -> None:
+    """Simulates some arenas in a process of its own, until it is sent None.
+
+    Args:
+      pipe: brings actions [A R, 2] and takes observation [A R, O], reward, done, truncated [A R]
+        and, where done, what was seen before a reset; the first message brings no action.
+      judged: settings of the arenas.
+      numbers: [A] of the arenas.
+    """
+    arenas = [Arena(judged, number * _LEVELS) for number in numbers]
+    seen = [arena.reset() for arena in arenas]
+    waits = [np.zeros(len(each), bool) for each in seen]
+    pipe.send(np.concatenate(seen))
+    while (action := pipe.recv()) is not None:
+        split = np.split(action, len(arenas))
+        found = [_step(*each) for each in zip(arenas, split, waits, strict=True)]
+        waits = [waiting for *_, waiting in found]
+        pipe.send([np.concatenate([each[i] for each in found]) for i in range(5)])
+
+
+def _step(arena: Arena, action: np.ndarray, waits: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Steps an arena, and resets it where it is over.
+
+    Returns:
+      [R, ...]: observation after any reset, reward, done, truncated, observation before the reset,
+      and who waits.
+    """
+    moved = arena.step(action)
+    arrives = moved.arrived & ~waits
+    truncated = moved.over & ~moved.arrived
+    done = arrives | moved.over
+    last, seen, waiting = moved.observation, moved.observation, moved.arrived
+    if moved.over:
+        seen, waiting = arena.reset(), np.zeros_like(waits)
+    return seen, moved.reward.astype(np.float32), done, truncated, last, waiting
+
+
+class Workers:
+    """Processes that simulate arenas; a robot is an environment."""
+
+    def __init__(self, given: Sb3Config, judged: EvaluateConfig) -> None:
+        """Starts them."""
+        context = multiprocessing.get_context("spawn")
+        each = given.arenas // given.workers
+        self._pipes: list[Any] = []
+        for i in range(given.workers):
+            mine, theirs = context.Pipe()
+            numbers = range(i * each, (i + 1) * each)
+            context.Process(target=serve, args=(theirs, judged, numbers), daemon=True).start()
+            self._pipes.append(mine)
+        self.first = np.concatenate([pipe.recv() for pipe in self._pipes])
+
+    def send(self, actions: np.ndarray) -> None:
+        """Lets all arenas make a control step, [A R, 2]."""
+        for pipe, part in zip(self._pipes, np.split(actions, len(self._pipes)), strict=True):
+            pipe.send(part)
+
+    def receive(self) -> list[np.ndarray]:
+        """What `_step` returns of all robots, but who waits."""
+        found = [pipe.recv() for pipe in self._pipes]
+        return [np.concatenate([each[i] for each in found]) for i in range(5)]
+
+    def close(self) -> None:
+        """Ends the processes."""
+        for pipe in self._pipes:
+            pipe.send(None)
+
+
+def vectorised(workers: Workers) -> Any:
+    """Puts the arenas behind the interface of Stable-Baselines3, whose class is made here.
+
+    It cannot be made before the library is there.
+    """
+    spaces = peers.find("gymnasium.spaces", peers.TORCH)
+    base = peers.find("stable_baselines3.common.vec_env", peers.TORCH).VecEnv
+    box = spaces.Box(-np.inf, np.inf, (observation.SIZE,), np.float32)
+    command = spaces.Box(-1.0, 1.0, (mujoco_arena.ACTION_SIZE,), np.float32)
+
+    def step_wait(self: Any) -> tuple[Any, ...]:
+        seen, reward, done, truncated, last = workers.receive()
+        infos: list[dict[str, Any]] = [{} for _ in done]
+        for i in np.flatnonzero(done):
+            infos[i] = {"terminal_observation": last[i], "TimeLimit.truncated": bool(truncated[i])}
+        return seen, reward, done, infos
+
+    members = {
+        "reset": lambda self: workers.first,
+        "step_async": lambda self, actions: workers.send(actions),
+        "step_wait": step_wait,
+        "close": lambda self: workers.close(),
+        "get_attr": lambda self, name, indices=None: [None] * self.num_envs,
+        "set_attr": lambda self, name, value, indices=None: None,
+        "env_method": lambda self, name, *given, **named: [],
+        "env_is_wrapped": lambda self, wrapper, indices=None: [False] * self.num_envs,
+    }
+    return type("SwarmVecEnv", (base,), members)(len(workers.first), box, command)
+
+
+def ppo_settings(robots: int) -> dict[str, Any]:
+    """Numbers of `algo=ppo` under the names of Stable-Baselines3, for so many robots in all."""
+    algo = config.load_train(["stage=s6"]).algo
+    return {
+        "n_steps": algo.rollout,
+        "batch_size": robots * algo.rollout // algo.minibatches,
+        "n_epochs": algo.epochs,
+        "gamma": algo.discount,
+        "gae_lambda": algo.gae_lambda,
+        "clip_range": algo.clip,
+        "learning_rate": algo.actor_learning_rate,
+        "vf_coef": algo.value_cost,
+        "ent_coef": algo.entropy_cost,
+        "max_grad_norm": algo.max_grad_norm,
+        "policy_kwargs": {"net_arch": list(algo.hidden), "log_std_init": np.log(algo.initial_std)},
+        "seed": 0,
+    }
+
+
+def results(given: Sb3Config, words: list[str]) -> Iterator[dict[str, Any]]:
+    """Trains for a while; yields the line."""
+    sb3, torch = peers.find("stable_baselines3", peers.TORCH), peers.find("torch", peers.TORCH)
+    judged = mujoco_arena.load_settings(["stage=s6", "robot=planar", "steps=500", *words])
+    workers = Workers(given, judged)
+    chosen = ppo_settings(len(workers.first))
+    model = sb3.PPO("MlpPolicy", vectorised(workers), device="cpu", **chosen)
+    batch = len(workers.first) * chosen["n_steps"]
+    calls_s: list[float] = []
+    for i in itertools.count():
+        began = time.perf_counter()
+        model.learn(batch, reset_num_timesteps=i == 0)
+        calls_s.append(time.perf_counter() - began)
+        if sum(calls_s[1:]) >= given.seconds:
+            break
+    workers.close()
+    calls_s = calls_s[1:]
+    rate = chosen["n_steps"] * given.arenas * len(calls_s) / sum(calls_s)
+    yield {
+        "benchmark": "cpu_sb3",
+        "trainer": "Stable-Baselines3 PPO, MuJoCo C",
+        "robot": judged.robot.body,
+        "arenas": given.arenas,
+        "robots": judged.stage.robots,
+        "workers": given.workers,
+        "arena_steps_per_s": rate,
+        "robot_steps_per_s": rate * judged.stage.robots,
+        "transitions_per_s": rate * judged.stage.robots,
+        "compile_s": None,
+        **timing.spread(calls_s),
+        "settings": settings.to_dict(given) | {"ppo": chosen},
+        "device": peers.torch_device_name(torch, "cpu"),
+        "versions": peers.versions("torch", "stable-baselines3", "gymnasium"),
+        "commit": provenance.commit(),
+    }
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    mine, rest = peers.parse(Sb3Config, arguments)
+    peers.write(results(mine, rest))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(peers.run("cpu_sb3", main, Sb3Config))

@@ -1,0 +1,119 @@
+"""How fast is CAMAR with differential drives, the nearest of JAX's continuous path finders?
+
+`python -m benchmarks.peer_camar [arenas=4096,65536] ...` needs the extra `camar` and prints a JSON
+line for each number of arenas: random actions, `steps` control steps a call in one compiled scan.
+Resets are CAMAR's own optimistic ones: one fresh map is drawn for every `reset_ratio` arenas and
+step, and all of those that end in it share it.
+"""
+
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from benchmarks import peers, timing
+from benchmarks.peers import PeerConfig
+from swarmjax import epuck, provenance
+from swarmjax.settings import about
+
+FRAMESKIP = 2  # CAMAR's own default: three substeps
+DT = 0.032 / (FRAMESKIP + 1)  # s
+CELLS = 6  # on a side; with 0.2 m each the arena is 1.2 m
+COUNTED = {
+    "step": "control step: three substeps of penalty contacts between discs in the plane, the "
+    "vectors to the nearest objects instead of rays, reward",
+    "resets": "optimistic: one fresh map for every reset_ratio arenas and step",
+    "precision": "float32",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CamarConfig(PeerConfig):
+    """How CAMAR is measured."""
+
+    reset_ratio: int = field(default=64, metadata=about("arenas that share a reset", 1, 2**20))
+
+
+def task(config: PeerConfig) -> dict[str, Any]:
+    """The task's numbers as `camar_v0` takes them; lengths in m."""
+    return {
+        "map_generator": "random_grid",
+        "dynamic": "DiffDriveDynamic",
+        "dynamic_kwargs": {
+            "linear_speed_min": 0.0,
+            "linear_speed_max": epuck.MAX_SPEED,
+            "angular_speed_min": -epuck.MAX_TURN_RATE,
+            "angular_speed_max": epuck.MAX_TURN_RATE,
+            "dt": DT,
+        },
+        "map_kwargs": {
+            "num_agents": config.robots,
+            "num_rows": CELLS,
+            "num_cols": CELLS,
+            "obstacle_density": 0.1,
+            "obstacle_size": 0.2,
+            "agent_rad_range": (epuck.HULL_RADIUS, epuck.HULL_RADIUS),
+            "goal_rad_range": (0.05, 0.05),
+        },
+        "max_steps": config.step_limit,
+        "frameskip": FRAMESKIP,
+        "window": epuck.SENSOR_RANGE + epuck.HULL_RADIUS,
+    }
+
+
+def results(config: CamarConfig) -> Iterator[dict[str, Any]]:
+    """Measures every number of arenas; yields a line each."""
+    camar = peers.find("camar", "the extra camar")
+    wrappers = peers.find("camar.wrappers", "the extra camar")
+    for arenas in config.arenas:
+        bare = camar.camar_v0(**task(config))
+        world = wrappers.OptimisticResetVecEnvWrapper(
+            bare, arenas, reset_ratio=min(config.reset_ratio, arenas)
+        )
+        key = jax.random.key(config.seed)
+        _, state = world.reset(key)
+        program = timing.compile_program(partial(_steps, world, config), (state, key), None)
+        calls_s, _ = timing.time_program(program, (state, key), None, config.repeats)
+        yield {
+            "benchmark": "peer_camar.environment",
+            "peer": "CAMAR random_grid",
+            **peers.speed(config, arenas, FRAMESKIP + 1, calls_s),
+            "reset_ratio": min(config.reset_ratio, arenas),
+            "compile_s": program.compile_s,
+            "program_bytes": program.size,
+            **COUNTED,
+            "matmul_precision": timing.matmul_precision(),
+            "settings": task(config),
+            "device": provenance.device(),
+            "versions": peers.versions("camar"),
+            "commit": provenance.commit(),
+        }
+
+
+def _steps(world: Any, config: PeerConfig, carry: Any, _: None) -> tuple[Any, jax.Array]:
+    """Steps all arenas with random actions; returns what depends on all of it."""
+
+    def body(carry: Any, _: None) -> tuple[Any, jax.Array]:
+        state, key = carry
+        key, action_key, step_key = jax.random.split(key, 3)
+        shape = (world.num_envs, config.robots, 2)
+        action = jax.random.uniform(action_key, shape, minval=-1.0, maxval=1.0)
+        seen, state, reward, _, _ = world.step(step_key, state, action)
+        return (state, key), jnp.sum(reward) + jnp.sum(seen)
+
+    carry, rewards = jax.lax.scan(body, carry, length=config.steps)
+    return carry, jnp.sum(rewards)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    peers.write(results(peers.load(CamarConfig, arguments)))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(peers.run("peer_camar", main, CamarConfig))

@@ -1,0 +1,157 @@
+"""Where does the time of an update go: physics, sensors, policy, learning?
+
+`python -m benchmarks.profile [top=40] [key=value ...]` takes the keys of `swarmjax.train`, traces
+one call of physics alone, of the environment with it and of training with both, and prints a JSON
+line for each of the `top` kernels of each: microseconds a control step of all arenas, and the share
+of all kernels' time. On a GPU kernels are those of its streams; on a CPU they are XLA's operations
+on all its threads together. `busy` is the time of all kernels over that of the call: more than 1
+where several threads or streams ran at once.
+"""
+
+import json
+import operator
+import sys
+import tempfile
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from benchmarks import steps_per_second
+from swarmjax import command, config
+from swarmjax.config import TrainConfig
+
+TOP = 40
+UPDATES = 2  # of the call of training
+# What stands in the names of the threads and streams that carry kernels, by platform.
+LINES = {"gpu": "Stream", "cpu": "tf_XLA"}
+# Events that only mark where a region begins or ends, and loops, whose insides are told one by one.
+MARKERS = ("ThreadpoolListener", "ThunkExecutor", "end: ", "while")
+KINDS = {
+    "warp": ("_cuda_kernel", "wp_"),
+    "matrix": ("gemm", "cutlass", "cublas", "dot", "xmma"),
+    "sort": ("sort", "Sort"),
+    "copy": ("memcpy", "Memcpy", "MemcpyD2D", "copy"),
+}
+
+
+def kind(name: str) -> str:
+    """Tells what a kernel does, as far as its name says it: a key of `KINDS`, or `fusion`."""
+    return next((k for k, marks in KINDS.items() if any(m in name for m in marks)), "fusion")
+
+
+def kernels(call: Callable[[], Any]) -> tuple[dict[str, float], Counter[str], float]:
+    """Traces a call that has been compiled and run before.
+
+    Args:
+      call: returns arrays.
+
+    Returns:
+      Seconds by kernel, how often each ran, and the seconds that the call took.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        with jax.profiler.trace(folder):
+            began = time.perf_counter()
+            jax.block_until_ready(call())
+            seconds = time.perf_counter() - began
+        spent: defaultdict[str, float] = defaultdict(float)
+        count: Counter[str] = Counter()
+        for name, duration in _events(Path(folder)):
+            spent[name] += duration
+            count[name] += 1
+    return spent, count, seconds
+
+
+def _events(folder: Path) -> Iterator[tuple[str, float]]:
+    """Yields the kernels of a trace and their seconds."""
+    mark = LINES[jax.default_backend()]
+    for path in folder.rglob("*.xplane.pb"):
+        for plane in jax.profiler.ProfileData.from_file(str(path)).planes:
+            for line in plane.lines:
+                if mark in line.name:
+                    yield from (
+                        (event.name, 1e-9 * event.duration_ns)
+                        for event in line.events
+                        if not event.name.startswith(MARKERS)
+                    )
+
+
+def lines(about: dict[str, Any], call: Callable[[], Any], steps: int, top: int) -> list[dict]:
+    """Profiles a call.
+
+    Args:
+      about: the fields of every line.
+      call: returns arrays; has run before.
+      steps: control steps of one call.
+      top: how many kernels to tell.
+
+    Returns:
+      A line for all kernels together, by kind, and one for each of those that took most.
+    """
+    spent, count, seconds = kernels(call)
+    total = sum(spent.values())
+    by_kind: defaultdict[str, float] = defaultdict(float)
+    for kernel, taken in spent.items():
+        by_kind[kind(kernel)] += taken
+    whole = {
+        "us_per_control_step": 1e6 * seconds / steps,
+        "busy": total / seconds,
+        "kernels_per_control_step": sum(count.values()) / steps,
+        "shares": {name: taken / total for name, taken in _most(by_kind)},
+        **steps_per_second.made_with(),
+    }
+    each = [
+        {
+            "kernel": kernel,
+            "kind": kind(kernel),
+            "us_per_control_step": 1e6 * taken / steps,
+            "runs_per_control_step": count[kernel] / steps,
+            "share": taken / total,
+        }
+        for kernel, taken in _most(spent)[:top]
+    ]
+    return [about | one for one in (whole, *each)]
+
+
+def _most(seconds: dict[str, float]) -> list[tuple[str, float]]:
+    """Sorts by what took most."""
+    return sorted(seconds.items(), key=operator.itemgetter(1), reverse=True)
+
+
+def results(settings: TrainConfig, top: int) -> Iterator[dict]:
+    """Profiles physics, environment and training, and yields their lines."""
+    prepared = steps_per_second.prepare(settings)
+    schedule, keys, rollout = prepared.schedule, prepared.keys, settings.algo.rollout
+    about = {"arenas": settings.arenas, "robot": settings.robot.body}
+    steps = steps_per_second.CONTROL_STEPS[settings.robot.body]
+    for name, program, argument, count in (
+        ("physics", prepared.physics, keys, steps),
+        ("environment", prepared.environment, (schedule, keys), steps),
+        ("training", prepared.training, np.int32(UPDATES), UPDATES * rollout),
+    ):
+        state = prepared.start(schedule)
+        state = state if name == "training" else state.arenas
+        state, _ = program.call(state, argument)
+        call = partial(program.call, state, argument)
+        yield from lines({"benchmark": f"profile.{name}", **about}, call, count, top)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    tops, words = steps_per_second.split(arguments, "top")
+    settings = config.load_train(["stage=s6", *words])
+    settings = replace(settings, stage=settings.stage[-1:])
+    for line in results(settings, int(tops[0]) if tops else TOP):
+        sys.stdout.write(json.dumps(line) + "\n")
+        sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("profile", main, TrainConfig))

@@ -1,0 +1,65 @@
+"""What does a larger swarm cost? The environment and training with 1 to 50 robots in each arena.
+
+`python -m benchmarks.robots_speed robots=1,5,50 [total=327680] [key=value ...]` takes the keys of
+`swarmjax.train` but `arenas`, and prints the lines of `benchmarks.steps_per_second` for each size,
+as `robots_speed.*`. There are about as many robots in all whatever the size: the arenas are the
+power of two that comes nearest. Each robot has the floor that it has on s6, in an arena of at least
+0.8 m, with three obstacles; as many robots are compiled in as there are.
+"""
+
+import json
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from benchmarks import peers, steps_per_second
+from swarmjax import command, config
+from swarmjax.config import TrainConfig
+from swarmjax.settings import Section, about
+
+_ROBOTS, _SIDE = 5, 1.2  # of s6; m
+_LEAST = 0.8  # m; the three obstacles need as much
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotsConfig(Section):
+    """Which swarms are measured."""
+
+    robots: tuple[int, ...] = field(
+        default=(1, 2, 3, 5, 10, 20, 50), metadata=about("robots of an arena", 1, 50)
+    )
+    total: int = field(default=327_680, metadata=about("robots in all, about", 8, 10**8))
+
+
+def load(robots: int, total: int, words: Sequence[str]) -> TrainConfig:
+    """Makes the config of one size.
+
+    Args:
+      robots: of an arena.
+      total: robots in all, about.
+      words: of training, `key=value`.
+
+    Returns:
+      The config; raises ConfigError if a word is unsound.
+    """
+    side = max(_LEAST, round(_SIDE * math.sqrt(robots / _ROBOTS), 2))
+    arenas = max(8, 2 ** round(math.log2(total / robots)))
+    size = [f"sim.max_robots={robots}", f"stage.robots={robots}", f"stage.side={side}"]
+    return config.load_train(["stage=s6", "budget=1e10", *words, *size, f"arenas={arenas}"])
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    given, words = peers.parse(RobotsConfig, arguments)
+    points = [load(robots, given.total, words) for robots in given.robots]
+    for lines in steps_per_second.sweep(points):
+        for line in lines:
+            name = line["benchmark"].replace("steps_per_second", "robots_speed")
+            sys.stdout.write(json.dumps(line | {"benchmark": name}) + "\n")
+        sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("robots_speed", main, RobotsConfig))

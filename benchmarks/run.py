@@ -1,0 +1,320 @@
+"""Runs suites of benchmarks, goes on where it was cut off, and writes docs/benchmarks.md.
+
+`python -m benchmarks.run suite=peers out=FILE.jsonl` runs each entry of the suite
+(`benchmarks.suites`) in a process of its own, and appends its JSON lines to `out` as they come,
+with the entry's name. What `out` has already is not run again; what failed is. A process that
+dies, or prints nothing for as long as its entry allows, is noted as `failed`, and the rest goes on.
+
+`python -m benchmarks.run table=FILE.jsonl docs=docs` runs nothing: it writes the tables and plots
+of that file into docs/benchmarks.md. With `suite` and `docs` this is done at the end.
+"""
+
+import json
+import math
+import os
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TextIO
+
+from benchmarks import peers, run_page
+from benchmarks.suites import SUITES, Entry
+from swarmjax import command
+from swarmjax.config import ConfigError
+from swarmjax.settings import Section, about
+
+Line = dict[str, Any]
+_GRACE = 10.0  # s that a process is given to end by itself
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig(Section):
+    """What is run, and where its results go."""
+
+    suite: str | None = field(
+        default=None, metadata=about(f"which benchmarks: {', '.join(SUITES)}")
+    )
+    only: tuple[str, ...] = field(
+        default=(), metadata=about("entries of the suite, by name; []: all of them")
+    )
+    out: str | None = field(default=None, metadata=about("file of JSON lines that is added to"))
+    minutes: float | None = field(
+        default=None, metadata=about("after which nothing more is run; null: no limit", above=0.0)
+    )
+    table: str | None = field(
+        default=None, metadata=about("file of JSON lines for the page; null: out")
+    )
+    docs: str | None = field(default=None, metadata=about(f"folder of {run_page.PAGE}"))
+
+    def _check(self) -> None:
+        if self.suite is not None and self.suite not in SUITES:
+            raise ConfigError(f"suite is '{self.suite}': give one of {', '.join(SUITES)}.")
+        names = [entry.name for entry in SUITES.get(self.suite or "", ())]
+        for name in self.only:
+            if name not in names:
+                raise ConfigError(f"only holds '{name}': give any of {', '.join(names)}.")
+        if self.suite is None and (self.table is None or self.docs is None):
+            raise ConfigError("suite is null: give suite=NAME, or table=FILE.jsonl and docs=DIR.")
+        if self.suite is not None and self.out is None:
+            raise ConfigError("out is null: give out=FILE.jsonl for what the suite finds.")
+        if self.table is not None and self.docs is None:
+            raise ConfigError("docs is null: give the folder of the page with table.")
+
+
+# What is left to do
+
+
+def entries(config: RunConfig) -> list[Entry]:
+    """The entries that are chosen, in the order of their suite."""
+    if config.suite is None:
+        return []
+    return [entry for entry in SUITES[config.suite] if entry.name in config.only or not config.only]
+
+
+def left(entry: Entry, lines: Sequence[Line]) -> list[str | None]:
+    """Values of an entry that have no result yet.
+
+    Args:
+      entry: of a suite.
+      lines: of `out`.
+
+    Returns:
+      Those of its values that are missing, or failed or were skipped when last tried; for an entry
+      without values, None alone.
+    """
+    values = entry.values or (None,)
+    return [value for value in values if not _is_done(entry, value, lines)]
+
+
+def _is_done(entry: Entry, value: str | None, lines: Sequence[Line]) -> bool:
+    """Tells whether the newest line of an entry and value is a result."""
+    mine = [line for line in lines if _is_of(entry, value, line)]
+    return bool(mine) and not {"failed", "skipped"} & mine[-1].keys()
+
+
+def _is_of(entry: Entry, value: str | None, line: Line) -> bool:
+    if line.get("entry") != entry.name:
+        return False
+    return entry.over is None or str(line.get(entry.over)) == value
+
+
+def command_line(entry: Entry, values: Sequence[str | None]) -> list[str]:
+    """The command of a process that measures some values of an entry."""
+    words = [*entry.words]
+    if entry.over is not None:
+        words.append(f"{entry.over}={','.join(str(value) for value in values)}")
+    return [sys.executable, "-m", f"benchmarks.{entry.module}", *words]
+
+
+# Running
+
+
+class Output:
+    """The file of JSON lines that a suite adds to."""
+
+    def __init__(self, path: Path) -> None:
+        """Reads what is there.
+
+        Raises:
+          ConfigError: if it cannot be read or written.
+        """
+        self.lines, self._path = read(path) if path.exists() else [], path
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+        except OSError as error:
+            raise ConfigError(
+                f"out is {path}, which cannot be written: {error.strerror}."
+            ) from None
+
+    def add(self, line: Line) -> None:
+        """Writes a line down at once."""
+        self.lines.append(line)
+        with self._path.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+
+
+def read(path: Path) -> list[Line]:
+    """Reads JSON lines.
+
+    Args:
+      path: of the file; a last line that was cut off is left out.
+
+    Returns:
+      The lines.
+
+    Raises:
+      ConfigError: if there is no such file, or a line is damaged.
+    """
+    try:
+        text = path.read_text()
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}.") from None
+    found = []
+    for number, line in enumerate(text.split("\n")[:-1], 1):
+        try:
+            found.append(json.loads(line))
+        except ValueError:
+            raise ConfigError(f"{path} in line {number} is no JSON: take it out.") from None
+    return found
+
+
+def run_entry(entry: Entry, output: Output, deadline: float) -> None:
+    """Runs what is left of an entry, in as many processes as it takes.
+
+    A value that a process did not come to is left to the next process, but for the one that it
+    died or was ended at, which is noted as failed.
+
+    Args:
+      entry: of a suite.
+      output: gets the lines.
+      deadline: by `time.monotonic`; the process that runs then is ended, and is no failure.
+    """
+    waiting = left(entry, output.lines)
+    while waiting:
+        values = waiting[: entry.each or len(waiting)]
+        rest = waiting[len(values) :]
+        process, first = Process(entry, values), len(output.lines)
+        for line in process.lines(deadline):
+            output.add({**line, "entry": entry.name})
+        new = output.lines[first:]
+        if process.late or any("skipped" in line for line in new):
+            return
+        untried = [value for value in values if not any(_is_of(entry, value, x) for x in new)]
+        if untried:
+            output.add(_failed(entry, untried[0], process.reason))
+        waiting = [*untried[1:], *rest]
+
+
+def _failed(entry: Entry, value: str | None, reason: str) -> Line:
+    """The line of a value that has no result."""
+    line = {"benchmark": entry.module, "entry": entry.name, "failed": reason}
+    return line if entry.over is None else {**line, entry.over: value}
+
+
+class Process:
+    """A benchmark in a process of its own.
+
+    Attributes:
+      reason: why it ended without a result; of use once its lines are read.
+      late: whether it was ended because the time of the whole run was over.
+    """
+
+    def __init__(self, entry: Entry, values: Sequence[str | None]) -> None:
+        """Starts it."""
+        self.reason, self.late, self._closed = "", False, False
+        self._limit = entry.seconds
+        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115  # `_end` closes it
+        self._process = subprocess.Popen(
+            command_line(entry, values),
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            text=True,
+            env=os.environ | entry.environment,
+            start_new_session=True,
+        )
+        self._queue: queue.Queue[str | None] = queue.Queue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        with self._process.stdout as output:
+            for text in output:
+                self._queue.put(text)
+        self._queue.put(None)
+
+    def lines(self, deadline: float) -> Iterator[Line]:
+        """Yields its JSON lines as they come; what else it prints is passed over.
+
+        Args:
+          deadline: by `time.monotonic`, when it is ended.
+
+        Yields:
+          The lines.
+        """
+        try:
+            while (text := self._next(deadline)) is not None:
+                if text.startswith("{"):
+                    yield json.loads(text)
+        finally:
+            self._end()
+
+    def _next(self, deadline: float) -> str | None:
+        """The next line of output; None at its end, or when the time is over."""
+        left = deadline - time.monotonic()
+        try:
+            text = self._queue.get(timeout=max(0.0, min(self._limit, left)))
+            self._closed = text is None
+            return text
+        except queue.Empty:
+            self.late = left <= self._limit
+            self.reason = f"printed nothing for {self._limit:g} s"
+            return None
+
+    def _end(self) -> None:
+        """Ends it, with all that it started, if it does not end by itself."""
+        if not self._closed:
+            os.killpg(self._process.pid, signal.SIGTERM)
+        try:
+            self._process.wait(_GRACE)
+        except subprocess.TimeoutExpired:
+            os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+        self._reader.join()
+        self.reason = self.reason or self._last_words()
+        self._errors.close()
+
+    def _last_words(self) -> str:
+        """Its exit code, and the last line that it complained with."""
+        self._errors.seek(0)
+        words = [line.strip() for line in self._errors if line.strip()]
+        return f"exit code {self._process.returncode}: {words[-1][:300] if words else 'silent'}"
+
+
+def run_suite(config: RunConfig, say: TextIO) -> None:
+    """Runs all entries, and says of each what is done.
+
+    Args:
+      config: which, and for how long.
+      say: gets a sentence an entry.
+    """
+    output = Output(Path(config.out or ""))
+    deadline = math.inf if config.minutes is None else time.monotonic() + 60.0 * config.minutes
+    for entry in entries(config):
+        began, first = time.monotonic(), len(output.lines)
+        if time.monotonic() < deadline:
+            run_entry(entry, output, deadline)
+        seconds, missing = time.monotonic() - began, len(left(entry, output.lines))
+        new = output.lines[first:]
+        say.write(
+            f"{entry.name}: {len(new)} lines in {seconds:.0f} s"
+            f"{f', {missing} of {len(entry.values) or 1} without a result' if missing else ''}\n"
+        )
+        for line in new:
+            for why in ("skipped", "failed"):
+                if why in line:
+                    say.write(f"  {why}: {line[why]}\n")
+        say.flush()
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    config = peers.load(RunConfig, arguments)
+    if config.suite is not None:
+        run_suite(config, sys.stderr)
+    if config.docs is not None:
+        source = Path(config.table or config.out or "")
+        run_page.write(Path(config.docs), read(source), source)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("run", main, RunConfig))

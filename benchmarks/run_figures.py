@@ -1,0 +1,98 @@
+"""The plots of docs/benchmarks.md."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from benchmarks import run_tables
+
+mpl.use("Agg")
+Line = dict[str, Any]
+_SIZE, _DOTS = (7.0, 4.0), 90  # inches; dots an inch
+_PREFIX = "benchmarks_"
+
+
+def draw(folder: Path, lines: Sequence[Line]) -> list[Path]:
+    """Draws all plots that the lines have anything for, a file for each device.
+
+    Args:
+      folder: where the PNG files go.
+      lines: of a file of results.
+
+    Returns:
+      The files.
+    """
+    results, written = run_tables.newest(lines), []
+    folder.mkdir(parents=True, exist_ok=True)
+    for device in dict.fromkeys(line["device"] for line in results):
+        mine = [line for line in results if line["device"] == device]
+        slug = re.sub(r"\W+", "-", device.lower()).strip("-")
+        for name, plot in {
+            "environment": _speeds(mine, ".environment", "robot_steps_per_s"),
+            "training": _speeds(mine, "steps_per_second.training", "transitions_per_s"),
+            "race": _race(mine),
+        }.items():
+            if plot is not None:
+                path = folder / f"{_PREFIX}{name}_{slug}.png"
+                # Without the version of Matplotlib, so that the same plot is the same file.
+                plot.savefig(path, dpi=_DOTS, metadata={"Software": None})
+                written.append(path)
+    return written
+
+
+def _figure() -> tuple[Figure, Axes]:
+    plot = Figure(figsize=_SIZE, layout="constrained")
+    axes = plot.subplots()
+    axes.grid(visible=True, alpha=0.3)
+    return plot, axes
+
+
+def _speeds(lines: Sequence[Line], benchmark: str, key: str) -> Figure | None:
+    """Speed over the number of arenas, a curve a system; a bar from slowest to fastest call."""
+    curves: dict[str, list[Line]] = {}
+    for line in run_tables.choose(lines, benchmark):
+        if not line["benchmark"].startswith("robots_speed"):
+            curves.setdefault(run_tables.label(line), []).append(line)
+    if not any(len(points) > 1 for points in curves.values()):
+        return None
+    plot, axes = _figure()
+    for name, points in curves.items():
+        points.sort(key=lambda line: line["arenas"])
+        speeds = [line[key] for line in points]
+        # Calls that take longer are slower in proportion.
+        low = [
+            s * (1 - p["call_s"] / max(p["calls_s"])) for s, p in zip(speeds, points, strict=True)
+        ]
+        high = [
+            s * (p["call_s"] / min(p["calls_s"]) - 1) for s, p in zip(speeds, points, strict=True)
+        ]
+        arenas = [line["arenas"] for line in points]
+        style = "o--" if "peer" in points[0] else "o-"
+        axes.errorbar(arenas, speeds, (low, high), fmt=style, ms=4, capsize=2, label=name)
+    sizes = sorted({line["arenas"] for points in curves.values() for line in points})
+    axes.set_xscale("log", base=2)
+    axes.set_xticks(sizes, [f"{size:,}" for size in sizes])
+    words = key.removesuffix("_per_s").replace("_", " ")
+    axes.set(yscale="log", xlabel="arenas", ylabel=f"{words} a second")
+    axes.legend(fontsize=8)
+    return plot
+
+
+def _race(lines: Sequence[Line]) -> Figure | None:
+    """Share of targets over seconds of training."""
+    mine = [line for line in lines if "curve" in line]
+    if not mine:
+        return None
+    plot, axes = _figure()
+    for line in mine:
+        axes.plot(*zip(*line["curve"], strict=True), "o-", ms=3, label=line["trainer"])
+    for share in (0.90, 0.95):
+        axes.axhline(share, color="0.5", lw=0.8, ls="--")
+    axes.set(xlabel="seconds of training, compilation apart", ylabel="targets reached")
+    axes.legend(fontsize=8)
+    return plot

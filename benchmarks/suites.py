@@ -1,0 +1,204 @@
+"""The suites of `benchmarks.run`: which benchmarks, of what size, what matters most first.
+
+An entry is one question, put to one file of benchmarks/ in a process of its own.
+"""
+
+from dataclasses import dataclass, field, replace
+
+CPU = {"JAX_PLATFORMS": "cpu"}
+# Peers, and ours beside them, are not to differ by what a tensor core leaves out.
+HIGHEST = {"JAX_DEFAULT_MATMUL_PRECISION": "highest"}
+# So that what Warp and others allocate is seen in what is left of the card.
+AS_NEEDED = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+ARENAS = ("65536", "16384", "262144", "4096", "1024", "256")
+SEEDS = ("0", "1", "2", "3", "4")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """One benchmark with its settings.
+
+    Attributes:
+      name: of the entry; lines bear it.
+      module: of benchmarks/.
+      words: `key=value`.
+      over: key that is given several values.
+      values: these; a line has one of them under `over`.
+      each: of how many values a process takes; None: all of them.
+      seconds: that a value may take before the process is ended.
+      environment: variables that the process is given.
+    """
+
+    name: str
+    module: str
+    words: tuple[str, ...] = ()
+    over: str | None = None
+    values: tuple[str, ...] = ()
+    each: int | None = None
+    seconds: float = 300.0
+    environment: dict[str, str] = field(default_factory=dict)
+
+
+def _speed(name: str, *words: str, values: tuple[str, ...] = ARENAS) -> Entry:
+    """Physics, environment and training at several numbers of arenas."""
+    return Entry(
+        name=name,
+        module="steps_per_second",
+        words=("budget=1e10", *words),
+        over="arenas",
+        values=values,
+        seconds=480.0,  # the first one waits until all are compiled
+    )
+
+
+def _robots(name: str, *words: str) -> Entry:
+    """The same with swarms of several sizes."""
+    values = ("5", "1", "50", "10", "20", "2", "3")
+    return Entry(
+        name=name, module="robots_speed", words=words, over="robots", values=values, seconds=480.0
+    )
+
+
+def _memory(name: str, *words: str) -> Entry:
+    """Memory at two sizes, a process each: a peak is one of a whole process."""
+    return Entry(
+        name=name,
+        module="memory",
+        words=words,
+        over="arenas",
+        values=("16384", "65536"),
+        each=1,
+        environment=AS_NEEDED,
+    )
+
+
+def _peer(name: str, values: tuple[str, ...], *words: str) -> Entry:
+    """The environment of a peer."""
+    return Entry(
+        name=name, module=name, words=words, over="arenas", values=values, environment=HIGHEST
+    )
+
+
+_WARP = "sim.impl=warp"
+_SLOW = ("16384", "4096", "1024", "256")
+_LARGE = ("65536", "16384", "262144", "4096")
+_TRAINED = ("stage=s6", _WARP, "arenas=8192", "budget=160e6")
+
+HEADLINE = (
+    _speed("planar-warp", _WARP),
+    _speed("wheeled-warp", _WARP, "robot=wheeled"),
+)
+PEERS = (
+    _peer("peer_vmas", ("262144", "65536", "16384", "4096")),
+    _peer("peer_camar", _LARGE),
+    _peer("peer_jaxnav", ("65536", "16384", "4096"), "step=pool"),
+    replace(_peer("peer_jaxnav", ("16384",), "step=default"), name="peer_jaxnav-default"),
+)
+TRAINERS = (
+    Entry(
+        name="race-swarmjax",
+        module="race",
+        words=("trainer=swarmjax", *_TRAINED),
+        environment=HIGHEST,
+    ),
+    Entry(
+        name="race-brax",
+        module="race",
+        words=("trainer=brax", *_TRAINED),
+        seconds=400.0,
+        environment=HIGHEST,
+    ),
+    Entry(
+        name="peer_jaxmarl_ippo",
+        module="peer_jaxmarl_ippo",
+        over="arenas",
+        values=("16384", "4096"),
+        environment=HIGHEST,
+    ),
+    Entry(name="peer_benchmarl", module="peer_benchmarl", over="arenas", values=("4096",)),
+)
+START = (
+    Entry(name="start_up", module="start_up", words=("stage=s6", _WARP, "arenas=16384")),
+    Entry(
+        name="start_up-wheeled",
+        module="start_up",
+        words=("stage=s6", _WARP, "robot=wheeled", "arenas=16384"),
+    ),
+)
+SUCCESS = (
+    Entry(
+        name="success-wheeled",
+        module="command_to_success",
+        words=("stage=s6", _WARP, "robot=wheeled", "arenas=16384", "budget=80e6"),
+        over="seed",
+        values=SEEDS,
+        seconds=240.0,
+    ),
+    Entry(
+        name="success-planar",
+        module="command_to_success",
+        words=("stage=s6", _WARP, "arenas=16384", "budget=150e6"),
+        over="seed",
+        values=SEEDS,
+        seconds=240.0,
+    ),
+)
+SWEEP = (
+    *HEADLINE,
+    _speed("planar-jax", "sim.impl=jax"),
+    _speed("wheeled-jax", "sim.impl=jax", "robot=wheeled", values=_SLOW),
+    _robots("robots-planar", _WARP),
+    _robots("robots-wheeled", _WARP, "robot=wheeled"),
+    _memory("memory-planar", _WARP, "stage=s6"),
+    _memory("memory-wheeled", _WARP, "stage=s6", "robot=wheeled"),
+    replace(
+        _speed("wheeled-jax-large", "sim.impl=jax", "robot=wheeled", values=("65536", "262144")),
+        seconds=1200.0,
+    ),
+)
+ON_CPU = tuple(
+    replace(entry, environment=CPU | entry.environment)
+    for entry in (
+        _speed("cpu-planar", "sim.impl=jax", values=("128", "64", "256")),
+        _speed("cpu-wheeled", "sim.impl=jax", "robot=wheeled", values=("64",)),
+        Entry(name="cpu_paper_way", module="cpu_paper_way", words=("seconds=30",)),
+        Entry(name="cpu_sb3", module="cpu_sb3", words=("seconds=30",)),
+        Entry(
+            name="cpu-success",
+            module="command_to_success",
+            over="seed",
+            values=SEEDS,
+            seconds=900.0,
+        ),
+        Entry(name="cpu-start_up", module="start_up"),
+    )
+)
+QUICK = tuple(
+    replace(entry, environment=CPU | entry.environment)
+    for entry in (
+        _speed("quick-planar", "sim.impl=jax", values=("64",)),
+        Entry(
+            name="quick-cpu_paper_way", module="cpu_paper_way", words=("seconds=5", "rollout=1000")
+        ),
+        Entry(name="quick-cpu_sb3", module="cpu_sb3", words=("seconds=5",)),
+        *(
+            replace(_peer(name, ("64",), "steps=16", *words), name=f"quick-{name}", module=name)
+            for name, words in {
+                "peer_vmas": ("device=cpu",),
+                "peer_camar": (),
+                "peer_jaxnav": ("pool=64",),
+            }.items()
+        ),
+    )
+)
+
+SUITES: dict[str, tuple[Entry, ...]] = {
+    "quick": QUICK,
+    "headline": HEADLINE,
+    "peers": (*HEADLINE, *PEERS),
+    "trainers": TRAINERS,
+    "success": (*START, *SUCCESS),
+    "sweep": SWEEP,
+    "cpu": ON_CPU,
+    "gpu": (*HEADLINE, *PEERS, *TRAINERS, *START, *SUCCESS, *SWEEP[2:]),
+}

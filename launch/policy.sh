@@ -1,0 +1,17 @@
+#!/usr/bin/env bash
+# Trains the published policy on one NVIDIA GPU, in about three minutes, compiling included:
+#   bash launch/policy.sh DIR [key=value ...]     e.g. bash launch/policy.sh runs/policy seeds=5 seed=300
+# The real body from the first update, with cheap contacts; then, once every robot arrives, dear
+# ones, with enough exploration left to learn from them. docs/results.md says what each part brings.
+set -euo pipefail
+run=${1:?give a directory for the two runs, as in: bash launch/policy.sh runs/policy}
+shift
+
+train() {
+  uv run --extra gpu python -m swarmjax.train sim.impl=warp robot=wheeled arenas=512 "$@"
+}
+
+train budget=8e6 run.dir="$run/arrive" "$@"
+train budget=6e6 run.dir="$run/avoid" stage=final start="$run/arrive" start_std=reset \
+  algo.exploration=scheduled algo.initial_std=0.3 algo.std_floor=0.2 algo.std_interval=2000000 \
+  task.reward.contact=-0.05 task.reward.proximity=-0.001 "$@"

@@ -1,0 +1,133 @@
+"""`run.episodes`: a line of `episodes.jsonl` for each episode that ended, robot by robot.
+
+The compiled loop hands them on packed: of a rollout the steps at which none ended are left out.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from swarmjax import rollout
+from swarmjax.config import TrainConfig
+from swarmjax.rollout import Ended, Robots
+
+KEY = "episodes_log"  # of the metrics of an update, beside its numbers
+MOST_HELD = 2**19  # episodes that a call may hand on, over all updates and seeds
+
+Row = dict[str, Any]
+
+
+class Log(NamedTuple):
+    """Episodes that ended in one update, in the order in which they ended; E fit in.
+
+    Attributes:
+      ended: [] how many, int32; if more than E, the last ones are lost.
+      arena_steps: [E] control steps of all arenas together in the update by its end.
+      stage: [E] on which it began.
+      steps: [E] control steps.
+      robots: [E] what became of each robot.
+    """
+
+    ended: Array
+    arena_steps: Array
+    stage: Array
+    steps: Array
+    robots: Robots
+
+
+def room(config: TrainConfig) -> int:
+    """Returns how many episodes of one update and seed fit in.
+
+    One more for each arena than wait for it, the one that is under way; or as many as a step limit
+    ends, where that is shorter; or one at each control step, of which there are no more.
+    """
+    steps, limit = config.algo.rollout, config.task.step_limit
+    return config.arenas * min(steps, max(rollout.waiting(steps), steps // limit) + 1)
+
+
+def rows_of_call(config: TrainConfig) -> int:
+    """Returns how many updates of each seed a call may hand on."""
+    return max(1, MOST_HELD // (room(config) * config.seeds))
+
+
+def pack(ended: Ended, size: int) -> Log:
+    """Leaves out where no episode ended.
+
+    Args:
+      ended: [T, A], with `robots`.
+      size: E.
+
+    Returns:
+      The episodes, first by the step at which they ended, then by arena; what follows them is 0.
+    """
+    chex.assert_rank(ended.episodes, 2)
+    assert ended.robots is not None
+    arenas = ended.episodes.shape[1]
+    over = jnp.ravel(ended.episodes) > 0
+    index = jnp.nonzero(over, size=size, fill_value=over.size)[0]
+
+    def take(x: Array) -> Array:
+        flat = x.reshape(-1, *x.shape[2:])
+        return jnp.take(flat, index, axis=0, mode="fill", fill_value=0)
+
+    return Log(
+        ended=jnp.sum(over, dtype=jnp.int32),
+        arena_steps=jnp.where(index < over.size, (index // arenas + 1) * arenas, 0),
+        stage=take(ended.stage),
+        steps=take(ended.steps),
+        robots=jax.tree.map(take, ended.robots),
+    )
+
+
+def rows(
+    log: Log,
+    updates: np.ndarray,
+    stages: Sequence[str],
+    seeds: Sequence[int],
+    control_steps: int,
+) -> tuple[list[Row], int]:
+    """Turns the episodes of a call into rows for JSON.
+
+    Args:
+      log: [N, rows, ...], of which each seed's first n hold an update each.
+      updates: [n] their numbers.
+      stages: names.
+      seeds: [N], the run's.
+      control_steps: arena control steps of one update and seed, over all arenas.
+
+    Returns:
+      The rows, by update, then seed, then as they ended; and how many episodes were lost.
+    """
+    found, lost = [], 0
+    for i, update in enumerate(updates.tolist()):
+        for lane, seed in enumerate(seeds):
+            mine = jax.tree.map(lambda x, at=(lane, i): x[at], log)
+            count, held = int(mine.ended), len(mine.steps)
+            lost += max(0, count - held)
+            begin = {"seed": seed, "update": update}
+            before = update * control_steps
+            found += [begin | _row(mine, each, stages, before) for each in range(min(count, held))]
+    return found, lost
+
+
+def _row(log: Log, index: int, stages: Sequence[str], before: int) -> Row:
+    """Describes one episode, of the robots that took part."""
+    present = np.asarray(log.robots.present[index])
+    values: Mapping[str, np.ndarray] = log.robots._asdict()
+    by_robot = {
+        name: np.asarray(value[index])[present].tolist()
+        for name, value in values.items()
+        if name != "present"
+    }
+    return {
+        "arena_steps": before + int(log.arena_steps[index]),
+        "stage": stages[int(log.stage[index])],
+        "steps": int(log.steps[index]),
+        "robots": int(present.sum()),
+        **by_robot,
+    }

@@ -1,0 +1,89 @@
+"""Gradients by blocks are those of the whole batch."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmjax.config import AlgoConfig
+from swarmjax.ppo import full_batch, losses, networks
+from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.losses import Minibatch
+
+CONFIG = AlgoConfig(hidden=(8,), minibatches=1, epochs=3, entropy_cost=0.01)
+GROUPS, SAMPLES = 3, 250  # 750 samples: two blocks and a part of one
+OBSERVATION, ACTION = 10, 2
+
+
+def _batch(share: float, seed: int = 0) -> Minibatch:
+    """Samples [G, N, ...] of which about this share is valid, zero where not."""
+    rng = np.random.default_rng(seed)
+    valid = rng.uniform(size=(GROUPS, SAMPLES)) < share
+    drawn = {
+        "observation": rng.normal(size=(GROUPS, SAMPLES, OBSERVATION)),
+        "action": rng.normal(size=(GROUPS, SAMPLES, ACTION)),
+        **{
+            name: rng.normal(size=(GROUPS, SAMPLES))
+            for name in ("log_prob", "advantage", "return_")
+        },
+    }
+    kept = {k: x * valid.reshape(valid.shape + (1,) * (x.ndim - 2)) for k, x in drawn.items()}
+    return Minibatch(valid=valid, **{k: x.astype(np.float32) for k, x in kept.items()})
+
+
+def _params() -> networks.Params:
+    return networks.init_params(jax.random.key(0), CONFIG, OBSERVATION, ACTION)
+
+
+@pytest.mark.parametrize(("share", "used"), [(1.0, 3), (0.5, 2), (0.1, 1), (0.0, 0)])
+def test_the_gradient_is_that_of_all_samples_at_once(share: float, used: int) -> None:
+    samples, params = _batch(share), _params()
+    blocks = full_batch.arrange(samples)
+    assert int(blocks.used) == used  # of 750, about 375, 75 and 0 samples in blocks of 256
+    count = jnp.sum(samples.valid)
+    found = full_batch.gradient(params, blocks, CONFIG, count)
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
+    whole = jax.grad(losses.ppo_loss, has_aux=True)
+    # Sums of float32 in another order.
+    for mine, theirs in zip(
+        jax.tree.leaves(found), jax.tree.leaves(whole(params, flat, CONFIG, count)), strict=True
+    ):
+        np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-6)
+
+
+def test_valid_samples_come_first_in_their_order() -> None:
+    samples = _batch(0.5)
+    blocks = full_batch.arrange(samples)
+    valid = samples.valid.reshape(-1)
+    kept = samples.advantage.reshape(-1)[valid]
+    np.testing.assert_array_equal(blocks.samples.advantage.reshape(-1)[: len(kept)], kept)
+    np.testing.assert_array_equal(
+        blocks.samples.valid.reshape(-1), np.arange(3 * full_batch.BLOCK) < len(kept)
+    )
+
+
+def test_lanes_take_their_turns_and_come_to_what_each_does_alone() -> None:
+    shares = (1.0, 0.3, 0.0)
+    batches = [_to_batch(_batch(share, seed)) for seed, share in enumerate(shares)]
+    keys = jax.random.split(jax.random.key(1), 3)
+    learners = jax.vmap(lambda k: ppo.init(k, CONFIG, OBSERVATION, ACTION, 5))(keys)
+
+    def update(learner: ppo.LearnerState, batch: ppo.Batch, key: jax.Array) -> ppo.LearnerState:
+        return ppo.update(learner, CONFIG, batch, key, 5)[0]
+
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *batches)
+    together = jax.jit(jax.vmap(update))(learners, stacked, keys).params
+    for lane, batch in enumerate(batches):
+        mine = jax.tree.map(lambda x, i=lane: x[i], learners)
+        alone = jax.jit(update)(mine, batch, keys[lane]).params
+        for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
+            # What is normalised before, and Adam's steps, are vectorised.
+            np.testing.assert_allclose(a[lane], b, atol=1e-6)
+    before = jax.tree.leaves(jax.tree.map(lambda x: x[2], learners.params))
+    after = jax.tree.leaves(jax.tree.map(lambda x: x[2], together))
+    assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+def _to_batch(samples: Minibatch) -> ppo.Batch:
+    names = ("observation", "action", "log_prob", "advantage", "return_", "valid")
+    return ppo.Batch(**{name: jnp.asarray(getattr(samples, name)) for name in names})

@@ -1,0 +1,134 @@
+"""Reproductions of the paper whose numbers are known beforehand."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from swarmjax.reproduce_rows import ARMS, EXPANDED, JUDGED, LAST, Log, Reproduction
+
+SEEDS = (0, 1, 2)
+FACTS = {
+    "format": 1,
+    "settings": {"seeds": 3, "budget": 1e6, "out": "somewhere", "sim": {"impl": "jax"}},
+    "seeds": list(SEEDS),
+    "budget": 1_000_000,
+    "fine_tune": 250_000,
+    "device": "CPU x86_64, 2 cores",
+    "versions": {"jax": "0.11.2"},
+    "commit": "60ed72f",
+    "compile_s": {},
+}
+
+
+def episode(number: int, **given: Any) -> dict[str, Any]:
+    """An episode of two robots that both arrive: 100 steps, the number-th of its seed from 1."""
+    robots = len(given.get("reached", (True, True)))
+    return {
+        "seed": 0,
+        "update": number,
+        "arena_steps": 100 * number,
+        "stage": LAST,
+        "steps": 100,
+        "robots": robots,
+        "reached": [True] * robots,
+        "reward": [0.5] * robots,
+        "robot_steps": [100] * robots,
+        "sensed": [10] * robots,
+        "contacts": [1] * robots,
+    } | given
+
+
+def row(arm: str, seed: int, stage: str, **given: Any) -> dict[str, Any]:
+    """A row of the evaluation."""
+    shares = {"targets_reached": 0.9, "all_reached": 0.6, "sensed_share": 0.1}
+    rest = {"contacts_per_robot": 1.5, "return": 0.8, "steps": 300.0}
+    where = {"arm": arm, "seed": seed, "stage": stage, "episodes": 20}
+    return where | shares | rest | given
+
+
+def write(
+    out: Path,
+    logs: Mapping[str, Sequence[Mapping[str, Any]]],
+    judged: Sequence[Mapping[str, Any]] | None = None,
+    **facts: Any,
+) -> Path:
+    """Writes a directory in which the arms of the logs have finished."""
+    finished = dict.fromkeys(logs, 60.0)
+    out.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(FACTS | {"seconds": finished, "compile_s": finished} | facts)
+    (out / "reproduce.json").write_text(text)
+    for arm, episodes in logs.items():
+        (out / arm).mkdir(exist_ok=True)
+        lines = "".join(json.dumps(each) + "\n" for each in episodes)
+        (out / arm / "episodes.jsonl").write_text(lines)
+    if judged is None:
+        stages = (LAST, EXPANDED)
+        judged = [row(arm, seed, stage) for arm in logs for seed in SEEDS for stage in stages]
+    text = json.dumps({"format": 1, "rows": list(judged)})
+    (out / "evaluation.json").write_text(text)
+    return out
+
+
+def whole(out: Path, episodes: int = 30, arms: Sequence[str] = tuple(ARMS)) -> Path:
+    """Writes arms that fail in their first ten episodes, baselines in twelve, and then never."""
+    logs = {}
+    for arm in arms:
+        stage = EXPANDED if arm.endswith("_expanded") else LAST
+        failures = 12 if "baseline" in arm else 10
+        logs[arm] = [
+            episode(
+                number,
+                seed=seed,
+                stage="paper1" if arm.endswith("curriculum") and number <= 5 else stage,
+                reached=[number > failures] * 2,
+            )
+            for seed in SEEDS
+            for number in range(1, episodes + 1)
+        ]
+    return write(out, logs)
+
+
+def log(successes: Sequence[bool], *, every: int = 100, **given: Any) -> Log:
+    """A seed's episodes of two robots, which arrive together or not at all."""
+    count = len(successes)
+    both = np.repeat(np.asarray(successes, bool)[:, None], 2, axis=1)
+    ones = np.ones((count, 2), int)
+    number = np.arange(1, count + 1)
+    values = {
+        "number": number,
+        "arena_steps": every * number,
+        "stage": np.full(count, LAST),
+        "present": np.ones((count, 2), bool),
+        "reached": both,
+        "reward": both.astype(float),
+        "robot_steps": 100 * ones,
+        "sensed": 10 * ones,
+        "contacts": ones,
+    }
+    return Log(**(values | given))
+
+
+def reproduction(
+    logs: Mapping[str, Sequence[Log]] | None = None,
+    judged: Mapping[tuple[str, str], Mapping[str, float]] | None = None,
+) -> Reproduction:
+    """What arms came to: every measure that is not given is 0 for all seeds."""
+    logs, judged = logs or {}, judged or {}
+    arms = [*logs, *(arm for arm, _ in judged if arm not in logs)]
+    zero = dict.fromkeys(JUDGED, 0.0)
+    return Reproduction(
+        facts=FACTS | {"seconds": dict.fromkeys(arms, 60.0)},
+        seeds=SEEDS,
+        logs={arm: tuple(logs.get(arm, [log([True] * 30)] * len(SEEDS))) for arm in arms},
+        judged={
+            (arm, stage): {
+                key: np.full(len(SEEDS), value)
+                for key, value in (zero | dict(judged.get((arm, stage), {}))).items()
+            }
+            for arm in arms
+            for stage in (LAST, EXPANDED)
+        },
+    )

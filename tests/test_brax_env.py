@@ -1,0 +1,105 @@
+"""The adapter to Brax steps, rewards, ends and restarts as the environment itself does."""
+
+import warnings
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks import race
+from swarmjax import curriculum
+from swarmjax.config import AlgoConfig, SimConfig, StageConfig, TaskConfig, TrainConfig
+from swarmjax.ppo import learner as ppo
+from swarmjax.task import env
+from swarmjax.task.env import World
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # JAXopt, which Brax imports, says that nobody keeps it up
+    brax_env = pytest.importorskip("benchmarks.brax_env", exc_type=ImportError)
+
+STEPS = 20  # the step limit is 16, so that every arena begins anew once
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    """Two robots where three are compiled in; one solver iteration, which compiles sooner."""
+    stage = StageConfig(name="pair", robots=2, side=0.5)
+    sim = SimConfig(impl="jax", max_robots=3, max_obstacles=0, iterations=1, ls_iterations=1)
+    task, algo = TaskConfig(step_limit=16), AlgoConfig(rollout=8, minibatches=2)
+    return env.load(TrainConfig(stage=(stage,), task=task, algo=algo, sim=sim, arenas=4, budget=32))
+
+
+def test_it_is_the_environment_robot_by_robot(world: World) -> None:
+    swarm = brax_env.SwarmEnv(world, curriculum.schedule(world.config).stages)
+    state = jax.jit(swarm.reset)(jax.random.split(jax.random.PRNGKey(0), 4 * 3))
+
+    @jax.jit
+    def step(state, action):
+        alone = jax.vmap(partial(env.step, world))
+        _, came = alone(state.pipeline_state.now, action.reshape(4, 3, 2))
+        return swarm.step(state, action), came
+
+    random, ended, drawn = np.random.default_rng(0), 0, []
+    for number in range(1, STEPS + 1):
+        before = state.pipeline_state
+        np.testing.assert_array_equal(state.obs, before.now.observation.reshape(12, 10))
+        state, came = step(state, random.uniform(-1.0, 1.0, (12, 2)).astype(np.float32))
+        over = np.asarray(came.done)[:, None, None]
+        seen = np.where(over, before.starts.observation, came.observation)
+        # The same numbers twice in one program, which XLA may add up in another order.
+        np.testing.assert_allclose(state.obs, seen.reshape(12, 10), rtol=0.0, atol=1e-5)
+        np.testing.assert_allclose(state.reward, came.reward.ravel(), rtol=0.0, atol=1e-5)
+        idle = np.asarray(came.truncated | ~came.valid).ravel()
+        np.testing.assert_array_equal(state.info["truncation"], idle)
+        np.testing.assert_array_equal(state.done, idle | np.asarray(came.terminated).ravel())
+        # Of three robots two are there: Brax learns nothing from the third.
+        assert idle.reshape(4, 3)[:, 2].all()
+        ended += int(np.sum(came.done))
+        if np.any(before.starts.level.start != state.pipeline_state.starts.level.start):
+            drawn.append(number)
+    assert ended >= 4
+    assert drawn == [8, 16]  # once a rollout of 8 control steps
+
+
+def test_brax_is_given_our_numbers(tiny_config: TrainConfig) -> None:
+    found = race.brax_settings(race.RaceConfig(points=4), tiny_config)
+    # 20 updates are judged every 5; 8 arenas of 3 robots, 8 control steps each.
+    assert found["num_timesteps"] == 20 * 24 * 8
+    assert (found["num_envs"], found["batch_size"], found["num_minibatches"]) == (24, 12, 2)
+    assert (found["unroll_length"], found["num_updates_per_batch"]) == (8, 2)
+    assert (found["discounting"], found["learning_rate"]) == (0.99, 3e-4)
+    assert race.points(race.RaceConfig(points=6), tiny_config).tolist() == [3, 6, 9, 12, 15, 18]
+
+
+def test_the_judge_sees_the_policy_that_brax_trained(tiny_config: TrainConfig) -> None:
+    from brax.training.acme import running_statistics
+    from brax.training.agents.ppo import networks
+
+    made = race.network_factory(tiny_config)(
+        10, 2, preprocess_observations_fn=running_statistics.normalize
+    )
+    random = np.random.default_rng(0)
+    seen = random.normal(0.2, 0.5, (6, 10)).astype(np.float32)
+    empty = running_statistics.init_state(jnp.zeros(10))
+    moments = running_statistics.update(empty, jnp.asarray(seen))
+    keys = jax.random.split(jax.random.key(1))
+    params = (moments, made.policy_network.init(keys[0]), made.value_network.init(keys[1]))
+    policy = networks.make_inference_fn(made)(params, deterministic=True)
+    theirs, _ = policy(seen, jax.random.key(2))
+    learners = race.as_learners(tiny_config, params)
+    mine = ppo.mode(jax.tree.map(lambda x: x[0, 0], learners), tiny_config.algo, seen)
+    np.testing.assert_allclose(mine, theirs, rtol=1e-5, atol=1e-7)  # rounding of float32
+    std = np.exp(learners.params["actor"]["log_std"])
+    np.testing.assert_allclose(std, 0.6, rtol=1e-6)
+
+
+def test_seconds_to_a_share() -> None:
+    course = race.Course(
+        train_s=np.array([1.0, 2.0, 3.0]),
+        share=np.array([0.5, 0.9, 0.94]),
+        transitions=np.array([10.0, 20.0, 30.0]),
+        compile_s=0.0,
+    )
+    assert race.seconds_to(course) == {"seconds_to_0.90": 2.0, "seconds_to_0.95": None}

@@ -1,0 +1,248 @@
+"""What a run needs of a device's memory, what fits, and how what does not is refused."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from swarmjax import config, memory, train, trainer
+from swarmjax.config import AlgoConfig, ConfigError, RunConfig, StageConfig, TrainConfig
+
+GIB = 2**30
+SETTINGS = TrainConfig(stage=(StageConfig(name="pair", robots=2, side=0.5),), budget=10**9)
+
+
+def _linear(fixed: int, each: int) -> Callable[[TrainConfig], int]:
+    return lambda settings: fixed + each * settings.arenas
+
+
+@pytest.mark.slow
+def test_two_small_programs_tell_what_a_larger_one_takes(tiny_config: TrainConfig) -> None:
+    fixed, each = memory.line(tiny_config, [16, 64], trainer.measure)
+    found = trainer.measure(replace(tiny_config, arenas=512, budget=512 * 8))
+    # XLA lays its buffers out anew for each program: 1.0 % was seen.
+    assert fixed + 512 * each == pytest.approx(found, rel=0.02)
+    # As much as each arena's part of the batch at least: 8 control steps of 3 robots, each with 10
+    # observed numbers, in float32.
+    assert each > 8 * 3 * 10 * 4
+
+
+def test_the_bytes_of_a_tree_are_those_of_its_arrays() -> None:
+    tree = {"a": jnp.zeros((3, 5)), "b": jnp.zeros(7, jnp.int8)}
+    assert memory.size(tree) == 3 * 5 * 4 + 7
+    assert memory.size(jax.eval_shape(lambda: tree)) == 3 * 5 * 4 + 7
+    assert memory.size(jax.random.split(jax.random.key(0), 4)) == 4 * 8  # two words each
+
+
+@pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="Linux alone has it")
+def test_a_cpu_has_all_the_memory_of_its_computer() -> None:
+    found = re.search(r"MemTotal: +(\d+) kB", Path("/proc/meminfo").read_text())
+    assert found is not None
+    assert memory.limit() == int(found[1]) * 1024
+
+
+# The choice
+
+
+@pytest.mark.parametrize(
+    ("share", "minibatches", "arenas"),
+    [
+        # 1e6 bytes and 1000 of each arena in 0.8 of 100e6: 79,000, rounded down.
+        (0.8, 8, 65536),
+        (0.6, 8, 32768),  # 59,000
+        (0.8, 6, 49152),  # 6 * 2^13
+        (0.01, 8, 8),  # not even the fixed part; what is too much is refused later
+    ],
+)
+def test_auto_fills_the_share_with_a_power_of_two(
+    share: float, minibatches: int, arenas: int
+) -> None:
+    settings = replace(
+        SETTINGS,
+        arenas=minibatches,
+        algo=AlgoConfig(minibatches=minibatches),
+        run=RunConfig(memory_share=share),
+    )
+    chosen, why = memory.fill(settings, _linear(10**6, 1000), 10**8)
+    assert chosen == replace(settings, arenas=arenas)
+    assert f"{arenas:,}" in why
+    assert "1,000 bytes each" in why
+
+
+def test_auto_stops_where_the_rest_of_the_config_does() -> None:
+    # 1e6 control steps pay an update of 31,250 arenas.
+    settings = replace(SETTINGS, budget=10**6)
+    chosen, why = memory.fill(settings, _linear(0, 1000), 100 * GIB)
+    assert chosen.arenas == 16384
+    assert "twice as many are refused: budget is 1000000, but one update takes" in why
+    assert "\n" not in why
+
+
+def test_auto_measures_two_small_programs_whatever_the_budget() -> None:
+    measured: list[tuple[int, int]] = []
+
+    def measure(settings: TrainConfig) -> int:
+        measured.append((settings.arenas, settings.updates))
+        return 1000 * settings.arenas
+
+    memory.fill(SETTINGS, measure, GIB)
+    assert measured == [(2048, 1), (4096, 1)]
+    measured.clear()
+    # 512 control steps pay for 16 arenas, and for no more.
+    assert memory.fill(replace(SETTINGS, arenas=8, budget=512), measure, GIB)[0].arenas == 16
+    assert measured == [(8, 1), (16, 1)]
+    measured.clear()
+    assert memory.fill(replace(SETTINGS, arenas=8, budget=256), measure, GIB)[0].arenas == 8
+    assert measured == [(8, 1)]
+
+
+@pytest.mark.parametrize(("minibatches", "arenas"), [(8, 128), (6, 96), (200, 200)])
+def test_auto_on_a_cpu_is_the_default(minibatches: int, arenas: int) -> None:
+    settings = replace(SETTINGS, arenas=minibatches, algo=AlgoConfig(minibatches=minibatches))
+    chosen, why = memory.fill(settings, lambda _: pytest.fail("nothing to measure"), None)
+    assert chosen == replace(settings, arenas=arenas)
+    assert why == f"arenas=auto: {arenas}, as wherever no GPU tells its memory."
+
+
+@pytest.mark.parametrize(
+    ("backend", "available", "arenas"),
+    # 1e6 bytes and 1000 of each arena in 0.8 of 100e6: 79,000, rounded down.
+    [("cpu", 10**8, 128), ("gpu", 10**8, 65536), ("gpu", None, 128)],
+)
+def test_training_begins_with_the_choice(
+    backend: str,
+    available: int | None,
+    arenas: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(memory, "limit", lambda: available)
+    monkeypatch.setattr(train, "measure", _linear(10**6, 1000))
+    monkeypatch.setattr(train, "_run", lambda settings: settings.arenas)
+    assert train.main([*WORDS, "arenas=auto"]) == arenas
+    assert capsys.readouterr().out.startswith(f"arenas=auto: {arenas:,}, ")
+
+
+def test_the_command_line_takes_auto() -> None:
+    settings, auto = train._settings(["arenas=auto", "algo.minibatches=4"])
+    assert auto
+    assert settings.arenas == 4
+    settings, auto = train._settings(["arenas=auto", "arenas=64"])
+    assert not auto
+    assert settings.arenas == 64
+    with pytest.raises(ConfigError, match=r"^arenas is 'auto': give a whole number\.$"):
+        config.load_train(["arenas=auto"])
+    with pytest.raises(ConfigError, match=r"^algo\.minibatches is 'many': give a whole number\.$"):
+        train._settings(["arenas=auto", "algo.minibatches=many"])
+
+
+# Refusals
+
+
+def test_what_fits_is_not_refused() -> None:
+    memory.check(SETTINGS, GIB, GIB)
+    memory.check(SETTINGS, GIB, None)
+    memory.check_state(SETTINGS, GIB, GIB)
+    memory.check_state(SETTINGS, GIB, None)
+
+
+def test_a_run_too_large_is_refused_with_what_fits() -> None:
+    settings = replace(SETTINGS, arenas=1000)
+    # 1000 * 0.95 * 3 / 4 = 712.5, of which 712 is a multiple of 8.
+    with pytest.raises(ConfigError) as caught:
+        memory.check(settings, 4 * GIB, 3 * GIB)
+    assert str(caught.value) == (
+        "arenas is 1000, but training needs 4 GiB of memory and there is 3 GiB: give at most "
+        "about 712."
+    )
+    with pytest.raises(ConfigError) as caught:
+        memory.check(replace(settings, seeds=10), 4 * GIB, 3 * GIB)
+    assert str(caught.value).startswith("arenas is 1000 for each of 10 seeds, but training needs ")
+    with pytest.raises(ConfigError) as caught:
+        memory.check_state(settings, 4 * GIB, 3 * GIB)
+    assert str(caught.value) == (
+        "arenas is 1000, but its state alone needs 4 GiB of memory and there is 3 GiB: give less "
+        "than 744."  # 750
+    )
+
+
+def test_where_fewer_arenas_cannot_be_something_else_is_named() -> None:
+    with pytest.raises(ConfigError) as caught:
+        memory.check(replace(SETTINGS, arenas=8), 4 * GIB, 3 * GIB)
+    assert str(caught.value).endswith(": give fewer seeds, sim.max_robots or algo.rollout.")
+    with pytest.raises(ConfigError) as caught, memory.refusal(replace(SETTINGS, arenas=8)):
+        raise jax.errors.JaxRuntimeError("INTERNAL: CUDA_ERROR_OUT_OF_MEMORY: out of memory")
+    assert str(caught.value) == (
+        "arenas is 8, but the memory of the device is full: give fewer seeds, sim.max_robots or "
+        "algo.rollout."
+    )
+    with pytest.raises(ConfigError) as caught:
+        memory.check(replace(SETTINGS, resume="runs/one"), 4 * GIB, 3 * GIB)
+    assert str(caught.value).endswith(": go on with it on a device that has more.")
+
+
+def test_a_device_that_is_full_is_one_sentence() -> None:
+    with pytest.raises(ConfigError) as caught, memory.refusal(replace(SETTINGS, arenas=1000)):
+        jnp.zeros(2**46, jnp.float32)  # more than a processor can address
+    assert str(caught.value) == (
+        "arenas is 1000, but the memory of the device is full: give about 496."  # 500
+    )
+
+
+def test_other_errors_of_a_device_pass() -> None:
+    with (
+        pytest.raises(jax.errors.JaxRuntimeError, match="INTERNAL"),
+        memory.refusal(SETTINGS),
+    ):
+        raise jax.errors.JaxRuntimeError("INTERNAL: something else")
+
+
+WORDS = [
+    "stage=s1",
+    "sim.impl=jax",
+    "sim.max_robots=2",
+    "sim.max_obstacles=0",
+    "algo.rollout=2",
+    "algo.epochs=1",
+    "algo.hidden=[4]",
+    "task.step_limit=8",
+    "budget=1e9",
+]
+
+
+def test_a_state_too_large_is_refused_before_anything_is_compiled_or_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory, "limit", lambda: 2**20)
+    for each in ("_first_state", "prepare", "compile_chunk"):
+        monkeypatch.setattr(train, each, lambda *_: pytest.fail("nothing to do"))
+    with pytest.raises(ConfigError, match=r"^arenas is 1048576, but its state alone needs "):
+        train.main([*WORDS, "arenas=1048576", f"run.dir={tmp_path / 'run'}"])
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_absurd_number_is_refused_by_the_config() -> None:
+    with pytest.raises(ConfigError, match=r"^arenas is 100000000: give 1 to 1048576\.$"):
+        train.main(["arenas=100000000"])
+
+
+def test_a_program_too_large_is_refused_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "run"
+    compiled = trainer.Compiled(lambda *_: pytest.fail("never called"), 1.0, GIB, GIB)
+    for module in (trainer, train):
+        monkeypatch.setattr(module, "compile_chunk", lambda *_: compiled)
+    monkeypatch.setattr(train, "_first_state", lambda *_: (None, []))
+    monkeypatch.setattr(memory, "limit", lambda: 2 * GIB - 1)
+    for words in ([], ["run.dry=true"]):
+        with pytest.raises(
+            ConfigError, match=r"^arenas is 64, but training needs 2 GiB of .*56\.$"
+        ):
+            train.main([*WORDS, "arenas=64", f"run.dir={run}", *words])
+    assert not run.exists()

@@ -1,0 +1,77 @@
+"""One arena of MuJoCo C for other trainers: it is the judge's, and its rewards are the task's."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import steering
+from sentences import refusal
+
+from benchmarks import cpu_paper_way, mujoco_arena
+from benchmarks.mujoco_arena import Arena
+from swarmjax import evaluate_c, policy
+from swarmjax.config import EvaluateConfig
+from swarmjax.task import observation, reward
+
+STEPS = 150
+
+
+@pytest.fixture(scope="module")
+def settings() -> EvaluateConfig:
+    return mujoco_arena.load_settings(["robot=planar", "stage=s4", f"steps={STEPS}", "seed=3"])
+
+
+def test_an_arena_does_what_the_judge_does(settings: EvaluateConfig, tmp_path: Path) -> None:
+    trained = policy.load(steering.write(tmp_path / "p.npz"))
+    judge = evaluate_c.load(settings, trained)
+    levels = [evaluate_c.draw_level(judge.stage, judge.spacing, 3, n) for n in range(5, 7)]
+    judged = evaluate_c.simulate(judge, levels)
+    arena = Arena(settings, first=5)
+    for n in range(2):
+        seen, over, steps = arena.reset(), False, 0
+        while not over:
+            moved = arena.step(policy.mean_action(trained, seen))
+            seen, over, steps = moved.observation, moved.over, steps + 1
+        assert arena.arenas is not None
+        came = arena.arenas.outcome
+        assert steps == came.clock[0] == judged.clock[n]
+        np.testing.assert_array_equal(came.arrived[0], judged.arrived[n])
+        np.testing.assert_array_equal(came.path[0], judged.path[n])
+
+
+def test_rewards_are_those_of_the_task(settings: EvaluateConfig) -> None:
+    weights = replace(settings.task.reward, proximity=-0.5, contact=-0.25, time=-0.125)
+    arena = Arena(replace(settings, task=replace(settings.task, reward=weights)))
+    arena.reset()
+    random, touched, near = np.random.default_rng(0), 0, 0
+    for _ in range(STEPS):
+        before = arena.arenas
+        assert before is not None
+        moved = arena.step(random.uniform([0.5, -0.2], [1.0, 0.2], (len(before.pose[0]), 2)))
+        after = arena.arenas
+        assert after is not None
+        start, end = (observation.to_target(x.pose, x.target, np)[0][0] for x in (before, after))
+        active = ~before.outcome.arrived[0]
+        begun = (after.outcome.contacts - before.outcome.contacts)[0]
+        rays = after.observation[0, :, :8]  # ideal sensors show metres
+        step = reward.Step(start, end, rays, 0.04, after.outcome.arrived[0] & active, begun)
+        expected = np.where(active, reward.total(step, weights), 0.0)
+        # Here in float64, there in float32; a ray of exactly its range is rounded either way.
+        np.testing.assert_allclose(moved.reward, expected, rtol=0.0, atol=1e-6)
+        touched, near = touched + begun.sum(), near + (rays < 0.04).any(axis=-1).sum()
+        if moved.over:
+            break
+    assert touched > 0
+    assert near > 0
+
+
+def test_a_reward_that_it_does_not_know_is_refused(settings: EvaluateConfig) -> None:
+    task = replace(settings.task, reward=replace(settings.task.reward, arrival=1.0))
+    assert refusal(Arena, replace(settings, task=task)) == "task.reward.arrival is 1.0: give 0."
+
+
+def test_returns_end_with_their_episodes() -> None:
+    # The first is 1 and half of the second, which ends; the last three go on, halved each time.
+    found = cpu_paper_way.discounted([1, 2, 3, 4, 5], [False, True, False, False, False], 0.5)
+    np.testing.assert_array_equal(found, [2.0, 2.0, 6.25, 6.5, 5.0])

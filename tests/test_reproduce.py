@@ -1,0 +1,141 @@
+"""`python -m swarmjax.reproduce` from end to end, and every way to be refused; few steps of all."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from sentences import refusal
+
+from swarmjax import command, compose, reproduce, reproduce_page, reproduce_rows
+from swarmjax.config import ReproduceConfig, load_reproduce
+
+# Eight updates of 64 control steps; the world is the paper's.
+TINY = [
+    "arms=[baseline]",
+    "seeds=3",
+    "seed=5",
+    "budget=512",
+    "fine_tune=512",
+    "rollout=64",
+    "epochs=2",
+    "step_limit=32",
+    "episodes=2",
+    "workers=1",
+    "impl=jax",
+]
+
+
+@pytest.fixture
+def pages(monkeypatch: pytest.MonkeyPatch) -> list[reproduce_rows.Reproduction]:
+    """What the page, which has tests of its own, would have been made of."""
+    found: list[reproduce_rows.Reproduction] = []
+
+    def write(out: Path) -> Path:
+        found.append(reproduce_rows.read(out))
+        return out / "report.html"
+
+    monkeypatch.setattr(reproduce_page, "write", write)
+    return found
+
+
+def test_what_was_stopped_goes_on_and_is_judged(
+    tmp_path: Path, pages: list, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    # Time is up before the first arm begins.
+    assert reproduce.main([*TINY, f"out={out}", "minutes=0.0001"]) == 0
+    assert capsys.readouterr().out == (
+        f"stopped with 1 of 1 arms to train, saved; go on with: python -m swarmjax.reproduce "
+        f"resume={out}\n"
+    )
+    assert not pages
+    facts = json.loads((out / "reproduce.json").read_text())
+    assert (facts["seeds"], facts["budget"], facts["seconds"]) == ([5, 6, 7], 512, {})
+    # A process that was killed before it had saved anything leaves no more than a config.
+    assert reproduce.main([f"resume={out}", "device=cpu"]) == 0
+    (found,) = pages
+    assert (found.seeds, list(found.logs)) == ((5, 6, 7), ["baseline"])
+    lines = (out / "baseline" / "metrics.jsonl").read_text().splitlines()
+    metrics = [json.loads(line) for line in lines]
+    for log, seed in zip(found.logs["baseline"], found.seeds, strict=True):
+        mine = [row for row in metrics if row["seed"] == seed]
+        assert len(mine) == 8
+        assert len(log) == sum(row["episodes"] for row in mine) >= 16  # of 32 steps at most
+        assert log.sensed.sum() == sum(row["sensed"] for row in mine)
+    rows = json.loads((out / "evaluation.json").read_text())["rows"]
+    named = [(row["arm"], row["seed"], row["stage"], row["episodes"]) for row in rows]
+    stages = ("paper6", "paper_expanded")
+    assert named == [("baseline", seed, stage, 2) for seed in (5, 6, 7) for stage in stages]
+    assert all(row["steps"] <= 32 for row in rows)
+    # All is there: nothing is trained or judged again.
+    before = {path: path.stat().st_mtime_ns for path in (out / "baseline").rglob("*")}
+    assert reproduce.main([f"resume={out}"]) == 0
+    assert {path: path.stat().st_mtime_ns for path in (out / "baseline").rglob("*")} == before
+    assert json.loads((out / "evaluation.json").read_text())["rows"] == rows
+
+
+def test_another_directory_is_not_written_over(tmp_path: Path) -> None:
+    (tmp_path / "reproduce.json").write_text("{}")
+    assert refusal(reproduce.main, [f"out={tmp_path}"]) == (
+        f"out is {tmp_path}, which holds a reproduction already: give another directory, or "
+        f"resume={tmp_path} to go on with it."
+    )
+
+
+def test_what_is_no_reproduction_is_not_gone_on_with(tmp_path: Path) -> None:
+    assert refusal(reproduce.main, [f"resume={tmp_path}"]) == (
+        f"resume is {tmp_path}, which is no reproduction: it has no reproduce.json."
+    )
+    stored = {"settings": {"seeds": 3}}
+    (tmp_path / "reproduce.json").write_text(json.dumps(stored))
+    assert refusal(reproduce.main, [f"resume={tmp_path}", "budget=1e6"]) == (
+        "budget=1e6 cannot be given: resume keeps the rest of the stored reproduction and takes "
+        "resume, minutes, device, arms, episodes, workers only."
+    )
+
+
+def test_a_device_that_is_not_there_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # This process has begun to compute on the CPU; JAX cannot change its mind.
+    monkeypatch.setattr(reproduce.jax.config, "update", lambda *_: None)
+    assert refusal(reproduce.main, [f"out={tmp_path / 'new'}", "device=gpu"]) == (
+        "device is gpu, but JAX finds no GPU here: give auto or cpu."
+    )
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["seeds=2"], "seeds is 2, too few for an interval: give 3 or more."),
+        (["budget=5999"],
+         "budget is 5999, which ends before the first update: give at least 6000, the control "
+         "steps of one."),
+        (["fine_tune=1"],
+         "fine_tune is 1, which ends before the first update: give at least 6000, the control "
+         "steps of one."),
+        (["arms=[]"],
+         "arms is []: give some of curriculum, baseline, curriculum_expanded, baseline_expanded, "
+         "modern_curriculum, modern_baseline."),
+        (["arms=[baseline,baseline]"], "arms names baseline more than once: give each once."),
+        (["arms=[baseline_expanded]"],
+         "arms names baseline_expanded, but not baseline, which it goes on with."),
+        (["minutes=0"], "minutes is 0: give more than 0."),
+        (["device=tpu"], "device is 'tpu': give auto, cpu or gpu."),
+        (["buget=1"], "buget is not a key: did you mean budget?"),
+    ],
+)  # fmt: skip
+def test_what_makes_no_sense_is_refused(words: list[str], sentence: str) -> None:
+    assert refusal(load_reproduce, words) == sentence
+
+
+def test_help_lists_every_key(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["reproduce", "--help"])
+    assert command.run("reproduce", reproduce.main, ReproduceConfig) == 0
+    text = capsys.readouterr().out
+    assert "  minutes=null" in text
+    assert compose.defaults("reproduce") == {}

@@ -1,0 +1,79 @@
+"""What the arms of a reproduction are."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from sentences import refusal
+
+from swarmjax import config, reproduce_arms
+from swarmjax.config import ARMS, ReproduceConfig, TrainConfig, load_train
+from swarmjax.trainer import Stop
+
+OUT = Path("somewhere") / "a=b, c"
+MADE = {arm: reproduce_arms.settings(ReproduceConfig(), arm, OUT) for arm in ARMS}
+PAPER = load_train(["algo=paper"])
+
+
+def test_the_paper_arms_are_the_preset() -> None:
+    given = {"run": PAPER.run, "seeds": 1, "seeds_by": "vmap"}
+    assert replace(MADE["curriculum"], **given) == PAPER
+    baseline = load_train(["algo=paper", "stage=paper6"])
+    assert replace(MADE["baseline"], **given) == baseline
+    assert MADE["baseline"].seeds == 10
+    for arm in ("curriculum", "baseline"):
+        fine = MADE[f"{arm}_expanded"]
+        assert fine.start == str(OUT / arm)
+        assert (fine.stage_name, fine.budget, fine.algo) == ("paper_expanded", 250_000, PAPER.algo)
+
+
+def test_the_modern_arms_differ_in_the_trainer_alone() -> None:
+    default = load_train([])
+    for arm in ("curriculum", "baseline"):
+        modern, paper = MADE[f"modern_{arm}"], MADE[arm]
+        for name in ("stage", "robot", "realism", "task", "sim", "budget", "seeds"):
+            assert getattr(modern, name) == getattr(paper, name), name
+        assert replace(modern.algo, rollout=default.algo.rollout) == default.algo
+        assert modern.curriculum == default.curriculum
+        assert modern.updates == 1_000_000 // (16 * 32)
+
+
+def test_each_arm_has_its_directory_and_its_log() -> None:
+    for arm, made in MADE.items():
+        assert made.run.dir == str(OUT / arm)
+        assert made.run.episodes
+
+
+def test_options_reach_the_arms() -> None:
+    given = ReproduceConfig(
+        rollout=3000, epochs=40, time_out="leak", step_limit=750, threshold=0.5, robot="planar"
+    )
+    made = reproduce_arms.settings(given, "curriculum", OUT)
+    assert (made.algo.rollout, made.algo.epochs, made.algo.time_out) == (3000, 40, "leak")
+    assert (made.task.step_limit, made.curriculum.threshold) == (750, 0.5)
+    assert made.robot == load_train([]).robot
+
+
+def test_a_directory_of_another_config_is_refused(tmp_path: Path) -> None:
+    made = reproduce_arms.settings(ReproduceConfig(), "baseline", tmp_path)
+    run = tmp_path / "baseline"
+    run.mkdir()
+    other = config.to_dict(replace(made, budget=12_000))
+    (run / "config.json").write_text(json.dumps(other))
+    assert refusal(reproduce_arms.run, made, Stop()) == (
+        f"{run} holds a run of another config than this version makes of the reproduction's: "
+        "give another out."
+    )
+
+
+@pytest.mark.parametrize("spent", [True, False])
+def test_an_arm_is_done_when_its_budget_is_spent(spent: bool, tmp_path: Path) -> None:
+    (tmp_path / "baseline").mkdir()
+    (tmp_path / "baseline" / "summary.json").write_text(json.dumps({"budget_spent": spent}))
+    assert list(reproduce_arms.summaries(tmp_path)) == (["baseline"] if spent else [])
+
+
+def test_the_config_is_one_that_is_stored() -> None:
+    for made in MADE.values():
+        assert config.build(TrainConfig, config.to_dict(made)) == made

@@ -1,0 +1,82 @@
+"""Policies of a reproduction on levels that differ by the noise of their sensors alone."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import steering
+from steering import STAY, STEER, STRIDE
+
+from swarmjax import cells, config, evaluate_c, policy, reproduce_judge
+from swarmjax.config import (
+    EvaluateConfig,
+    ReproduceConfig,
+    RewardConfig,
+    RobotConfig,
+    StageConfig,
+    TaskConfig,
+    TrainConfig,
+)
+from swarmjax.reproduce_judge import Task
+
+RADIUS = TaskConfig().target_radius
+
+
+def _play(tmp_path: Path, drive: tuple) -> tuple:
+    """Four episodes of two robots in 0.6 m: what `play` and `simulate` make of them."""
+    path = steering.write(tmp_path / "policy.npz", drive)
+    stage = StageConfig(name="pair", robots=2, side=0.6)
+    settings = EvaluateConfig(
+        policy=str(path), stage=stage, robot=RobotConfig(), steps=150, episodes=4
+    )
+    levels = cells.split(cells.draw_stage(settings, range(4)).levels)
+    judge = evaluate_c.load(settings, policy.load(path))
+    away = np.array([np.hypot(*(each.start[:, :2] - each.target).T) for each in levels])
+    return reproduce_judge.play(judge, levels), evaluate_c.simulate(judge, levels), away
+
+
+def test_episodes_are_those_of_the_judge(tmp_path: Path) -> None:
+    (outcome, nearer), expected, away = _play(tmp_path, STEER)
+    for name, mine, theirs in zip(outcome._fields, outcome, expected, strict=True):
+        np.testing.assert_array_equal(mine, theirs, err_msg=name)
+    # One that has arrived crossed the radius in its last step, by a stride at most; float32
+    # levels.
+    arrived = outcome.arrived
+    assert arrived.any()
+    assert len(set(outcome.clock.tolist())) > 1  # some are over before others
+    left = (away - nearer)[arrived]
+    assert (left <= RADIUS + 1e-6).all()
+    assert (left >= RADIUS - STRIDE - 1e-6).all()
+
+
+def test_robots_that_stay_come_no_nearer(tmp_path: Path) -> None:
+    (outcome, nearer), _, _ = _play(tmp_path, STAY)
+    assert outcome.clock.tolist() == [150] * 4
+    np.testing.assert_allclose(nearer, 0.0, atol=1e-9)  # rounding of the physics
+
+
+def test_a_row_says_what_became_of_a_policy(tmp_path: Path) -> None:
+    trained = TrainConfig(
+        stage=(StageConfig(name="pair", robots=2, side=0.6),),
+        task=TaskConfig(step_limit=5, reward=RewardConfig(proximity=-0.001)),
+    )
+    path = steering.write(tmp_path / "p.npz", STAY, config=config.to_dict(trained))
+    tasks = [Task("baseline", 3, path, stage) for stage in reproduce_judge.STAGES]
+    given = ReproduceConfig(episodes=2, workers=1)
+    done: list[None] = []
+    rows = reproduce_judge.judge(given, tasks, lambda: done.append(None))
+    assert len(done) == 2
+    for row, stage in zip(rows, reproduce_judge.STAGES, strict=True):
+        assert {key: row[key] for key in ("arm", "seed", "stage", "episodes", "steps")} == {
+            "arm": "baseline", "seed": 3, "stage": stage, "episodes": 2, "steps": 5.0
+        }  # fmt: skip
+        assert row["targets_reached"] == row["all_reached"] == 0.0
+        # Equation 3 of robots that stay: what is in infrared range costs 0.001 a step, of 5.
+        assert row["return"] == pytest.approx(-0.005 * row["sensed_share"], abs=1e-9)
+
+
+def test_rows_that_were_written_are_read(tmp_path: Path) -> None:
+    assert reproduce_judge.read(tmp_path) == []
+    (tmp_path / "evaluation.json").write_text(json.dumps({"format": 1, "rows": [{"seed": 1}]}))
+    assert reproduce_judge.read(tmp_path) == [{"seed": 1}]

@@ -1,0 +1,203 @@
+"""The report of a reproduction: read as a browser would, it says what the data say."""
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from reproductions import SEEDS, episode, row, whole, write
+from sentences import refusal
+
+from swarmjax import reproduce_claims, reproduce_page
+from swarmjax.reproduce_rows import ARMS, EXPANDED, LAST
+
+PAIR = ("curriculum", "baseline")
+HOSTILE = "</style><script>alert(1)</script>"
+
+
+class Page(HTMLParser):
+    """Tags with their attributes, rows of tables, and all other text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.rows: list[list[str]] = []
+        self.text = ""
+        self.in_cell = False
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag == "tr":
+            self.rows.append([])
+        elif tag in ("td", "th"):
+            self.rows[-1].append("")
+            self.in_cell = True
+
+    def handle_endtag(self, tag: str) -> None:
+        self.in_cell = self.in_cell and tag not in ("td", "th")
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+        if self.in_cell:
+            self.rows[-1][-1] += data.strip()
+
+    def starting(self, *cells: str) -> list[list[str]]:
+        """Rows that begin with these cells."""
+        return [found for found in self.rows if found[: len(cells)] == list(cells)]
+
+
+@pytest.fixture(scope="module")
+def partial(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page]:
+    """The curriculum and the baseline have finished; success by seed is 0.5, 0.75 and 1."""
+    out = tmp_path_factory.mktemp("out")
+    whole(out, arms=PAIR)
+    judged = [
+        row(arm, seed, stage, targets_reached=0.5 + seed / 4)
+        for arm in PAIR
+        for seed in SEEDS
+        for stage in (LAST, EXPANDED)
+    ]
+    (out / "evaluation.json").write_text(json.dumps({"format": 1, "rows": judged}))
+    facts = json.loads((out / "reproduce.json").read_text())
+    (out / "reproduce.json").write_text(json.dumps(facts | {"commit": HOSTILE}))
+    page = reproduce_page.write(out)
+    assert page == out / "report.html"
+    return out, Page(page.read_text())
+
+
+def test_the_header_says_how_the_data_came_about(partial: tuple[Path, Page]) -> None:
+    _, page = partial
+    assert "python -m swarmjax.reproduce seeds=3 budget=1000000 sim.impl=jax" in page.text
+    assert "1,000,000 arena control steps of each seed" in page.text
+    assert HOSTILE in page.text
+    assert page.starting("curriculum")[0] == ["curriculum", ARMS["curriculum"], "60 s", "60 s"]
+    assert page.starting("modern_baseline")[0][2:] == ["not trained to the end", ""]
+
+
+def test_the_table_that_the_paper_lacks(partial: tuple[Path, Page]) -> None:
+    _, page = partial
+    [found] = page.starting("baseline", LAST)
+    # The mean of three, of which none is trimmed, and a seed thrice in one resample of 27.
+    assert found[2] == "75.0 % (50.0 to 100.0)"
+    assert found[3:] == [
+        "60.0 % (60.0 to 60.0)",
+        "10.0 % (10.0 to 10.0)",
+        "1.5 (1.5 to 1.5)",
+        "0.8 (0.8 to 0.8)",
+    ]
+
+
+def test_where_success_becomes_steady(partial: tuple[Path, Page]) -> None:
+    _, page = partial
+    goal = "robot 1 reached its target"
+    # Ten failures, of which a window of 20 may have four: episode 7. On the last stage five are
+    # left, and the second of them is episode 7 of the run, which ends at 700 arena steps.
+    everything, on_last = (
+        page.starting(goal, "all episodes, episode number", "curriculum")[0],
+        (page.starting(goal, f"episodes on {LAST}, arena steps", "curriculum")[0]),
+    )
+    assert everything[3:] == ["7", "7 (7 to 7)", "3 of 3"]
+    assert on_last[3:] == ["700", "700 (700 to 700)", "3 of 3"]
+    # The baseline fails twice more, and is steady two episodes later in every seed.
+    minus = "\N{MINUS SIGN}"
+    assert page.starting(goal, "all episodes, episode number", f"{minus}2 ({minus}2 to {minus}2)")
+    [found] = page.starting(
+        goal, f"episodes on {LAST}, arena steps", f"{minus}200 ({minus}200 to {minus}200)"
+    )
+    assert found[3] == "1 (1 to 1)"
+
+
+def test_every_claim_has_its_verdict(partial: tuple[Path, Page]) -> None:
+    out, page = partial
+    for claim in reproduce_claims.CLAIMS:
+        [found] = [found for found in page.rows if found[0].startswith(claim.quote)]
+        assert re.match("reproduced|not reproduced|undecidable", found[1])
+        assert claim.criterion in page.text
+    lines = (out / "verdicts.md").read_text().splitlines()
+    assert sum(line.startswith('| "') for line in lines) == len(reproduce_claims.CLAIMS)
+    total = re.search(
+        r"Of (\d+) claims: (\d+) reproduced, (\d+) not reproduced, (\d+) und", page.text
+    )
+    assert total is not None
+    count, *parts = map(int, total.groups())
+    assert count == len(reproduce_claims.CLAIMS) == sum(parts)
+
+
+def test_what_is_lacking_is_said(partial: tuple[Path, Page]) -> None:
+    _, page = partial
+    assert (
+        "Not trained to the end, and missing below: curriculum_expanded, baseline_expanded, "
+        "modern_curriculum, modern_baseline." in page.text
+    )
+    assert "Lacks modern_curriculum and modern_baseline, not trained to the end." in page.text
+    assert "Not drawn: Figure 9. Lacks curriculum_expanded and baseline_expanded" in page.text
+
+
+def test_the_page_needs_nothing_else(partial: tuple[Path, Page]) -> None:
+    out, page = partial
+    names = [tag for tag, _ in page.tags]
+    assert not {"script", "iframe", "object", "form"} & set(names)
+    sources = [given["src"] for tag, given in page.tags if tag == "img"]
+    assert all(source is not None and source.startswith("data:image/png;") for source in sources)
+    assert len(sources) == len(list((out / "figures").iterdir())) == 7
+    assert [given for tag, given in page.tags if tag == "link"] == [
+        {"rel": "icon", "href": "data:,"}
+    ]
+    assert all(given["alt"] for tag, given in page.tags if tag == "img")
+
+
+def test_a_single_arm_is_reported(tmp_path: Path) -> None:
+    logs = {"baseline": [episode(n, seed=seed) for seed in SEEDS for n in range(1, 4)]}
+    page = Page(reproduce_page.write(write(tmp_path, logs)).read_text())
+    # Three episodes are fewer than a window: there is no curve, and nothing is steady.
+    [found] = page.starting(
+        "robot 1 reached its target", "all episodes, episode number", "baseline"
+    )[:1]
+    assert found[3:5] == ["never", "never (never to never)"]
+
+
+def test_data_that_are_missing_are_refused(tmp_path: Path) -> None:
+    out = whole(tmp_path, arms=PAIR)
+    (out / "baseline" / "episodes.jsonl").unlink()
+    assert "baseline has no episodes.jsonl" in refusal(reproduce_page.write, out)
+    assert not (out / "report.html").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    out = whole(tmp_path, episodes=2, arms=("baseline",))
+    (out / "figures").write_text("in the way")
+    assert "cannot be written" in refusal(reproduce_page.write, out)
+
+
+@pytest.mark.slow
+def test_ten_seeds_of_six_arms_stay_below_two_megabytes(tmp_path: Path) -> None:
+    # Noise in all that is drawn: nothing that compression could make use of.
+    random = np.random.default_rng(0)
+    logs = {
+        arm: [
+            episode(
+                number,
+                seed=seed,
+                stage=EXPANDED if arm.endswith("_expanded") else LAST,
+                reached=random.integers(0, 2, 5).astype(bool).tolist(),
+                reward=random.normal(size=5).tolist(),
+                robot_steps=[100] * 5,
+                sensed=random.integers(0, 100, 5).tolist(),
+                contacts=random.integers(0, 20, 5).tolist(),
+            )
+            for seed in range(10)
+            for number in range(1, 2001)
+        ]
+        for arm in ARMS
+    }
+    judged = [
+        row(arm, seed, stage, targets_reached=random.random())
+        for arm in ARMS
+        for seed in range(10)
+        for stage in (LAST, EXPANDED)
+    ]
+    page = reproduce_page.write(write(tmp_path, logs, judged, seeds=list(range(10))))
+    assert page.stat().st_size < 2_000_000

@@ -1,0 +1,154 @@
+"""What a reproduction wrote down: laid out by seed, episode and robot, or refused in a sentence."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from reproductions import SEEDS, episode, row, whole, write
+from sentences import refusal
+
+from swarmjax import config, reproduce_rows
+from swarmjax.reproduce_rows import EXPANDED, LAST
+
+PAIR = ("curriculum", "baseline")
+
+
+def _three(*episodes: dict) -> list[dict]:
+    """The same episodes for each of three seeds."""
+    return [each | {"seed": seed} for seed in SEEDS for each in episodes]
+
+
+def test_episodes_are_laid_out_by_robot(tmp_path: Path) -> None:
+    first = episode(
+        1,
+        stage="paper1",
+        reached=[True, False],
+        reward=[0.25, -0.5],
+        robot_steps=[60, 100],
+        sensed=[3, 4],
+        contacts=[0, 2],
+    )
+    second = episode(2, reached=[True, True, False], reward=[1, 0.5, 0.125])
+    data = reproduce_rows.read(write(tmp_path, {"curriculum": _three(first, second)}))
+    assert data.seeds == SEEDS
+    assert len(data.logs["curriculum"]) == 3
+    log = data.logs["curriculum"][1]
+    # A robot that is absent reaches nothing and collects nothing.
+    np.testing.assert_array_equal(log.present, [[True, True, False], [True, True, True]])
+    np.testing.assert_array_equal(log.reached, [[True, False, False], [True, True, False]])
+    np.testing.assert_array_equal(log.reward, [[0.25, -0.5, 0.0], [1.0, 0.5, 0.125]])
+    np.testing.assert_array_equal(log.robot_steps, [[60, 100, 0], [100, 100, 100]])
+    np.testing.assert_array_equal(log.sensed, [[3, 4, 0], [10, 10, 10]])
+    np.testing.assert_array_equal(log.contacts, [[0, 2, 0], [1, 1, 1]])
+    # The episodes of a stage keep their numbers in the run.
+    last = log.on(LAST)
+    assert (last.number.tolist(), last.arena_steps.tolist(), len(last)) == ([2], [200], 1)
+    assert log.on(None) is log
+
+
+def test_episodes_of_an_update_are_ordered_by_their_ends(tmp_path: Path) -> None:
+    late, soon = episode(3, update=0, contacts=[7, 7]), episode(1, update=0)
+    data = reproduce_rows.read(write(tmp_path, {"curriculum": _three(late, soon)}))
+    log = data.logs["curriculum"][0]
+    assert log.arena_steps.tolist() == [100, 300]
+    assert log.contacts[:, 0].tolist() == [1, 7]
+    assert log.number.tolist() == [1, 2]
+
+
+def test_evaluations_are_laid_out_by_seed(tmp_path: Path) -> None:
+    rows = [
+        row("baseline", seed, stage, targets_reached=share + seed / 10)
+        for stage, share in ((EXPANDED, 0.5), (LAST, 0.75))
+        for seed in reversed(SEEDS)
+    ]
+    data = reproduce_rows.read(write(tmp_path, {"baseline": _three(episode(1))}, rows))
+    judged = {stage: data.judged["baseline", stage] for stage in (LAST, EXPANDED)}
+    np.testing.assert_array_equal(judged[LAST]["targets_reached"], [0.75, 0.75 + 0.1, 0.75 + 0.2])
+    np.testing.assert_array_equal(judged[EXPANDED]["targets_reached"], [0.5, 0.5 + 0.1, 0.5 + 0.2])
+    np.testing.assert_array_equal(judged[EXPANDED]["return"], [0.8] * 3)
+
+
+def test_an_arm_that_has_not_finished_is_left_out(tmp_path: Path) -> None:
+    out = whole(tmp_path, arms=PAIR)
+    (out / "modern_curriculum").mkdir()
+    (out / "modern_curriculum" / "episodes.jsonl").write_text("not read\n")
+    data = reproduce_rows.read(out)
+    assert list(data.logs) == list(PAIR)
+    assert data.lacking(("baseline", "modern_curriculum")) == ["modern_curriculum"]
+
+
+def test_the_arms_are_those_that_are_trained() -> None:
+    assert tuple(reproduce_rows.ARMS) == config.ARMS
+
+
+def _change(out: Path, name: str, **given: object) -> None:
+    found = json.loads((out / name).read_text())
+    (out / name).write_text(json.dumps(found | given))
+
+
+def _append(out: Path, **given: object) -> None:
+    with (out / "baseline" / "episodes.jsonl").open("a") as file:
+        file.write(json.dumps(episode(99) | given) + "\n")
+
+
+def _drop(out: Path, text: str) -> None:
+    """Takes lines out of the baseline's log."""
+    path = out / "baseline" / "episodes.jsonl"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(line for line in lines if text not in line))
+
+
+REFUSED = {
+    "no facts": (lambda out: (out / "reproduce.json").unlink(), "is no reproduction"),
+    "format": (lambda out: _change(out, "reproduce.json", format=2), "has format 2"),
+    "no arm": (lambda out: _change(out, "reproduce.json", seconds={}), "no finished arm"),
+    "two seeds": (
+        lambda out: _change(out, "reproduce.json", seeds=[0, 1]),
+        "has 2 seeds: an interval takes 3 or more",
+    ),
+    "seeds": (lambda out: _change(out, "reproduce.json", seeds=["0"] * 3), "as seeds"),
+    "budget": (lambda out: _change(out, "reproduce.json", budget=None), "as budget"),
+    "seconds": (lambda out: _change(out, "reproduce.json", seconds={"baseline": "x"}), "seconds"),
+    "no log": (
+        lambda out: (out / "baseline" / "episodes.jsonl").unlink(),
+        "baseline has no episodes.jsonl",
+    ),
+    "a seed": (lambda out: _drop(out, '"seed": 2'), "no episode of seed 2"),
+    "another seed": (lambda out: _append(out, seed=3), "has seed 3"),
+    "an update": (lambda out: _append(out, seed=0, update=1), "goes back to update 1"),
+    "lengths": (lambda out: _append(out, sensed=[1]), "has sensed that is no list of 2"),
+    "no robots": (
+        lambda out: _append(
+            out, robots=0, reached=[], reward=[], robot_steps=[], sensed=[], contacts=[]
+        ),
+        "has reached",
+    ),
+    "kinds": (lambda out: _append(out, reached=[1, 0]), "has reached"),
+    "counts": (lambda out: _append(out, contacts=[-1, 0]), "has contacts"),
+    "nan": (lambda out: _append(out, reward=[float("nan"), 0.0]), "has reward"),
+    "stage": (lambda out: _append(out, stage=6), "as stage"),
+    "no evaluation": (
+        lambda out: (out / "evaluation.json").unlink(),
+        "has no evaluation.json",
+    ),
+    "rows": (
+        lambda out: _change(out, "evaluation.json", rows=[row("baseline", 0, LAST)]),
+        "has no row of arm curriculum, seed 0 on paper6",
+    ),
+    "a measure": (
+        lambda out: _change(
+            out, "evaluation.json", rows=[row("baseline", 0, LAST, **{"return": float("inf")})]
+        ),
+        "as return",
+    ),
+    "a row": (lambda out: _change(out, "evaluation.json", rows=[[]]), "row 1, holds no keys"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_missing_or_damaged_is_named(name: str, tmp_path: Path) -> None:
+    out = whole(tmp_path, arms=PAIR)
+    damage, words = REFUSED[name]
+    damage(out)
+    assert words in refusal(reproduce_rows.read, out)

@@ -1,0 +1,31 @@
+"""When training stops by itself, and groups of seeds that are called at once."""
+
+import threading
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from swarmjax import trainer
+
+
+def test_groups_are_called_at_once_and_keep_their_order() -> None:
+    together = threading.Barrier(3, timeout=60)  # breaks unless all three are under way
+
+    def call(schedule: Any, part: jax.Array, n: np.int32) -> tuple[jax.Array, dict]:
+        together.wait()
+        return part + n, {"seed": 10 * part}
+
+    state, metrics = trainer._call_at_once(call, 3, None, jnp.arange(6), np.int32(100))
+    assert state.tolist() == [100, 101, 102, 103, 104, 105]
+    assert metrics["seed"].tolist() == [0, 10, 20, 30, 40, 50]
+
+
+def test_a_stop_has_a_time_of_its_own() -> None:
+    assert not trainer.Stop().asked
+    assert not trainer.Stop(until=time.monotonic() + 3600.0).asked
+    over = trainer.Stop(until=time.monotonic())
+    assert over.asked
+    assert not over.signalled
