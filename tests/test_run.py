@@ -183,8 +183,8 @@ def test_a_benchmark_without_its_peer_says_so(
     assert code == 0
     assert json.loads(capsys.readouterr().out) == {
         "benchmark": "peer",
-        "skipped": "no_such_peer cannot be imported (No module named 'no_such_peer'): install the "
-        "extra some.",
+        "skipped": "no_such_peer cannot be imported (No module named 'no_such_peer'): install "
+        "some.",
     }
 
 

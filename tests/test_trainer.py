@@ -18,7 +18,11 @@ def test_groups_are_called_at_once_and_keep_their_order() -> None:
         together.wait()
         return part + n, {"seed": 10 * part}
 
-    state, metrics = trainer._call_at_once(call, 3, None, jnp.arange(6), np.int32(100))
+    schedule: Any = None
+    lanes: Any = jnp.arange(6)
+    found = trainer._call_at_once(call, 3, schedule, lanes, np.int32(100))
+    state: Any = found[0]
+    metrics = found[1]
     assert state.tolist() == [100, 101, 102, 103, 104, 105]
     assert metrics["seed"].tolist() == [0, 10, 20, 30, 40, 50]
 

@@ -58,8 +58,8 @@ def test_without_its_prices_the_default_is_equation_3(step: reward.Step) -> None
 
 
 def test_default_adds_prices_of_contacts_and_time(step: reward.Step) -> None:
-    # 0.02 m a contact that begins, 0.001 m a control step.
-    expected = np.float32([0.124, -0.022, 0.03125 - 0.042, -0.251])
+    # 0.02 m a contact that begins, 0.002 m a control step; nothing for a short ray.
+    expected = np.float32([0.123, -0.022, 0.03125 - 0.042, -0.252])
     # 1e-8: float32, a few roundings of numbers below 0.3.
     np.testing.assert_allclose(reward.total(step, RewardConfig()), expected, atol=2e-8)
 
