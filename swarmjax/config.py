@@ -908,11 +908,12 @@ class TrainConfig(Section):
                 f"budget is {self.budget}, but one update takes arenas x algo.rollout = {update} "
                 f"control steps: give at least {update}."
             )
-        if self.updates > MAX_COUNT:
+        most = MAX_COUNT // (self.algo.epochs * self.algo.minibatches)
+        if self.updates > most:
             raise ConfigError(
                 f"budget is {self.budget}, which is {self.updates} updates of {update} control "
-                f"steps, and updates are counted up to {MAX_COUNT}: give at most "
-                f"{MAX_COUNT * update}."
+                f"steps, and the gradient steps of no more than {most} are counted in 32 bits: "
+                f"give at most {most * update}."
             )
 
     @property

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from swarmjax import cells, compose, evaluate_c, evaluate_judge, evaluate_run, policy_file
-from swarmjax.config import EvaluateConfig, ReproduceConfig, StageConfig, TrainConfig
+from swarmjax.config import ConfigError, EvaluateConfig, ReproduceConfig, StageConfig, TrainConfig
 from swarmjax.evaluate_c import Arenas
 from swarmjax.evaluate_judge import Judge
 from swarmjax.measures import Outcome
@@ -140,6 +140,14 @@ def read(out: Path) -> list[Row]:
 
     Args:
       out: directory of the reproduction.
+
+    Raises:
+      ConfigError: if the file is damaged.
     """
     path = out / EVALUATION
-    return json.loads(path.read_text())["rows"] if path.exists() else []
+    if not path.exists():
+        return []
+    try:
+        return [*json.loads(path.read_text())["rows"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path} cannot be read ({error}): remove it to judge anew.") from None

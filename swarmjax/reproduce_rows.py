@@ -221,7 +221,9 @@ def _read_judged(
     found = report_rows.read_object(path)
     _check_format(found, path)
     rows: dict[tuple[str, str, int], Row] = {}
-    for number, row in enumerate(found.get("rows", []), 1):
+    if not isinstance(found.get("rows"), list):
+        raise ConfigError(f"{path} has no list of rows: it is damaged.")
+    for number, row in enumerate(found["rows"], 1):
         _check_judged(row, f"{path}, row {number},")
         rows[row["arm"], row["stage"], row["seed"]] = row
     judged = {}

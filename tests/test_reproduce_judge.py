@@ -80,3 +80,13 @@ def test_rows_that_were_written_are_read(tmp_path: Path) -> None:
     assert reproduce_judge.read(tmp_path) == []
     (tmp_path / "evaluation.json").write_text(json.dumps({"format": 1, "rows": [{"seed": 1}]}))
     assert reproduce_judge.read(tmp_path) == [{"seed": 1}]
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"rows": null}'])
+def test_rows_that_are_damaged_are_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "evaluation.json"
+    path.write_text(text)
+    with pytest.raises(
+        config.ConfigError, match=r"cannot be read \(.*\): remove it to judge anew\.$"
+    ):
+        reproduce_judge.read(tmp_path)

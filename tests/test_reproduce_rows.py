@@ -132,6 +132,10 @@ REFUSED = {
         lambda out: (out / "evaluation.json").unlink(),
         "has no evaluation.json",
     ),
+    "no rows": (
+        lambda out: _change(out, "evaluation.json", rows=None),
+        "has no list of rows: it is damaged.",
+    ),
     "rows": (
         lambda out: _change(out, "evaluation.json", rows=[row("baseline", 0, LAST)]),
         "has no row of arm curriculum, seed 0 on paper6",
