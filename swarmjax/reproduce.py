@@ -29,9 +29,9 @@ from swarmjax import (
 from swarmjax.checkpoint import CheckpointError
 from swarmjax.config import ConfigError, ReproduceConfig
 from swarmjax.reproduce_judge import Task
+from swarmjax.reproduce_rows import EVALUATION, FACTS, FORMAT
 from swarmjax.trainer import Stop, TrainingError
 
-FACTS, FORMAT = "reproduce.json", 1
 FAILED = 1
 _PLATFORMS = {"cpu": "cpu", "gpu": "cuda,cpu"}  # as JAX calls them
 
@@ -155,7 +155,7 @@ def _judge(out: Path, given: ReproduceConfig) -> None:
     with progress:
         bar = progress.add_task("policies judged", total=len(tasks))
         rows += reproduce_judge.judge(given, tasks, lambda: progress.advance(bar))
-    _replace(out / reproduce_judge.EVALUATION, {"format": reproduce_judge.FORMAT, "rows": rows})
+    _replace(out / EVALUATION, {"format": FORMAT, "rows": rows})
 
 
 def _tasks(out: Path, given: ReproduceConfig) -> list[Task]:

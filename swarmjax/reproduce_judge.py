@@ -18,12 +18,12 @@ from swarmjax.evaluate_c import Arenas
 from swarmjax.evaluate_judge import Judge
 from swarmjax.measures import Outcome
 from swarmjax.provenance import cores
+from swarmjax.reproduce_rows import EVALUATION, EXPANDED, LAST
 from swarmjax.settings import build
 from swarmjax.task import observation
 from swarmjax.task.level import Level
 
-EVALUATION, FORMAT = "evaluation.json", 1
-STAGES = ("paper6", "paper_expanded")
+STAGES = (LAST, EXPANDED)
 
 Row = dict[str, Any]
 

@@ -14,11 +14,12 @@ import numpy as np
 
 from swarmjax import report_rows
 from swarmjax.config import ConfigError
+from swarmjax.recorder import EPISODES
 from swarmjax.report_rows import Row
 from swarmjax.statistics import LEAST_DRAWN
 
-FACTS, EPISODES, EVALUATION = "reproduce.json", "episodes.jsonl", "evaluation.json"
-FORMAT = 1
+FACTS, EVALUATION = "reproduce.json", "evaluation.json"
+FORMAT = 1  # of both
 LAST, EXPANDED = "paper6", "paper_expanded"  # the stages that policies are judged on
 ARMS = {
     "curriculum": "the paper's algorithm with its curriculum",
