@@ -58,7 +58,8 @@ class Arena:
         if arrival:
             raise ConfigError(f"task.reward.arrival is {arrival}: give 0.")
         robots = settings.stage.robots
-        self.judge = evaluate_c.load(settings, _puppet(settings, np.zeros((robots, ACTION_SIZE))))
+        told = replace(settings, action="mean")  # what it is told, and nothing drawn beside it
+        self.judge = evaluate_c.load(told, _puppet(told, np.zeros((robots, ACTION_SIZE))))
         self._number = first
         self.arenas: Arenas | None = None
 

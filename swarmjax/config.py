@@ -948,6 +948,13 @@ class EvaluateConfig(Section):
     )
     shape: Shape = field(default="box", metadata=about("of the obstacles of a random level"))
     realism: RealismConfig = field(default_factory=RealismConfig)
+    action: Literal["sampled", "mean"] = field(
+        default="sampled",
+        metadata=about(
+            "of the robots; sampled: drawn from the policy, the same for the same level; mean: "
+            "the most likely one"
+        ),
+    )
     engine: Literal["c", "mjx"] = field(
         default="c", metadata=about("c: MuJoCo's C engine; mjx: the one that trains")
     )
@@ -1127,6 +1134,13 @@ class ReplayConfig(Section):
     task: TaskConfig = field(default_factory=TaskConfig)
     realism: RealismConfig = field(default_factory=RealismConfig)
     shape: Shape = field(default="box", metadata=about("of the obstacles of a random level"))
+    action: Literal["sampled", "mean"] = field(
+        default="sampled",
+        metadata=about(
+            "of the robots; sampled: drawn from the policy, the same for the same level; mean: "
+            "the most likely one"
+        ),
+    )
     level: str | None = field(
         default=None,
         metadata=about("numbers of the levels, as in 0,7,12; null: 0, unless worst is given"),
@@ -1208,6 +1222,7 @@ class ReplayConfig(Section):
             task=self.task,
             realism=self.realism,
             shape=self.shape,
+            action=self.action,
             steps=self.steps,
             # Of levels that are named no more are drawn than needed.
             episodes=max(self.levels) + 1 if self.worst is None else self.episodes,

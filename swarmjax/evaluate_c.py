@@ -16,15 +16,16 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from swarmjax import evaluate_rays, measures, policy
+from swarmjax import evaluate_rays, measures, policy, policy_file
 from swarmjax.config import ConfigError
 from swarmjax.evaluate_judge import Judge
 from swarmjax.evaluate_judge import draw_level as draw_level
 from swarmjax.evaluate_judge import load as load
 from swarmjax.measures import Outcome
 from swarmjax.sim import drive as sim_drive
-from swarmjax.sim import gaps
+from swarmjax.sim import gaps, noise
 from swarmjax.sim import model as sim_model
+from swarmjax.sim.noise import Stream
 from swarmjax.task import factors as task_factors
 from swarmjax.task import level, observation, senses
 from swarmjax.task.factors import Factors
@@ -41,6 +42,7 @@ class Arenas(NamedTuple):
         memory: [A] of the robots' electronics.
         target: [A, R, 2] x (m), y (m).
         obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+        seed: [A] uint32 of the levels.
         pose: [A, R, 3] x (m), y (m), yaw (rad).
         observation: [A, R, O].
         apart: [A, R, 3] for how long there was no contact of each kind, s.
@@ -54,6 +56,7 @@ class Arenas(NamedTuple):
     memory: Memory
     target: np.ndarray
     obstacle: np.ndarray
+    seed: np.ndarray
     pose: np.ndarray
     observation: np.ndarray
     apart: np.ndarray
@@ -127,6 +130,7 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
         memory=memory,
         target=target,
         obstacle=obstacle,
+        seed=seed,
         pose=pose,
         observation=seen,
         apart=np.full(outcome.contacts.shape, gaps.CONTACT_PAUSE),
@@ -270,8 +274,7 @@ def _drive(
     Returns:
         Memory, new poses [A, R, 3], and impulses [A, R, 3] (N s) by kind of contact.
     """
-    action = policy.mean_action(judge.policy, arenas.observation)
-    wanted = sim_drive.command(action, judge.drive, np)
+    wanted = sim_drive.command(_act(judge, arenas), judge.drive, np)
     memory, wheels = senses.drive(
         judge.electronics,
         arenas.memory,
@@ -294,6 +297,15 @@ def _drive(
             f"than {judge.substeps}, or a robot nearer to the real one."
         )
     return memory, body.pose(qpos, np), _impulses(judge, pushes, len(arenas.data))
+
+
+def _act(judge: Judge, arenas: Arenas) -> np.ndarray:
+    """Lets the policy act, [A, R, U]; what is drawn follows from the level and the clock."""
+    if judge.config.action == "mean":
+        return policy.act(judge.policy, arenas.observation)
+    shape = (arenas.pose.shape[1], len(policy_file.ACTION_NAMES))
+    normal = noise.normal(arenas.seed, arenas.outcome.clock, Stream.ACTION, shape, np)
+    return policy.act(judge.policy, arenas.observation, normal)
 
 
 class _Pushes(NamedTuple):

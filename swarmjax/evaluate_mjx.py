@@ -32,7 +32,8 @@ from swarmjax.measures import Outcome
 from swarmjax.policy import Policy
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
-from swarmjax.sim import physics
+from swarmjax.sim import noise, physics
+from swarmjax.sim.noise import Stream
 from swarmjax.task import env, level, senses
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
@@ -154,7 +155,9 @@ def _largest(stage: StageConfig, half: np.ndarray) -> StageConfig:
     return StageConfig(name=stage.name, robots=stage.robots, side=4.0, obstacle_size=largest)
 
 
-def play(world: World, levels: Level, trained: Policy, steps: int) -> Outcome:
+def play(
+    world: World, levels: Level, trained: Policy, steps: int, *, sampled: bool = True
+) -> Outcome:
     """Runs an episode of each level by a policy file's policy.
 
     Args:
@@ -162,6 +165,7 @@ def play(world: World, levels: Level, trained: Policy, steps: int) -> Outcome:
       levels: [E] with all robots and obstacles that the world has room for.
       trained: the policy.
       steps: control steps of an episode.
+      sampled: draw the actions from the policy; otherwise they are its mean.
 
     Returns:
       [E] what they came to, as NumPy arrays; impulses are nan, since contacts are analytic here.
@@ -176,8 +180,10 @@ def play(world: World, levels: Level, trained: Policy, steps: int) -> Outcome:
         (trained.max_speed, trained.max_turn_rate),
         trained.meta["activation"],
         trained.meta["observation"]["limit"],
+        sampled,
     )
-    outcome, broken = run((trained.layers, trained.mean, trained.std), levels)
+    weights = trained.layers, trained.mean, trained.std
+    outcome, broken = run(weights, trained.log_std, levels)
     if np.any(broken):
         raise ConfigError(
             f"the physics of {int(np.sum(broken))} of {len(levels.side)} episodes broke down, with "
@@ -194,7 +200,8 @@ def _program(
     limits: tuple[float, float],
     activation: str,
     limit: float,
-) -> Callable[[Any, Level], tuple[dict[str, Array], Array]]:
+    sampled: bool,
+) -> Callable[[Any, ArrayLike, Level], tuple[dict[str, Array], Array]]:
     """The compiled program of policies that differ in their weights alone."""
     config, (speed, turn_rate) = world.config, limits
     mine = replace(
@@ -203,16 +210,27 @@ def _program(
         electronics=senses.load(config.task, config.realism, encoding),
     )
 
-    def play(weights: Any, levels: Level) -> tuple[dict[str, Array], Array]:
-        act = partial(_mean_action, activation, limit, weights)
+    def play(weights: Any, log_std: Array, levels: Level) -> tuple[dict[str, Array], Array]:
+        mean = partial(_mean_action, activation, limit, weights)
+        act = partial(_act, mean, log_std if sampled else None)
         arenas, counts, broken = _run(mine, act, levels, steps)
         return _outcome(arenas, counts), broken
 
     return jax.jit(play)
 
 
+def _act(mean: Callable[[Array], Array], log_std: Array | None, arenas: EnvState) -> Array:
+    """What the judge's robots do, [E, R, U]: drawn by the same numbers as there, if at all."""
+    action = mean(arenas.observation)
+    if log_std is None:
+        return action
+    shape = action.shape[1:]
+    normal = noise.normal(arenas.level.seed, arenas.clock, Stream.ACTION, shape, jnp)
+    return action + jnp.exp(log_std[: len(action[0])]) * normal
+
+
 def _mean_action(activation: str, limit: float, weights: Any, observation: Array) -> Array:
-    """What `policy.mean_action` says, [E, R, U]: in full precision, where a GPU has less."""
+    """What `policy.act` says without noise, [E, R, U]: in full precision, where a GPU has less."""
     layers, mean, std = weights
     robots = slice(observation.shape[-2])
     x = jnp.clip((observation - mean[robots]) / std[robots], -limit, limit)
@@ -251,9 +269,9 @@ def outcomes(world: World, learners: LearnerState, levels: Level, steps: int) ->
     return _sum_up(arenas, broken, world.config.task.control_step)
 
 
-def _mode(world: World, learners: LearnerState, observation: Array) -> Array:
+def _mode(world: World, learners: LearnerState, arenas: EnvState) -> Array:
     """The learners' most likely actions [E, R, U]."""
-    seen = rollout.to_learners(observation, len(jax.tree.leaves(learners)[0]))
+    seen = rollout.to_learners(arenas.observation, len(jax.tree.leaves(learners)[0]))
     action = jax.vmap(partial(ppo.mode, config=world.config.algo))(learners, observation=seen)
     return rollout.to_arenas(action)
 
@@ -269,7 +287,7 @@ class _Counts(NamedTuple):
 
 
 def _run(
-    world: World, act: Callable[[Array], Array], levels: Level, steps: int
+    world: World, act: Callable[[EnvState], Array], levels: Level, steps: int
 ) -> tuple[EnvState, _Counts, Array]:
     """Runs an episode of each level; returns how the arenas end, and which of them broke."""
     robots, obstacles = world.spacing.robots, world.spacing.obstacles
@@ -291,13 +309,13 @@ def _run(
 
 def _step(
     world: World,
-    act: Callable[[Array], Array],
+    act: Callable[[EnvState], Array],
     carry: tuple[EnvState, _Counts, Array],
     _: None,
 ) -> tuple[tuple[EnvState, _Counts, Array], None]:
     """Moves the arenas [E] on by a control step whose episodes are not over."""
     arenas, counts, broken = carry
-    action = act(arenas.observation)
+    action = act(arenas)
     moved, came = jax.vmap(partial(env.step, world))(arenas, action)
     over = broken | _all_arrived(arenas)
     broken = broken | (~over & ~came.sound)

@@ -144,7 +144,14 @@ def _by_mjx(
         with compile_cache.use(compile_cache.AUTO):
             world = evaluate_mjx.load(mine, cell.half, len(cell.episodes))
             for each in entrants:
-                outcomes.append(evaluate_mjx.play(world, cell.levels, each.policy, config.steps))
+                found = evaluate_mjx.play(
+                    world,
+                    cell.levels,
+                    each.policy,
+                    config.steps,
+                    sampled=config.action == "sampled",
+                )
+                outcomes.append(found)
                 report(len(cell.episodes))
         yield outcomes, ways(mine, cell.levels)
 

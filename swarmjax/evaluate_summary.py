@@ -79,6 +79,7 @@ def _about(config: EvaluateConfig, suite: str | None) -> dict[str, Any]:
     return {
         "suite": suite,
         "engine": config.engine,
+        "action": config.action,
         "robot": to_dict(config.robot),
         "task": to_dict(config.task),
         "steps": config.steps,

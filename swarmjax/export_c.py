@@ -49,7 +49,8 @@ def _about(trained: Policy) -> dict[str, str]:
     """What the comments and the constants say of a policy."""
     robot, task = trained.meta["robot"], trained.meta["task"]
     sizes, learners = _sizes(trained), len(trained.mean)
-    arrays = [trained.mean, trained.std, *(part for layer in trained.layers for part in layer)]
+    weights = [part for layer in trained.layers for part in layer]
+    arrays = [trained.mean, trained.std, trained.log_std, *weights]
     parameters = sum(array.size for array in arrays)
     several = f"{learners} policies, one for each robot."
     return {
@@ -112,6 +113,7 @@ def _arrays(trained: Policy) -> Iterable[str]:
     for i, (kernel, bias) in enumerate(trained.layers):
         yield _array(f"KERNEL_{i}", kernel.swapaxes(1, 2).reshape(len(kernel), -1))
         yield _array(f"BIAS_{i}", bias)
+    yield _array("DEVIATION", np.exp(trained.log_std))
 
 
 def _array(name: str, rows: np.ndarray) -> str:
@@ -133,20 +135,23 @@ def _calls(sizes: Sequence[int]) -> Iterable[str]:
 
 
 def _cases(trained: Policy) -> dict[str, str]:
-    """Observations of the self-test, half of them beyond the clip, and what NumPy makes of them."""
+    """Cases of the self-test, half of them beyond the clip, and what NumPy makes of them."""
     draw = np.random.default_rng(0)
     shape = (CASES, *trained.mean.shape)
     reach = np.where(np.arange(CASES) % 2, 1.5 * trained.meta["observation"]["limit"], 3.0)
     drawn = draw.uniform(-1, 1, shape) * reach[:, None, None]
     observation = (trained.mean + trained.std * drawn).astype(np.float32)
-    action = policy.mean_action(trained, observation)
+    action = policy.act(trained, observation)
+    normal = draw.standard_normal(action.shape, np.float32)
+    sample = policy.act(trained, observation, normal)
 
     def table(values: np.ndarray) -> str:
         rows = values.reshape(-1, values.shape[-1])
         return "\n".join(f"{{\n{_values(row)}\n}}," for row in rows)
 
+    tables = {"observation": observation, "action": action, "normal": normal, "sample": sample}
     cases = CASES * len(trained.mean)
-    return {"cases": str(cases), "observation": table(observation), "action": table(action)}
+    return {"cases": str(cases)} | {name: table(values) for name, values in tables.items()}
 
 
 def _values(row: Iterable[float]) -> str:

@@ -56,7 +56,7 @@ def render(policy: Policy) -> bytes:
     Returns:
         The bytes of an ONNX file. Its input `observation` is [B, O] if the policy is shared, else
         [B, R, O] with R the number of learners, as `meta["observation"]` of the policy says; its
-        outputs are `action` ([..., U], as `policy.mean_action`) and `command` (as
+        outputs are `action` ([..., U], as `policy.act`) and `command` (as
         `policy.command`: m/s and rad/s).
 
     Raises:
@@ -91,7 +91,7 @@ def render(policy: Policy) -> bytes:
 
 
 def _graph(policy: Policy) -> _Graph:
-    """Puts the operations of `policy.mean_action` and `policy.command` one after the other."""
+    """Puts the operations of `policy.act` and `policy.command` one after the other."""
     graph = _Graph("observation")
     limit = policy.meta["observation"]["limit"]
     shared = policy.is_shared
@@ -134,4 +134,5 @@ def _properties(policy: Policy) -> dict[str, str]:
     keys = ("observation", "action", "robot", "sensors", "task", "policy", "learners", "config")
     described = {key: policy.meta[key] for key in (*keys, "versions", "update", "seed")}
     text = {key: json.dumps(value, sort_keys=True) for key, value in described.items()}
-    return text | {"digest": policy.digest}
+    deviation = np.exp(policy.log_std).tolist()
+    return text | {"deviation": json.dumps(deviation), "digest": policy.digest}

@@ -25,7 +25,7 @@ class Policy(NamedTuple):
     """A trained policy. L is 1 if all robots share it; otherwise robot i is learner i."""
 
     layers: list[tuple[np.ndarray, np.ndarray]]  # kernel [L, in, out] and bias [L, out]
-    log_std: np.ndarray  # [L, U], of the deviation that training explored with
+    log_std: np.ndarray  # [L, U], logarithm of the deviation of the action
     mean: np.ndarray  # [L, O], of the observation
     std: np.ndarray  # [L, O], likewise
     is_shared: bool
@@ -61,18 +61,18 @@ def load(path: str | Path | IO[bytes]) -> Policy:
 
 def digest(arrays: dict[str, np.ndarray]) -> str:
     """Returns the SHA-256 over the names, types, shapes and bytes of arrays, names sorted."""
-    total = hashlib.sha256()
-    for name, array in sorted(arrays.items()):
-        total.update(f"{name} {array.dtype.str} {list(array.shape)}\n".encode() + array.tobytes())
-    return total.hexdigest()
+    heads = {name: f"{name} {x.dtype.str} {list(x.shape)}\n".encode() for name, x in arrays.items()}
+    rows = (heads[name] + arrays[name].tobytes() for name in sorted(arrays))
+    return hashlib.sha256(b"".join(rows)).hexdigest()
 
 
-def mean_action(policy: Policy, observation: np.ndarray) -> np.ndarray:
-    """Computes the most likely action of each robot, the same whatever is computed beside it.
+def act(policy: Policy, observation: np.ndarray, normal: Any = 0.0) -> np.ndarray:
+    """Draws the action of each robot from the policy; without `normal` it is the most likely one.
 
     Args:
         policy: Of one learner for all robots, or of R or more.
         observation: [..., R, O] as `meta["observation"]` says: (quantity - offset) / scale.
+        normal: [..., R, U] standard normal, drawn anew at each control step.
 
     Returns:
         [..., R, U] float32; -1..1 spans the commands, but it may lie beyond.
@@ -86,7 +86,7 @@ def mean_action(policy: Policy, observation: np.ndarray) -> np.ndarray:
     *hidden, (kernel, bias) = policy.layers
     for weights, offset in hidden:
         x = _ACTIVATIONS[policy.meta["activation"]](np.vecmat(x, weights[mine]) + offset[mine])
-    return np.vecmat(x, kernel[mine]) + bias[mine]
+    return np.vecmat(x, kernel[mine]) + bias[mine] + np.exp(policy.log_std[mine]) * normal
 
 
 def command(policy: Policy, action: np.ndarray) -> np.ndarray:

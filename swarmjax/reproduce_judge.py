@@ -75,6 +75,7 @@ def _judge(episodes: int, task: Task) -> Row:
         robot=config.robot,
         task=config.task,
         realism=config.realism,
+        action="mean",
         steps=config.task.step_limit,
         episodes=episodes,
     )

@@ -3,7 +3,8 @@
 Once every control step: infrared, GPS and compass in, speeds of the wheels out. `policy.npz` and
 `sensors.json`, which says what the sensors' counts mean, lie beside this file. The target comes as
 `target=x,y` (m) in the robot's controllerArgs, or in its customData, where it may change; so does
-`robot=i`, the robot's number from 0, for a policy that is not shared. controllerArgs win.
+`robot=i`, the robot's number from 0, for a policy that is not shared. controllerArgs win. The robot
+draws its actions from the policy; with `action=mean` it does what is most likely.
 """
 
 import importlib
@@ -24,14 +25,15 @@ MOTORS = ("left wheel motor", "right wheel motor")
 
 
 class Orders(NamedTuple):
-    """Where a robot is to go, and which one it is."""
+    """Where a robot is to go, which one it is, and whether it draws its actions."""
 
     target: tuple[float, float] | None = None
     robot: int = 0
+    sampled: bool = True
 
 
 def parse(words: Iterable[str]) -> Orders:
-    """Reads `target=x,y` and `robot=i`.
+    """Reads `target=x,y`, `robot=i` and `action=mean` or `action=sampled`.
 
     Args:
         words: of controllerArgs, or of customData.
@@ -40,7 +42,7 @@ def parse(words: Iterable[str]) -> Orders:
         The orders.
 
     Raises:
-        ValueError: if a word is neither.
+        ValueError: if a word is none of them.
     """
     orders = Orders()
     for word in words:
@@ -53,10 +55,14 @@ def parse(words: Iterable[str]) -> Orders:
                 orders = orders._replace(target=(x, y))
             elif key == "robot" and value.isdecimal():
                 orders = orders._replace(robot=int(value))
+            elif key == "action" and value in ("mean", "sampled"):
+                orders = orders._replace(sampled=value == "sampled")
             else:
                 raise ValueError
         except ValueError:
-            raise ValueError(f"{word!r} cannot be read: give target=x,y or robot=i.") from None
+            raise ValueError(
+                f"{word!r} cannot be read: give target=x,y, robot=i or action=mean."
+            ) from None
     return orders
 
 
@@ -131,20 +137,23 @@ def to_target(
     return math.hypot(x, y), math.atan2(math.sin(turn), math.cos(turn))
 
 
-def wheel_speeds(trained: Policy, observation: np.ndarray, robot: int) -> np.ndarray:
+def wheel_speeds(
+    trained: Policy, observation: np.ndarray, robot: int, normal: Any = 0.0
+) -> np.ndarray:
     """Lets the policy act.
 
     Args:
         trained: the policy.
         observation: [O].
         robot: its number, from 0.
+        normal: [U] standard normal, to draw the action with; 0 is the most likely one.
 
     Returns:
         [2] speeds of the left and the right wheel, rad/s, each within its own limit.
     """
     # Robots before this one are there only so that it meets its own network.
     seen = np.broadcast_to(observation, (1 if trained.is_shared else robot + 1, observation.size))
-    speed, turn_rate = policy.command(trained, policy.mean_action(trained, seen))[-1]
+    speed, turn_rate = policy.command(trained, policy.act(trained, seen, normal))[-1]
     body = trained.meta["robot"]
     turn = turn_rate * 0.5 * body["track"]
     wheels = np.array([speed - turn, speed + turn]) / body["wheel_radius"]
@@ -235,7 +244,7 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
     sensors = json.loads((folder / "sensors.json").read_text())
     period = control_period(trained, robot.getBasicTimeStep())
     devices = find_devices(robot, period)
-    given = parse(words)
+    given, draw = parse(words), np.random.default_rng()
     parked_at = None
     while robot.step(period) != -1:  # the first step gives all sensors a value
         orders = parse([*_custom(robot, given), *words])
@@ -250,7 +259,8 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
                 parked_at = orders.target
             else:
                 seen = observe(trained, sensors, counts, distance, bearing)
-                wheels = wheel_speeds(trained, seen, orders.robot)
+                normal = draw.standard_normal(len(MOTORS)) if orders.sampled else 0.0
+                wheels = wheel_speeds(trained, seen, orders.robot, normal)
         for motor, speed in zip(devices.motors, wheels, strict=True):
             motor.setVelocity(float(speed))
 

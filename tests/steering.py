@@ -12,6 +12,7 @@ from swarmjax.task import observation
 SPEED = 0.1256  # m/s, the largest command
 STEP = 0.032  # s, a control step
 STRIDE = SPEED * STEP  # m; the servo has the speed within one control step
+NO_NOISE = -200.0  # the logarithm of a deviation that is 0 in float32
 # Action of a policy by hand: at bearing 0, and what each radian to the left and right adds.
 STEER = ((1.0, 0.0), (-2.0, 2.0), (-2.0, -2.0))
 AHEAD = ((1.0, 0.0), (0.0, 0.0), (0.0, 0.0))
@@ -19,7 +20,13 @@ STAY = ((-1.0, 0.0), (0.0, 0.0), (0.0, 0.0))
 SPIN = ((-1.0, 1.0), (0.0, 0.0), (0.0, 0.0))
 
 
-def write(path: Path, drive: tuple = STEER, learners: int = 1, **meta: Any) -> Path:
+def write(
+    path: Path,
+    drive: tuple = STEER,
+    learners: int = 1,
+    log_std: float = NO_NOISE,
+    **meta: Any,
+) -> Path:
     """Writes a policy of one hidden layer, relu(bearing) and relu(-bearing)."""
     bearing = np.zeros((1, observation.SIZE, 2))
     bearing[0, observation.NAMES.index("target_bearing")] = [1.0, -1.0]
@@ -29,7 +36,7 @@ def write(path: Path, drive: tuple = STEER, learners: int = 1, **meta: Any) -> P
         "actor/hidden_0/bias": zero[:, :2],
         "actor/mean/kernel": np.array([drive[1:]]),
         "actor/mean/bias": np.array([drive[0]]),
-        "actor/log_std": zero[:, :2],
+        "actor/log_std": zero[:, :2] + log_std,
         "normalizer/mean": zero,
         "normalizer/std": zero + 1.0,
     }

@@ -285,7 +285,7 @@ def test_train_refuses(words, sentence):
         (["workers=0"], "workers is 0: give 1 to 1024."),
         (["engine=warp"], "engine is 'warp': give c or mjx."),
         (["algo=ppo"], "algo is not a key: give one of policy, compare, stage, robot, task, suite, "
-         "shape, realism, engine, steps, episodes, seed, workers, substeps, out."),
+         "shape, realism, action, engine, steps, episodes, seed, workers, substeps, out."),
     ],
 )  # fmt: skip
 def test_evaluate_refuses(words, sentence):

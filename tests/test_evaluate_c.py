@@ -28,7 +28,7 @@ from swarmjax.config import (
 from swarmjax.evaluate_c import Arenas
 from swarmjax.evaluate_judge import Judge
 from swarmjax.policy import PolicyError
-from swarmjax.sim import gaps, infrared, model, physics
+from swarmjax.sim import gaps, infrared, model, noise, physics
 from swarmjax.task import env, observation, senses, shapes
 from swarmjax.task.env import EnvState, TimeStep, World
 from swarmjax.task.level import Level
@@ -263,7 +263,7 @@ def test_the_judge_counts_what_the_training_environment_counts(tmp_path: Path) -
     # Float32 against double along the way; the paths hardly magnify it, contacts included.
     np.testing.assert_allclose(seen, arenas.observation[0], atol=1e-5)
     for _ in range(168):
-        state, came = step(state, policy.mean_action(judge.policy, np.asarray(seen)))
+        state, came = step(state, policy.act(judge.policy, np.asarray(seen)))
         seen = np.asarray(came.observation)
         arenas = evaluate_c.step(judge, arenas)
         np.testing.assert_allclose(seen, arenas.observation[0], atol=1e-3)
@@ -323,7 +323,7 @@ def _train(engines: Engines, drawn: Level, steps: int) -> tuple[list[EnvState], 
     states = [engines.reset(drawn)]
     seen = [np.asarray(states[0].observation)]
     for _ in range(steps):
-        action = policy.mean_action(engines.judge.policy, seen[-1])
+        action = policy.act(engines.judge.policy, seen[-1])
         state, came = engines.step(states[-1], jnp.asarray(action))
         states.append(state)
         seen.append(np.asarray(came.observation))
@@ -613,6 +613,42 @@ def test_a_policy_of_three_judges_three(tmp_path: Path) -> None:
     config = EvaluateConfig(policy=str(path), stage=_stage(robots=3), task=TaskConfig(), steps=2)
     judge = evaluate_c.load(config, policy.load(path))
     assert evaluate_c.simulate(judge, _draw_some(judge, [0])).clock.tolist() == [2]
+
+
+def test_robots_draw_their_actions(tmp_path: Path) -> None:
+    """A command is that of the mean plus the deviation times numbers that level and clock give."""
+    judge = _judge(tmp_path, _stage(robots=2))
+    learned = judge.policy._replace(log_std=np.log(np.array([[0.2, 0.1]], np.float32)))
+    poses = [[-0.2, 0.0, 0.3], [0.2, 0.0, -1.0]]
+    levels = [_level(judge, poses, seed=seed) for seed in (4, 5)]
+    arenas = _run(dataclasses.replace(judge, policy=learned), evaluate_c.start(judge, levels), 1)
+    before = arenas.observation
+    arenas = evaluate_c.step(dataclasses.replace(judge, policy=learned), arenas)
+    normal = noise.normal(np.uint32([4, 5]), np.array([1, 1]), noise.Stream.ACTION, (2, 2), np)
+    action = policy.act(judge.policy, before) + np.array([0.2, 0.1]) * normal
+    speed, turn = np.clip(action, -1, 1).transpose(2, 0, 1)
+    wanted = [(speed + 1) / 2 * 0.1256, 3.14 * turn]  # m/s, rad/s
+    told = np.stack([data.ctrl.reshape(2, 3) for data in arenas.data])[..., [0, 2]]
+    # Wheel by wheel clipped at 6.28 rad/s: those that are not keep what was wanted, in float32.
+    free = np.abs(wanted[0]) + np.abs(wanted[1]) * 0.026 < 6.28 * 0.02
+    assert 1 < free.sum() < 4
+    for found, expected in zip(told[free].T, (x[free] for x in wanted), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-5)
+    assert np.unique(normal).size == normal.size
+
+
+def test_what_is_drawn_does_not_depend_on_who_is_judged_beside(tmp_path: Path) -> None:
+    path = steering.write(tmp_path / "policy.npz", log_std=math.log(0.3))
+    given = EvaluateConfig(policy=str(path), stage=_stage(robots=2), robot=RobotConfig(), steps=60)
+    judge = evaluate_c.load(given, policy.load(path))
+    levels = _draw_some(judge, [0, 1, 2])
+    together = evaluate_c.simulate(judge, levels)
+    for i, one in enumerate(levels):
+        alone = evaluate_c.simulate(judge, [one])
+        for whole, mine in zip(together, alone, strict=True):
+            np.testing.assert_array_equal(whole[i], mine[0])
+    mean = evaluate_c.load(dataclasses.replace(given, action="mean"), policy.load(path))
+    assert (evaluate_c.simulate(mean, levels).path != together.path).all()
 
 
 # --- what episodes come to

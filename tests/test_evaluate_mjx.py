@@ -1,5 +1,6 @@
 """The judge on the device against the one in MuJoCo C, on the same levels by the same policy."""
 
+import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -122,7 +123,7 @@ def _by_c(folder: Path, stage: StageConfig, drives: tuple) -> dict[str, np.ndarr
     }
     path = folder / "policy.npz"
     policy_file.write(path, _arrays(drives), meta)
-    (trial,) = _judge(path, stage, "c").trials
+    (trial,) = _judge(path, stage, "c", action="mean").trials
     return {name: trial.found[name][0] for name in Outcomes._fields if name != "broken"}
 
 
@@ -243,17 +244,19 @@ def test_a_stage_that_does_not_fit_is_refused(world: World) -> None:
 def test_the_engines_of_the_command_agree(
     tmp_path: Path, body: Any, shape: Any, learners: int
 ) -> None:
-    """By a policy file, on the same levels, in physics steps of the same length."""
+    """By a policy that is drawn from, on the same levels, in physics steps of the same length."""
     kind = "shared" if learners == 1 else "independent"
-    path = steering.write(tmp_path / "policy.npz", learners=learners, policy=kind)
+    path = steering.write(tmp_path / "policy.npz", STEER, learners, math.log(0.02), policy=kind)
     count = 12
     common = {"robot": RobotConfig(body=body), "shape": shape, "episodes": count}
+    still = _judge(path, STAGES[1], "c", action="mean", **common)
     by_c, by_mjx = (_judge(path, STAGES[1], engine, **common) for engine in ("c", "mjx"))
     assert by_mjx.result["engine"] == "mjx"
     keys = ("cell", "digest", "unreachable", "shape", "episodes")
     for key in keys:
         assert by_mjx.result["cells"][0][key] == by_c.result["cells"][0][key]
     (c,), (mjx,) = by_c.trials, by_mjx.trials
+    assert not np.allclose(still.trials[0].arrival, c.arrival)  # so what is drawn is the same
     np.testing.assert_array_equal(c.shortest, mjx.shortest)
     missing = set(c.found) - set(mjx.found)
     assert missing == {name for name in c.found if name.startswith("impulse")}

@@ -83,7 +83,7 @@ def test_all_forms_of_a_policy_agree(activation: Activation, learners: int, tmp_
     seen = policies.seen(trained, OBSERVATIONS)
     clipped = np.abs((seen - trained.mean) / trained.std) > 10
     assert 0.1 < clipped.mean() < 0.5
-    expected = policy.mean_action(trained, seen)
+    expected = policy.act(trained, seen)
     assert 1 < np.abs(expected).max() < 20
     found = {
         "Flax": _by_flax(arrays, activation, seen),

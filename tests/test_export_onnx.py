@@ -29,7 +29,7 @@ def test_the_model_is_sound_and_runs_any_batch(learners: int, tmp_path: Path) ->
     assert [out.name for out in session.get_outputs()] == ["action", "command"]
     for count in (2, 14):
         seen = policies.seen(trained, count)
-        expected = policy.mean_action(trained, seen)
+        expected = policy.act(trained, seen)
         fed = seen[:, 0] if learners == 1 else seen
         action, command = session.run(None, {"observation": fed})
         # Sums of 10 terms at most, in another order; actions are below 4.
@@ -45,6 +45,7 @@ def test_the_metadata_are_those_of_the_policy(tmp_path: Path) -> None:
     model = onnx.load_from_string(export_onnx.render(trained))
     found = {one.key: one.value for one in model.metadata_props}
     assert found.pop("digest") == trained.digest
+    np.testing.assert_allclose(json.loads(found.pop("deviation")), np.exp(trained.log_std))
     assert {key: json.loads(value) for key, value in found.items()} == {
         key: trained.meta[key] for key in found
     }

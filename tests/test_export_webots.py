@@ -172,7 +172,7 @@ def _chain(
     _, seen = senses.begin(electronics, none, sight, np.zeros(len(scenes)), np)
     robots = np.repeat(seen, len(trained.mean), axis=1)
     robot = drive.from_config(RobotConfig())
-    command = drive.command(policy.mean_action(trained, robots), robot, np)
+    command = drive.command(policy.act(trained, robots), robot, np)
     return drive.wheel_speeds(command, robot, np)
 
 
@@ -193,7 +193,7 @@ def test_the_wheels_turn_as_they_do_in_the_judge(
     draw = np.random.default_rng(learners)
     scenes = [_scene(draw) for _ in range(40)]
     target = (1.5, -0.4)  # out of reach of all poses
-    words = ("target=1.5,-0.4", *([] if learners == 1 else ["robot=2"]))
+    words = ("action=mean", "target=1.5,-0.4", *([] if learners == 1 else ["robot=2"]))
     done = _simulate(folder, [_script(scene, answers) for scene in scenes], *words)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     found = _told(folder, len(scenes))
@@ -204,6 +204,31 @@ def test_the_wheels_turn_as_they_do_in_the_judge(
     # within 2**-23 of 4 rad or 1e-7 m of 6e-3 in a deviation: 2e-5 of what the policy sees, which
     # a network of gains near 1 hands on, times some 6 rad/s.
     np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+def test_a_robot_draws_its_actions_from_the_policy(tmp_path: Path) -> None:
+    given = policies.arrays(hidden=(16, 16))
+    given["actor/log_std"][:] = np.log([0.1, 0.02])  # too little to meet a limit of the command
+    given["actor/mean/kernel"][:] = 0.0
+    given["actor/mean/bias"][:] = 0.0
+    trained = saved(tmp_path / "policy.npz", given)
+    assert export.main([f"policy={tmp_path / 'policy.npz'}", "format=webots"]) == 0
+    folder = tmp_path / "swarmjax_epuck"
+    steps = [_script(_scene(np.random.default_rng(0)), "webots")] * 2000
+    assert _simulate(folder, steps, "target=1.5,-0.4").returncode == 0
+    left, right = _told(folder, len(steps)).T
+    body = trained.meta["robot"]
+    speed = 0.5 * (left + right) * body["wheel_radius"]
+    turn = (right - left) * body["wheel_radius"] / body["track"]
+    # An action of 0 is half the speed and no turn. The error of a deviation measured on 2,000 draws
+    # is 1 / sqrt(4000) = 1.6 %, that of a mean a deviation over sqrt(2000); five times that.
+    for found, mean, deviation in (
+        (speed, 0.5 * trained.max_speed, 0.1 * 0.5 * trained.max_speed),
+        (turn, 0.0, 0.02 * trained.max_turn_rate),
+    ):
+        np.testing.assert_allclose(np.std(found), deviation, rtol=0.08)
+        np.testing.assert_allclose(np.mean(found), mean, atol=0.11 * deviation)
+    assert abs(np.corrcoef(speed, turn)[0, 1]) < 0.11
 
 
 def test_a_robot_stays_where_it_has_arrived_until_its_target_moves(tmp_path: Path) -> None:
@@ -257,8 +282,8 @@ def test_a_control_step_that_webots_cannot_have_is_refused(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("words", "script", "sentence"),
     [
-        (["goal=1,2"], {}, r"'goal=1,2' cannot be read: give target=x,y or robot=i\."),
-        (["target=1"], {}, r"'target=1' cannot be read: give target=x,y or robot=i\."),
+        (["goal=1,2"], {}, r"'goal=1,2' cannot be read: give target=x,y, robot=i or action=mean\."),
+        (["target=1"], {}, r"'target=1' cannot be read: give target=x,y, robot=i or action=mean\."),
         ([], {"missing": ["gps"]}, r"the robot has no device 'gps': .* turretSlot .*\."),
         ([], {"basic": 20.0}, r"basicTimeStep is 20 ms: give 32 ms, .*\."),
         ([], {"basic": 64.0}, r"basicTimeStep is 64 ms: give 32 ms, .*\."),

@@ -31,7 +31,7 @@ def test_an_arena_does_what_the_judge_does(settings: EvaluateConfig, tmp_path: P
     for n in range(2):
         seen, over, steps = arena.reset(), False, 0
         while not over:
-            moved = arena.step(policy.mean_action(trained, seen))
+            moved = arena.step(policy.act(trained, seen))
             seen, over, steps = moved.observation, moved.over, steps + 1
         assert arena.arenas is not None
         came = arena.arenas.outcome

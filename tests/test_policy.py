@@ -47,14 +47,14 @@ def test_the_file_is_short_and_needs_numpy_alone(tmp_path: Path) -> None:
     code = (
         "import json, sys, numpy as np, policy\n"
         "trained = policy.load('policy.npz')\n"
-        f"action = policy.mean_action(trained, np.ones((2, {SIZE}), np.float32))\n"
+        f"action = policy.act(trained, np.ones((2, {SIZE}), np.float32))\n"
         "assert 'swarmjax' not in sys.modules\n"
         "print(json.dumps(policy.command(trained, action).tolist()))\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
     )
-    ones = policy.mean_action(trained, np.ones((2, SIZE), np.float32))
+    ones = policy.act(trained, np.ones((2, SIZE), np.float32))
     assert json.loads(done.stdout) == policy.command(trained, ones).tolist()
 
 
@@ -144,7 +144,7 @@ def test_mean_action_by_hand() -> None:
     seen = _f32([[5, 3, 7, 7, 2], [-1, 2, 7, 7, 20], [1, 5, 7, 7, -0.5]])
     expected = [[13, -1], [19, -1], [7, 20]]
     # All of these are whole or half numbers, which float32 adds without rounding.
-    np.testing.assert_array_equal(policy.mean_action(_by_hand("relu"), seen), expected)
+    np.testing.assert_array_equal(policy.act(_by_hand("relu"), seen), expected)
 
 
 def test_command_by_hand() -> None:
@@ -178,7 +178,7 @@ def test_activations_against_float64(tmp_path: Path, activation: str, function: 
     x = function(x @ exact["actor/hidden_0/kernel"] + exact["actor/hidden_0/bias"])
     expected = x @ exact["actor/mean/kernel"] + exact["actor/mean/bias"]
     # Sums of up to 10 float32 terms of size 30 at most: 10 * 30 * 2**-24 = 1.8e-5.
-    np.testing.assert_allclose(policy.mean_action(loaded, seen), expected, atol=2e-5)
+    np.testing.assert_allclose(policy.act(loaded, seen), expected, atol=2e-5)
 
 
 def test_swish_stays_finite_for_any_float32(tmp_path: Path) -> None:
@@ -190,7 +190,7 @@ def test_swish_stays_finite_for_any_float32(tmp_path: Path) -> None:
     loaded = saved(tmp_path / "policy.npz", arrays, activation="swish")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        action = policy.mean_action(loaded, np.zeros((1, SIZE), np.float32))
+        action = policy.act(loaded, np.zeros((1, SIZE), np.float32))
     np.testing.assert_array_equal(action, _f32([[1e30, 1e30]]))  # swish(-1e30) is 0
 
 
@@ -198,14 +198,14 @@ def test_robot_i_of_an_independent_policy_uses_learner_i(tmp_path: Path) -> None
     arrays = policies.arrays(learners=3)
     together = saved(tmp_path / "all.npz", arrays, **several(3))
     seen = np.random.default_rng(2).normal(size=(4, 3, SIZE)).astype(np.float32)
-    action = policy.mean_action(together, seen)
+    action = policy.act(together, seen)
     assert action.shape == (4, 3, ACTIONS)
     for i in range(3):
         alone = saved(tmp_path / f"{i}.npz", {n: a[i : i + 1] for n, a in arrays.items()})
-        np.testing.assert_array_equal(action[:, i], policy.mean_action(alone, seen[:, i]))
-    np.testing.assert_array_equal(policy.mean_action(together, seen[:, :2]), action[:, :2])
+        np.testing.assert_array_equal(action[:, i], policy.act(alone, seen[:, i]))
+    np.testing.assert_array_equal(policy.act(together, seen[:, :2]), action[:, :2])
     with pytest.raises(PolicyError, match=r"^4 robots are too many for 3 independent policies\.$"):
-        policy.mean_action(together, np.zeros((4, SIZE), np.float32))
+        policy.act(together, np.zeros((4, SIZE), np.float32))
 
 
 @pytest.mark.parametrize("width", [8, 64, 200])
@@ -214,8 +214,8 @@ def test_an_action_does_not_depend_on_what_is_computed_beside_it(
 ) -> None:
     loaded = saved(tmp_path / "policy.npz", policies.arrays(hidden=(width, width)))
     seen = np.random.default_rng(3).normal(size=(33, 4, SIZE)).astype(np.float32)
-    together = policy.mean_action(loaded, seen)
-    alone = np.stack([policy.mean_action(loaded, arena) for arena in seen])
+    together = policy.act(loaded, seen)
+    alone = np.stack([policy.act(loaded, arena) for arena in seen])
     np.testing.assert_array_equal(together, alone)
 
 
@@ -254,4 +254,4 @@ def test_mean_action_is_the_mode_of_the_learner(tmp_path: Path, activation: Any)
     assert np.ptp(expected, axis=(0, 1)).min() > 1.0  # the observation matters
     # Three sums of 64 float32 terms or fewer, in another order: some 64 * 2**-24 = 4e-6 of the
     # largest term, which is below 10.
-    np.testing.assert_allclose(policy.mean_action(loaded, seen), expected, atol=4e-5)
+    np.testing.assert_allclose(policy.act(loaded, seen), expected, atol=4e-5)

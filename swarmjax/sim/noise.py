@@ -47,6 +47,7 @@ class Stream(enum.IntEnum):
     STALL_TIME = 35
     TARGET_DISTANCE = 36
     TARGET_BEARING = 37
+    ACTION = 38
 
 
 def bits(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: Any) -> Array:

@@ -84,7 +84,7 @@ def test_an_exported_policy_has_the_output_of_tanh(config: TrainConfig, tmp_path
     leaves = {name: np.asarray(leaf) for name, leaf in to_leaves(state).items()}
     export.write_policy(tmp_path / "p.npz", leaves, config, update=0, seed=1)
     observation = np.random.default_rng(0).uniform(0.0, 1.0, (5, 3, 10)).astype(np.float32)
-    found = policy.mean_action(policy.load(tmp_path / "p.npz"), observation)
+    found = policy.act(policy.load(tmp_path / "p.npz"), observation)
     second = jax.tree.map(lambda x: x[1], learners)
     mode = jax.vmap(partial(ppo.mode, config=config.algo))
     expected = mode(second, observation=observation.swapaxes(0, 1)).swapaxes(0, 1)

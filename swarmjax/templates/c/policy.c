@@ -12,8 +12,8 @@ static const float SCALE[POLICY_OBSERVATIONS] = {
 $scale
 };
 
-/* Mean and deviation of the observation, then the layers: of each learner in turn. A kernel has a
- * row of inputs for each output. */
+/* Mean and deviation of the observation, the layers, and the deviation of the action: of each
+ * learner in turn. A kernel has a row of inputs for each output. */
 $arrays
 
 static float clip(float x, float limit)
@@ -57,6 +57,15 @@ void policy_action(unsigned learner, const float observation[POLICY_OBSERVATIONS
         a[i] = clip((observation[i] - MEAN[learner][i]) / STD[learner][i], $limit);
     }
 $layers
+}
+
+void policy_sample(unsigned learner, const float normal[POLICY_ACTIONS],
+                   float action[POLICY_ACTIONS])
+{
+    learner %= POLICY_LEARNERS;
+    for (unsigned i = 0; i < POLICY_ACTIONS; i++) {
+        action[i] += DEVIATION[learner][i] * normal[i];
+    }
 }
 
 void policy_command(const float action[POLICY_ACTIONS], float command[POLICY_ACTIONS])

@@ -35,6 +35,12 @@ void policy_observe(const float quantity[POLICY_OBSERVATIONS],
 void policy_action(unsigned learner, const float observation[POLICY_OBSERVATIONS],
                    float action[POLICY_ACTIONS]);
 
+/* Draws an action from the policy, as robots do when it is judged, around its most likely one:
+ * `normal` are standard normal numbers, independent of each other and of those before. Robots that
+ * block each other, each doing the likeliest thing, come free by it. */
+void policy_sample(unsigned learner, const float normal[POLICY_ACTIONS],
+                   float action[POLICY_ACTIONS]);
+
 /* Scales an action, clipped to -1..1 first, to forward speed (m/s) and turn rate (rad/s, left
  * positive). */
 void policy_command(const float action[POLICY_ACTIONS], float command[POLICY_ACTIONS]);

@@ -11,6 +11,12 @@ $observation
 static const float ACTION[CASES][POLICY_ACTIONS] = {
 $action
 };
+static const float NORMAL[CASES][POLICY_ACTIONS] = {
+$normal
+};
+static const float SAMPLE[CASES][POLICY_ACTIONS] = {
+$sample
+};
 
 static float magnitude(float x)
 {
@@ -35,6 +41,10 @@ int main(void)
         float action[POLICY_ACTIONS];
         policy_action((unsigned)i % POLICY_LEARNERS, OBSERVATION[i], action);
         if (!agrees(action, ACTION[i])) {
+            return 1 + i;
+        }
+        policy_sample((unsigned)i % POLICY_LEARNERS, NORMAL[i], action);
+        if (!agrees(action, SAMPLE[i])) {
             return 1 + i;
         }
     }
