@@ -95,9 +95,8 @@ def brightness(scene: Scene, shades: infrared.Reflectance, geom: np.ndarray) -> 
     """
     model, table = scene.model, np.ones((len(geom), scene.model.ngeom + 1))  # the last: nothing
     obstacles = scene.ids.obstacle_geom
-    fixtures = np.flatnonzero(model.body_mocapid[model.geom_bodyid] >= 0)
     if shades.wall is not None:
-        table[:, np.setdiff1d(fixtures, obstacles)] = shades.wall[:, None]
+        table[:, scene.ids.fixture_geom[len(obstacles) :]] = shades.wall[:, None]
     if shades.obstacle is not None:
         table[:, obstacles] = shades.obstacle
     if shades.robot is not None:

@@ -61,6 +61,7 @@ class Body:
     """One kind of body, as functions.
 
     Attributes:
+      gravity: whether gravity acts along any of its joints.
       add: adds a robot of this name to a spec, for a physics step (s); returns its contact geom.
       qpos: positions of the joints [..., R * Q] of robots at rest at [..., R, 3] x (m), y (m),
         yaw (rad).
@@ -69,6 +70,7 @@ class Body:
       changes: what a chassis changes in the compiled model (the last argument is the model).
     """
 
+    gravity: bool
     add: Callable[[mujoco.MjSpec, str, RobotConfig, float], str]
     qpos: Callable[[Array, Any], Array]
     pose: Callable[[Array, Any], Array]

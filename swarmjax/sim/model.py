@@ -5,7 +5,7 @@ run time; the model itself is compiled once for the largest case. MuJoCo only, n
 """
 
 import itertools
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import mujoco
 import numpy as np
@@ -22,6 +22,10 @@ WALL_HALF_LENGTH = 2.5  # m; longer than half the largest arena (4 m)
 HALF_HEIGHT = 0.05  # m; walls and obstacles are 0.1 m high (Webots RectangleArena)
 WALLS = 4
 BODIES: dict[str, Body] = {"planar": PLANAR, "wheeled": WHEELED}
+# How obstacles and walls are described. MuJoCo C relies on what it worked out of the world's geoms
+# when it compiled them (`geom_sameframe`, a hierarchy of bounds for rays), so there they are bodies
+# that it knows to move. MJX relies on neither, and pays for every body.
+Fixtures = Literal["mocap", "world"]
 
 
 class ArenaSize(NamedTuple):
@@ -42,12 +46,15 @@ class Ids(NamedTuple):
     """Where things lie in the model's arrays.
 
     Attributes:
-      fixture_mocap: [M + 4] rows of `mocap_pos`: obstacles, then walls east, north, west, south.
-      obstacle_geom: [M] rows of `geom_size`.
+      fixture_geom: [M + 4] rows of `geom_size`, one after the other: obstacles, then walls east,
+        north, west, south.
+      fixture_mocap: [M + 4] rows of `mocap_pos` likewise; -1 of geoms of the world.
+      obstacle_geom: [M] the first of `fixture_geom`.
       hull_body: [R] bodies, for `bodyexclude` of a ray.
       robots: rows of the robots.
     """
 
+    fixture_geom: np.ndarray
     fixture_mocap: np.ndarray
     obstacle_geom: np.ndarray
     hull_body: np.ndarray
@@ -55,7 +62,12 @@ class Ids(NamedTuple):
 
 
 def build(
-    robot: RobotConfig, size: ArenaSize, timestep: float, *, ray_geoms: bool = False
+    robot: RobotConfig,
+    size: ArenaSize,
+    timestep: float,
+    *,
+    ray_geoms: bool = False,
+    fixtures: Fixtures = "mocap",
 ) -> mujoco.MjSpec:
     """Describes one arena.
 
@@ -64,19 +76,22 @@ def build(
       size: what to compile for.
       timestep: one physics step, s.
       ray_geoms: add the hull as the cylinder that a ray sees; the analytic sensors need none.
+      fixtures: obstacles and walls are `mocap` bodies, for MuJoCo C, or geoms of the `world`, whose
+        poses MJX is told.
 
     Returns:
       The spec, ready to compile: qpos, qvel and ctrl hold each robot in turn, as its body says.
     """
     spec = mujoco.MjSpec()
-    _set_options(spec, timestep)
+    _set_options(spec, timestep, gravity=BODIES[robot.body].gravity)
     names = [f"robot{i}" for i in range(size.robots)]
     hulls = [BODIES[robot.body].add(spec, name, robot, timestep) for name in names]
     for name in names if ray_geoms else ():
         add_ray_hull(spec.body(name), name, robot.hull_radius)
-    obstacles = [_add_box(spec, f"obstacle{i}", size.largest_half) for i in range(size.obstacles)]
-    walls = [_add_box(spec, f"wall{i}", WALL_HALF_LENGTH) for i in range(WALLS)]
-    solid = itertools.product(hulls, obstacles + walls)
+    halves = [size.largest_half] * size.obstacles + [WALL_HALF_LENGTH] * WALLS
+    named = zip(_fixture_names(size), halves, strict=True)
+    boxes = [_add_box(spec, name, half, fixtures) for name, half in named]
+    solid = itertools.product(hulls, boxes)
     for first, second in itertools.chain(itertools.combinations(hulls, 2), solid):
         # condim 1: the hull's plastic slides along what it touches, as the paper's robots do.
         spec.add_pair(geomname1=first, geomname2=second, condim=1)
@@ -85,11 +100,12 @@ def build(
 
 def ids(model: mujoco.MjModel, size: ArenaSize) -> Ids:
     """Looks the rows of robots, obstacles and walls up by name."""
-    obstacles = [model.body(f"obstacle{i}") for i in range(size.obstacles)]
-    walls = [model.body(f"wall{i}") for i in range(WALLS)]
+    boxes = [model.geom(f"{name}_box").id for name in _fixture_names(size)]
+    fixture_geom = np.array(boxes, np.int32)
     return Ids(
-        fixture_mocap=np.array([model.body_mocapid[b.id] for b in obstacles + walls], np.int32),
-        obstacle_geom=np.array([model.body_geomadr[b.id] for b in obstacles], np.int32),
+        fixture_geom=fixture_geom,
+        fixture_mocap=np.array(model.body_mocapid[model.geom_bodyid[fixture_geom]], np.int32),
+        obstacle_geom=fixture_geom[: size.obstacles],
         hull_body=np.array([model.body(f"robot{i}").id for i in range(size.robots)], np.int32),
         robots=find_rows(model, size.robots),
     )
@@ -104,7 +120,7 @@ def fixture_poses(side: Any, obstacle: Any, xp: Any) -> tuple[Any, Any]:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      Positions [M + 4, 3] (m) and unit quaternions [M + 4, 4] (w, x, y, z).
+      Positions [M + 4, 3] on the floor (m) and unit quaternions [M + 4, 4] (w, x, y, z).
     """
     bearing = np.arange(WALLS, dtype=np.float32) * np.float32(np.pi / 2)
     away = 0.5 * side + WALL_HALF_THICKNESS
@@ -116,18 +132,28 @@ def fixture_poses(side: Any, obstacle: Any, xp: Any) -> tuple[Any, Any]:
     return place, xp.stack([xp.cos(half_yaw), zero, zero, xp.sin(half_yaw)], axis=-1)
 
 
-def _set_options(spec: mujoco.MjSpec, timestep: float) -> None:
-    """Euler: the servos are discrete. Gravity acts along no joint of a planar robot."""
+def _fixture_names(size: ArenaSize) -> list[str]:
+    """Obstacles, then walls."""
+    return [f"obstacle{i}" for i in range(size.obstacles)] + [f"wall{i}" for i in range(WALLS)]
+
+
+def _set_options(spec: mujoco.MjSpec, timestep: float, *, gravity: bool) -> None:
+    """Euler: the servos are discrete. What acts on nothing is switched off; MJX pays for asking."""
     spec.option.timestep = timestep
     spec.option.gravity = [0.0, 0.0, -epuck.GRAVITY]
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
-    # Nothing is damped, and MJX pays a factorisation a step for asking.
-    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    off = mujoco.mjtDisableBit
+    # No joint has damping (whose factorisation is a flag of its own), a spring, or dry friction.
+    spec.option.disableflags |= int(off.mjDSBL_EULERDAMP | off.mjDSBL_DAMPER | off.mjDSBL_SPRING)
+    spec.option.disableflags |= int(off.mjDSBL_FRICTIONLOSS)
+    if not gravity:
+        spec.option.disableflags |= int(off.mjDSBL_GRAVITY)
 
 
-def _add_box(spec: mujoco.MjSpec, name: str, half: float) -> str:
-    """Adds a box that is moved by its mocap pose and returns the name of its geom."""
-    body = spec.worldbody.add_body(name=name, mocap=True)
+def _add_box(spec: mujoco.MjSpec, name: str, half: float, fixtures: Fixtures) -> str:
+    """Adds a box whose pose is set at run time and returns the name of its geom."""
+    world = spec.worldbody
+    body = world.add_body(name=name, mocap=True) if fixtures == "mocap" else world
     thickness = WALL_HALF_THICKNESS if name.startswith("wall") else half
     box, size = mujoco.mjtGeom.mjGEOM_BOX, [thickness, half, HALF_HEIGHT]
     return add_geom(body, f"{name}_box", box, size, [0.0, 0.0, HALF_HEIGHT])

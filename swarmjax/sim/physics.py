@@ -6,6 +6,7 @@ carried instead, because rebuilding it at every control step costs a quarter of 
 """
 
 import contextlib
+import functools
 import importlib.util
 import io
 from dataclasses import dataclass
@@ -37,6 +38,9 @@ SOLVER_STEPS = {
 # SOLVER_ROWS_PER_ROBOT. What stands on the floor is counted apart, and whole.
 CONTACTS_PER_ROBOT = 3
 SOLVER_ROWS_PER_ROBOT = 6  # neighbours that a disc can touch at once
+
+
+Fields = dict[str, Array]
 
 
 class PhysicsState(NamedTuple):
@@ -211,27 +215,63 @@ def step(
     Returns:
       The arena, one control step later.
     """
-    ids = physics.ids
     chex.assert_rank(side, 0)
-    chex.assert_shape(obstacle, (len(ids.obstacle_geom), 5))
-    chex.assert_shape(wheels, (len(ids.hull_body), 2))
-    place, turn = sim_model.fixture_poses(side, obstacle, jnp)
-    data = data.replace(
-        mocap_pos=data.mocap_pos.at[ids.fixture_mocap].set(place),
-        mocap_quat=data.mocap_quat.at[ids.fixture_mocap].set(turn),
-        ctrl=physics.body.ctrl(wheels, chassis, physics.robot, jnp),
-    )
-    model = _change(physics, obstacle, chassis)
+    chex.assert_shape(obstacle, (len(physics.ids.obstacle_geom), 5))
+    chex.assert_shape(wheels, (len(physics.ids.hull_body), 2))
+    of_model, of_data = _fixtures(physics, side, obstacle)
+    model = _change(physics, of_model, chassis)
+    data = data.replace(ctrl=physics.body.ctrl(wheels, chassis, physics.robot, jnp), **of_data)
     if physics.substeps == 1:
         return mjx.step(model, data)
     return jax.lax.fori_loop(0, physics.substeps, lambda _, d: mjx.step(model, d), data)
 
 
-def _change(physics: Physics, obstacle: Array, chassis: Chassis) -> mjx.Model:
-    """Sets what this arena's model has of its own."""
-    model, ids = physics.model, physics.ids
-    fields = {"geom_size": model.geom_size.at[ids.obstacle_geom, :2].set(obstacle[:, 3:])}
-    changes = physics.body.changes(chassis, ids.robots, physics.robot, physics.host)
+def _fixtures(physics: Physics, side: Array, obstacle: Array) -> tuple[Fields, Fields]:
+    """Puts this arena's obstacles and walls where the implementation looks for them.
+
+    `jax` works the poses of all geoms out from the model. `warp` passes over those of the world,
+    which stay in the data as they were made, or set here; it overwrites the poses of all others.
+
+    Args:
+      physics: the compiled side.
+      side: [] of the arena, m.
+      obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
+
+    Returns:
+      Fields of the model, and of the data.
+    """
+    model, made = physics.model, physics.template
+    put = functools.partial(_with_rows, first=int(physics.ids.fixture_geom[0]))
+    place, turn = sim_model.fixture_poses(side, obstacle, jnp)
+    middle = place + np.array([0.0, 0.0, sim_model.HALF_HEIGHT], np.float32)
+    half = jnp.pad(obstacle[:, 3:], ((0, 0), (0, 1)), constant_values=sim_model.HALF_HEIGHT)
+    sizes = {"geom_size": put(model.geom_size, half)}
+    if model.impl.value == "warp":
+        matrix = put(made.geom_xmat, _matrices(turn))
+        return sizes, {"geom_xpos": put(made.geom_xpos, middle), "geom_xmat": matrix}
+    poses = {"geom_pos": put(model.geom_pos, middle), "geom_quat": put(model.geom_quat, turn)}
+    return sizes | poses, {}
+
+
+def _with_rows(array: Array, rows: Array, first: int) -> Array:
+    """Replaces the rows from `first` on: in one piece, where `.at` under `vmap` is a scatter."""
+    array = jnp.asarray(array)
+    return jnp.concatenate([array[:first], rows, array[first + len(rows) :]])
+
+
+def _matrices(turn: Array) -> Array:
+    """Rotation matrices [F, 3, 3] of unit quaternions [F, 4] about the z axis."""
+    w, z = turn[:, 0], turn[:, 3]
+    cos, sin, zero = w * w - z * z, 2.0 * w * z, 0.0 * w
+    rows = [cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1.0]
+    return jnp.stack(rows, axis=-1).reshape(-1, 3, 3)
+
+
+def _change(physics: Physics, fields: Fields, chassis: Chassis) -> mjx.Model:
+    """Sets what this arena's model has of its own: these fields, and the chassis."""
+    model, rows_of = physics.model, physics.ids.robots
+    changes = physics.body.changes(chassis, rows_of, physics.robot, physics.host)
     for name, (rows, values) in changes.items():
-        fields[name] = jnp.asarray(fields.get(name, getattr(model, name))).at[rows].set(values)
+        now = jnp.asarray(fields.get(name, getattr(model, name)))
+        fields = fields | {name: now.at[rows].set(values)}
     return model.replace(**fields)

@@ -120,4 +120,4 @@ def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjM
     return changes
 
 
-PLANAR = Body(add=_add, qpos=_qpos, pose=_pose, ctrl=_ctrl, changes=_changes)
+PLANAR = Body(gravity=False, add=_add, qpos=_qpos, pose=_pose, ctrl=_ctrl, changes=_changes)

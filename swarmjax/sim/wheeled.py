@@ -163,4 +163,4 @@ def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjM
     return changes
 
 
-WHEELED = Body(add=_add, qpos=_qpos, pose=_pose, ctrl=_ctrl, changes=_changes)
+WHEELED = Body(gravity=True, add=_add, qpos=_qpos, pose=_pose, ctrl=_ctrl, changes=_changes)

@@ -132,7 +132,7 @@ def load(config: TrainConfig) -> World:
     largest = task_stage.largest_half(config.stage)
     size = model.ArenaSize(sim.max_robots, sim.max_obstacles, largest)
     robot = task_factors.largest(config.robot, config.realism)
-    spec = model.build(robot, size, config.task.control_step / count)
+    spec = model.build(robot, size, config.task.control_step / count, fixtures="world")
     iterations, ls_iterations = physics.SOLVER_STEPS[config.robot.body, impl]
     spec.option.iterations = sim.iterations or iterations
     spec.option.ls_iterations = sim.ls_iterations or ls_iterations

@@ -110,10 +110,12 @@ def drive_all(
     return Path(pose, rate.reshape(*pose.shape[:3], -1))
 
 
-def compile_in_c(robot: RobotConfig, obstacle: np.ndarray, steps: int) -> Any:
+def compile_in_c(
+    robot: RobotConfig, obstacle: np.ndarray, steps: int, fixtures: model.Fixtures = "mocap"
+) -> Any:
     """The same model in MuJoCo C, in float64, its solver converged."""
     size = model.ArenaSize(ROBOTS, OBSTACLES, BIGGEST_HALF)
-    spec = model.build(robot, size, STEP / steps)
+    spec = model.build(robot, size, STEP / steps, fixtures=fixtures)
     spec.option.iterations, spec.option.tolerance = 100, 1e-14
     spec.option.ls_iterations, spec.option.ls_tolerance = 100, 1e-6
     built = spec.compile()

@@ -1,5 +1,7 @@
 """The compiled model: what the ids point at, what may touch what, where things are put."""
 
+from typing import Literal
+
 import mujoco
 import numpy as np
 import pytest
@@ -28,6 +30,47 @@ def test_ids_point_at_the_named_bodies(compiled: mujoco.MjModel) -> None:
     assert names == ["obstacle0", "obstacle1", "wall0", "wall1", "wall2", "wall3"]
     assert [compiled.geom(g).name for g in ids.obstacle_geom] == ["obstacle0_box", "obstacle1_box"]
     assert [compiled.body(b).name for b in ids.hull_body] == ["robot0", "robot1", "robot2"]
+
+
+@pytest.mark.parametrize("body", ["planar", "wheeled"])
+@pytest.mark.parametrize("fixtures", ["mocap", "world"])
+def test_bodies_and_geoms_of_either_description(
+    fixtures: model.Fixtures, body: Literal["planar", "wheeled"]
+) -> None:
+    built = model.build(RobotConfig(body=body), SIZE, STEP, fixtures=fixtures).compile()
+    ids = model.ids(built, SIZE)
+    # The world, and a body for each planar robot, three for a wheeled one; six mocap bodies.
+    robots = 3 if body == "planar" else 9
+    assert built.nbody == 1 + robots + (6 if fixtures == "mocap" else 0)
+    assert built.nmocap == (6 if fixtures == "mocap" else 0)
+    names = ["obstacle0", "obstacle1", "wall0", "wall1", "wall2", "wall3"]
+    assert [built.geom(int(g)).name for g in ids.fixture_geom] == [f"{n}_box" for n in names]
+    np.testing.assert_array_equal(np.diff(ids.fixture_geom), 1)  # MJX replaces them in one piece
+    np.testing.assert_array_equal(ids.obstacle_geom, ids.fixture_geom[:2])
+    expected = np.arange(6) if fixtures == "mocap" else np.full(6, -1)
+    np.testing.assert_array_equal(ids.fixture_mocap, expected)
+
+
+@pytest.mark.parametrize("body", ["planar", "wheeled"])
+def test_only_what_acts_on_nothing_is_switched_off(body: Literal["planar", "wheeled"]) -> None:
+    built = model.build(RobotConfig(body=body), SIZE, STEP).compile()
+    off, flags = mujoco.mjtDisableBit, built.opt.disableflags
+    acting = (off.mjDSBL_EULERDAMP, off.mjDSBL_DAMPER, off.mjDSBL_SPRING, off.mjDSBL_FRICTIONLOSS)
+    expected = sum(map(int, acting))
+    assert flags & ~int(off.mjDSBL_GRAVITY) == expected
+    for field in ("jnt_stiffness", "dof_damping", "dof_frictionloss", "body_gravcomp"):
+        assert not getattr(built, field).any(), field
+    # MuJoCo leaves the drag of a fluid out with springs and dampers.
+    assert built.opt.density == built.opt.viscosity == 0.0
+    # What gravity does to the joints of robots at rest.
+    built.opt.disableflags &= ~int(off.mjDSBL_GRAVITY)
+    data = mujoco.MjData(built)
+    pose = np.array([[0.0, 0.1, 0.3], [0.4, 0.0, -2.0], [-0.3, 0.2, 1.0]])
+    data.qpos = model.BODIES[body].qpos(pose, np)
+    mujoco.mj_forward(built, data)
+    weighed = bool(data.qfrc_bias.any())  # exactly; at rest there is no other bias
+    assert weighed == (body == "wheeled")
+    assert weighed != bool(flags & int(off.mjDSBL_GRAVITY))
 
 
 @pytest.mark.parametrize("size", [ArenaSize(1, 0, 0.05), ArenaSize(5, 4, 0.05)])
