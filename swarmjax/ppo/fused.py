@@ -17,12 +17,11 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from swarmjax.config import AlgoConfig
+from swarmjax.config import AlgoConfig, ConfigError, show
 from swarmjax.ppo import fused_kernel, networks
 from swarmjax.ppo.fused_kernel import Launch, Layer, Samples
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
-from swarmjax.settings import ConfigError, show
 
 # 64 samples are the fewest rows that four warps multiply at once on an H100. With two layers of 64,
 # 128 threads then take all of their 255 registers, and 80 kB on the chip: each of its 132
