@@ -232,7 +232,7 @@ def test_the_learner_steps_along_the_kernels_gradient(monkeypatch: pytest.Monkey
     ("hidden", "possible"),
     [
         ((64, 64), True),
-        # 4 * (16 * 128 + 2 * 128 * 16 + 64 * (16 + 2 * 128)) = 94,208 bytes, of 101,376.
+        # 4 * (16 * 128 + 2 * 128 * 16 + 64 * (16 + 2 * 128)) = 94,208 bytes, of 97,280.
         ((128,), True),
         # 4 * (16 * 64 + 2 * (2 * 64 * 64 + 64 * 16) + 64 * (16 + 2 * 64)) = 114,688 bytes.
         ((64, 64, 64), False),
