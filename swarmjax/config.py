@@ -392,6 +392,12 @@ class AlgoConfig(Section):
         default=0.5, metadata=about("weight of the value loss, half the mean squared error", 0.0)
     )
     entropy_cost: float = field(default=0.0, metadata=about("weight of the entropy", 0.0))
+    gradient: Literal["auto", "autodiff", "fused"] = field(
+        default="auto",
+        metadata=about(
+            "how the gradient is computed; auto: fused on an NVIDIA GPU where the layers fit it"
+        ),
+    )
     exploration: Literal["learned", "scheduled"] = field(
         default="learned",
         metadata=about("deviation of the action: learned, or falling in steps whatever is learned"),

@@ -17,6 +17,7 @@ from swarmjax import episodes, promotion, rollout
 from swarmjax.config import TrainConfig
 from swarmjax.curriculum import Curriculum, Decision, Mode, Schedule
 from swarmjax.curriculum_modes import MODES
+from swarmjax.ppo import fused
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.rollout import Ended
@@ -242,5 +243,15 @@ def _episode_metrics(ended: Ended, stage: Array) -> Metrics:
 
 
 def load(config: TrainConfig) -> tuple[Program, Schedule]:
-    """Builds the program and the curriculum's numbers of a config."""
+    """Builds the program and the curriculum's numbers of a config.
+
+    Raises:
+      ConfigError: if Warp is asked for and not installed, or a gradient that cannot be had.
+    """
+    resolve_gradient(config)
     return Program(config, env.load(config)), curricula.schedule(config)
+
+
+def resolve_gradient(config: TrainConfig) -> str:
+    """Says how gradients are computed, `autodiff` or `fused`; raises what `fused.resolve` does."""
+    return fused.resolve(config.algo, observation.SIZE, rollout.ACTION_SIZE)

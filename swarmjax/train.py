@@ -263,6 +263,7 @@ def _write_results(run: Path, program: Program, state: TrainState, tally: Tally)
             [entry for entry in tally.decisions if entry["seed"] == seed] for seed in every
         ],
         "impl": physics.resolve_impl(settings.sim.impl),
+        "gradient": loop.resolve_gradient(settings),
         "device": provenance.device(),
         "versions": provenance.versions(),
         "commit": provenance.commit(),

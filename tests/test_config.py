@@ -462,6 +462,12 @@ def test_resume_may_stop_again():
     assert load_resume(stored, ["run.stop_after=5"]).run.stop_after == 5
 
 
+def test_a_run_from_before_the_choice_of_gradient_goes_on():
+    stored = to_dict(load_train([]))
+    assert stored["algo"].pop("gradient") == "auto"
+    assert load_resume(stored, []).algo.gradient == "auto"
+
+
 @pytest.mark.parametrize("word", ["arenas=256", "stage=s3", "algo.clip=0.1", "run=3"])
 def test_resume_refuses_other_keys(word):
     stored = to_dict(load_train([]))

@@ -89,6 +89,7 @@ def test_a_run_directory_holds_what_it_promises(whole: Path) -> None:
     summary = json.loads((whole / "summary.json").read_text())
     assert summary["updates"] == 9
     assert summary["budget_spent"] is True
+    assert (summary["impl"], summary["gradient"]) == ("jax", "autodiff")
     assert summary["seeds"] == [0]
     assert summary["transitions"] == [sum(row["transitions"] for row in rows)]
     stored = json.loads((whole / "config.json").read_text())

@@ -6,6 +6,7 @@ G stands for groups of samples that are shuffled as one (arenas), N for the samp
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import chex
@@ -15,7 +16,7 @@ import optax
 from flax import struct
 
 from swarmjax.config import AlgoConfig
-from swarmjax.ppo import exploration, full_batch, losses, networks, normalizer
+from swarmjax.ppo import exploration, full_batch, fused, losses, networks, normalizer
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
 from swarmjax.ppo.normalizer import Normalizer
@@ -313,8 +314,16 @@ def _step(
     minibatch: Minibatch,
 ) -> tuple[_Progress, Metrics]:
     """One step of the optimiser on a minibatch."""
-    found = jax.grad(losses.ppo_loss, has_aux=True)(progress[0], minibatch, config, expected_valid)
+    found = _gradient(config, minibatch)(progress[0], minibatch, config, expected_valid)
     return _take(config, updates, progress, found, jnp.any(minibatch.valid))
+
+
+def _gradient(config: AlgoConfig, minibatch: Minibatch) -> Callable[..., tuple[Params, Metrics]]:
+    """What computes the gradient of `losses.ppo_loss`, and its metrics, from its arguments."""
+    sizes = minibatch.observation.shape[-1], minibatch.action.shape[-1]
+    if fused.resolve(config, *sizes) == "fused":
+        return fused.gradient
+    return jax.grad(losses.ppo_loss, has_aux=True)
 
 
 def _take(

@@ -48,8 +48,10 @@ def test_the_help_names_the_rows_of_the_algorithm() -> None:
 
 def test_the_preset_leaves_no_number_of_the_learner_to_a_default() -> None:
     given = compose.read_preset("algo", "paper")
-    assert set(given["algo"]) | {"gae_lambda"} == {f.name for f in dataclasses.fields(AlgoConfig)}
-    assert PAPER.algo.gae_lambda is None  # has no meaning
+    # One has no meaning, the other says how numbers come about, not which.
+    others = {"gae_lambda", "gradient"}
+    assert set(given["algo"]) | others == {f.name for f in dataclasses.fields(AlgoConfig)}
+    assert PAPER.algo.gae_lambda is None
     rewards = {f.name for f in dataclasses.fields(RewardConfig)}
     assert set(given["task"]["reward"]) == rewards
     # Equation 3.

@@ -10,9 +10,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from swarmjax.config import AlgoConfig
-from swarmjax.ppo import learner
+from swarmjax.ppo import fused, learner
 from swarmjax.ppo.gae import generalized_advantages
 from swarmjax.ppo.learner import Batch, LearnerState
 
@@ -165,3 +166,14 @@ def test_actor_learns_the_best_action_of_each_observation() -> None:
     )
     # As above, with half the samples for each observation.
     np.testing.assert_allclose(_modes(state, -1.0, 1.0), [-0.5, 0.5], atol=0.02)
+
+
+def test_the_kernels_teach_the_actor_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fused, "resolve", lambda *_: "fused")
+    interpreted = functools.partial(fused.gradient, interpret=True)
+    monkeypatch.setattr(fused, "gradient", interpreted)
+    probe = Probe(
+        1, lambda draw, clock: draw, lambda draw, action, clock: -((action - 0.5 * draw) ** 2)
+    )
+    # As above.
+    np.testing.assert_allclose(_modes(_solve(probe), -1.0, 1.0), [-0.5, 0.5], atol=0.02)

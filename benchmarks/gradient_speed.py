@@ -1,0 +1,199 @@
+"""How long does the gradient of a minibatch take, by autodiff and by the fused kernels?
+
+`python -m benchmarks.gradient_speed [batch=N,N] [tile=N,N] [programs=N,N] [warps=N,N] [key=value
+...]` also takes the keys of `swarmjax.train`, of which `algo.*` tell. For each batch it compiles
+autodiff and every launch of the kernels, times calls of them in turn, and prints a JSON line for
+each: seconds of a gradient, and how far it is from autodiff's at the same and at full precision.
+"""
+
+import functools
+import itertools
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax.errors import JaxRuntimeError
+
+from benchmarks import peers, timing
+from swarmjax import command, config, provenance, rollout
+from swarmjax.config import AlgoConfig
+from swarmjax.ppo import fused, losses, networks
+from swarmjax.ppo.fused_kernel import Launch
+from swarmjax.ppo.losses import Minibatch
+from swarmjax.ppo.networks import Params
+from swarmjax.settings import Section, about
+from swarmjax.task import observation
+
+_STEP = 1e-6  # along each gradient: none may be computed once for all
+_VALID = 0.75  # share of the samples
+
+Gradient = Callable[[Params, Minibatch], Params]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpeedConfig(Section):
+    """What is measured."""
+
+    batch: tuple[int, ...] = field(
+        default=(1_310_720,), metadata=about("samples of the minibatch", 1, 10**9)
+    )
+    tile: tuple[int, ...] = field(
+        default=(fused.LARGE.tile,), metadata=about("samples of a tile, a power of two", 16, 1024)
+    )
+    programs: tuple[int, ...] = field(
+        default=(fused.LARGE.programs,), metadata=about("programs of the grid", 1, 10**6)
+    )
+    warps: tuple[int, ...] = field(
+        default=(fused.LARGE.warps,), metadata=about("of a program, a power of two", 1, 32)
+    )
+    steps: int = field(default=20, metadata=about("gradients of a call", 1, 10**6))
+    repeats: int = field(default=10, metadata=about("calls of each that are timed", 1, 10**6))
+    kernels: Literal["triton", "interpret", "none"] = field(
+        default="triton",
+        metadata=about("interpret: as JAX, on any device; none: autodiff alone"),
+    )
+
+
+def minibatch(key: jax.Array, params: Params, algo: AlgoConfig, size: int) -> Minibatch:
+    """Draws samples whose ratios are about 1, some of them clipped."""
+    keys = jax.random.split(key, 6)
+    seen = jax.random.normal(keys[0], (size, observation.SIZE))
+    action = jax.random.normal(keys[1], (size, rollout.ACTION_SIZE))
+    mean, std = networks.action_distribution(params, algo, seen)
+    moved = 0.1 * jax.random.normal(keys[2], (size,))
+    return Minibatch(
+        observation=seen,
+        action=action,
+        log_prob=networks.log_prob(mean, std, action) + moved,
+        advantage=jax.random.normal(keys[3], (size,)),
+        return_=jax.random.normal(keys[4], (size,)),
+        valid=jax.random.uniform(keys[5], (size,)) < _VALID,
+    )
+
+
+def methods(given: SpeedConfig, algo: AlgoConfig) -> dict[Launch | None, Gradient]:
+    """Makes what is timed: autodiff, without a launch, and the kernels with each."""
+    autodiff = jax.grad(losses.ppo_loss, has_aux=True)
+    made: dict[Launch | None, Gradient] = {None: _of_samples(autodiff, algo)}
+    if given.kernels != "none":
+        for launch in itertools.starmap(
+            Launch, itertools.product(given.tile, given.programs, given.warps)
+        ):
+            by_kernel = functools.partial(
+                fused.gradient, launch=launch, interpret=given.kernels == "interpret"
+            )
+            made[launch] = _of_samples(by_kernel, algo)
+    return made
+
+
+def _of_samples(gradient: Callable[..., Any], algo: AlgoConfig) -> Gradient:
+    def of_samples(params: Params, samples: Minibatch) -> Params:
+        return gradient(params, samples, algo, jnp.sum(samples.valid, dtype=jnp.float32))[0]
+
+    return of_samples
+
+
+def _compile(
+    gradient: Gradient, steps: int, params: Params, samples: Minibatch
+) -> timing.Program | str:
+    """Compiles as many steps along the gradient; what is said where that cannot be done."""
+
+    def descend(params: Params, samples: Minibatch) -> tuple[Params, None]:
+        def step(_: jax.Array, params: Params) -> Params:
+            found = gradient(params, samples)
+            return jax.tree.map(lambda x, slope: x - _STEP * slope, params, found)
+
+        return jax.lax.fori_loop(0, steps, step, params), None
+
+    try:
+        return timing.compile_program(descend, params, samples)
+    except JaxRuntimeError as error:  # more registers or memory of the chip than there is
+        return str(error).splitlines()[0]
+
+
+def _time(programs: Sequence[timing.Program], repeats: int, params: Params, samples: Any) -> Any:
+    """Seconds of the calls of each program, which take their turns; the first is not counted."""
+    taken: list[list[float]] = [[] for _ in programs]
+    for _ in range(1 + repeats):
+        for program, seconds in zip(programs, taken, strict=True):
+            begun = jax.block_until_ready(jax.tree.map(jnp.copy, params))
+            began = time.perf_counter()
+            jax.block_until_ready(program.call(begun, samples))
+            seconds.append(time.perf_counter() - began)
+    return [seconds[1:] for seconds in taken]
+
+
+def _difference(one: Params, other: Params) -> float:
+    """Norm of the difference, of that of the other."""
+    apart = jax.tree.map(jnp.subtract, one, other)
+    return float(optax.tree.norm(apart) / optax.tree.norm(other))
+
+
+def lines(given: SpeedConfig, algo: AlgoConfig, size: int) -> Iterator[dict[str, Any]]:
+    """Measures one size of the minibatch; yields a line for each method."""
+    init_key, key = jax.random.split(jax.random.key(0))
+    params = networks.init_params(init_key, algo, observation.SIZE, rollout.ACTION_SIZE)
+    samples = jax.jit(minibatch, static_argnums=(2, 3))(key, params, algo, size)
+    made = methods(given, algo)
+    built = {
+        launch: _compile(gradient, given.steps, params, samples)
+        for launch, gradient in made.items()
+    }
+    sound = {k: program for k, program in built.items() if not isinstance(program, str)}
+    taken = dict(zip(sound, _time([*sound.values()], given.repeats, params, samples), strict=True))
+    with jax.default_matmul_precision("highest"):
+        exact = jax.jit(made[None])(params, samples)
+    plain = jax.jit(made[None])(params, samples)
+    for launch, program in built.items():
+        line = _about(given, algo, size, launch)
+        if isinstance(program, str):
+            yield line | {"error": program}
+            continue
+        found = jax.jit(made[launch])(params, samples)
+        yield line | {
+            **timing.spread([seconds / given.steps for seconds in taken[launch]]),
+            "difference": _difference(found, plain),
+            "difference_from_highest": _difference(found, exact),
+            "compile_s": program.compile_s,
+            "bytes": program.size,
+        }
+
+
+def _about(
+    given: SpeedConfig, algo: AlgoConfig, size: int, launch: Launch | None
+) -> dict[str, Any]:
+    return {
+        "benchmark": "gradient_speed",
+        "batch": size,
+        "gradient": "autodiff" if launch is None else "fused",
+        **(dict.fromkeys(Launch._fields) if launch is None else launch._asdict()),
+        "hidden": algo.hidden,
+        "activation": algo.activation,
+        "steps": given.steps,
+        "kernels": given.kernels,
+        "matmul_precision": timing.matmul_precision(),
+        "device": provenance.device(),
+        "versions": provenance.versions(),
+        "commit": provenance.commit(),
+    }
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    given, words = peers.parse(SpeedConfig, arguments)
+    algo = config.load_train(words).algo
+    for size in given.batch:
+        for line in lines(given, algo, size):
+            sys.stdout.write(json.dumps(line) + "\n")
+            sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("gradient_speed", main, SpeedConfig))

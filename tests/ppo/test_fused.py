@@ -1,0 +1,318 @@
+"""The kernel's gradient is that of the loss; interpreted here, since no GPU is asked for."""
+
+import functools
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import AbstractDevice, AbstractMesh
+
+from swarmjax.config import AlgoConfig, ConfigError
+from swarmjax.ppo import fused, fused_kernel, losses, networks
+from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.fused_kernel import Launch
+from swarmjax.ppo.losses import Minibatch
+from swarmjax.ppo.networks import Params
+
+OBSERVATION, ACTION = 10, 2
+SMALL = AlgoConfig(hidden=(16,), entropy_cost=0.02, value_cost=0.7)
+# Sums of float32 in another order, and exp(-log_std) for 1 / std: what is found is about 2e-6.
+RELATIVE = 2e-5
+H100 = AbstractDevice(device_kind="NVIDIA H100 80GB HBM3", num_cores=132, platform="gpu")
+
+
+def _params(config: AlgoConfig, seed: int = 0) -> Params:
+    """Parameters none of which is 0."""
+    shapes = jax.eval_shape(
+        lambda: networks.init_params(jax.random.key(0), config, OBSERVATION, ACTION)
+    )
+    random = np.random.default_rng(seed)
+    return jax.tree.map(lambda x: 0.3 * random.normal(size=x.shape).astype(np.float32), shapes)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _log_prob(
+    params: Params, config: AlgoConfig, observation: jax.Array, action: jax.Array
+) -> jax.Array:
+    mean, std = networks.action_distribution(params, config, observation)
+    return networks.log_prob(mean, std, action)
+
+
+def _minibatch(params: Params, config: AlgoConfig, size: int, seed: int = 0) -> Minibatch:
+    """Samples of which about a third is invalid, and about half have a clipped ratio."""
+    random = np.random.default_rng(seed)
+    observation = random.normal(size=(size, OBSERVATION)).astype(np.float32)
+    action = random.normal(size=(size, ACTION)).astype(np.float32)
+    log_prob = _log_prob(params, config, observation, action) + 0.3 * random.normal(size=size)
+    return Minibatch(
+        observation=observation,
+        action=action,
+        log_prob=np.asarray(log_prob, np.float32),
+        advantage=random.normal(size=size).astype(np.float32),
+        return_=random.normal(size=size).astype(np.float32),
+        valid=random.uniform(size=size) < 0.7,
+    )
+
+
+def _expected(params: Params, minibatch: Minibatch, config: AlgoConfig, count: float) -> Any:
+    """Autodiff's gradient and metrics."""
+    with jax.default_matmul_precision("highest"):
+        gradient = jax.grad(losses.ppo_loss, has_aux=True)
+        return jax.jit(gradient, static_argnums=2)(params, minibatch, config, jnp.float32(count))
+
+
+@functools.partial(jax.jit, static_argnums=(2, 4))
+def _fused(
+    params: Params, minibatch: Minibatch, config: AlgoConfig, count: Any, launch: Launch
+) -> Any:
+    with jax.default_matmul_precision("highest"):
+        return fused.gradient(params, minibatch, config, count, launch=launch, interpret=True)
+
+
+def _assert_close(found: Any, expected: Any) -> None:
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for (path, mine), theirs in zip(
+        jax.tree.leaves_with_path(found), jax.tree.leaves(expected), strict=True
+    ):
+        error = np.linalg.norm(np.asarray(mine) - theirs)
+        assert error <= RELATIVE * np.linalg.norm(theirs), jax.tree_util.keystr(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "launch", "size", "count"),
+    [
+        # Seven tiles, the last of 8 samples, for three programs: two find nothing in the end.
+        ({"hidden": (64, 64)}, Launch(32, 3, 4), 200, 140.0),
+        ({"hidden": (32,), "activation": "relu"}, Launch(16, 4, 4), 70, 140.0),
+        ({"hidden": (16, 32, 16), "activation": "swish"}, Launch(16, 100, 4), 64, 60.0),
+        ({"exploration": "scheduled"}, Launch(64, 1, 4), 65, 40.0),
+        ({"output": "tanh"}, Launch(32, 2, 4), 40, 30.0),
+        # With 0.25 expected, the sums are divided by 1.
+        ({"clip": 0.3}, Launch(32, 2, 4), 9, 0.25),
+    ],
+)
+def test_gradient_and_metrics_are_those_of_autodiff(
+    changes: dict[str, Any], launch: Launch, size: int, count: float
+) -> None:
+    config = replace(SMALL, **changes)
+    params = _params(config)
+    minibatch = _minibatch(params, config, size)
+    expected = _expected(params, minibatch, config, count)
+    assert 0.0 < expected[1]["clip_fraction"] * max(count, 1.0) < np.sum(minibatch.valid)
+    _assert_close(_fused(params, minibatch, config, count, launch), expected)
+
+
+def test_float_masks_count_as_boolean_ones() -> None:
+    params = _params(SMALL)
+    minibatch = _minibatch(params, SMALL, 40)
+    masked = replace(minibatch, valid=3.0 * minibatch.valid)
+    expected = _expected(params, minibatch, SMALL, 25.0)
+    _assert_close(_fused(params, masked, SMALL, 25.0, Launch(32, 2, 4)), expected)
+
+
+def test_without_a_valid_sample_all_is_zero() -> None:
+    params = _params(SMALL)
+    minibatch = _minibatch(params, SMALL, 40)
+    # A log ratio of about 1000: masked only after exp, its gradient would be NaN.
+    minibatch = replace(
+        minibatch, valid=np.zeros(40, bool), log_prob=minibatch.log_prob - np.float32(1000.0)
+    )
+    for leaf in jax.tree.leaves(_fused(params, minibatch, SMALL, 0.0, Launch(32, 2, 4))):
+        np.testing.assert_array_equal(leaf, np.zeros(leaf.shape))
+
+
+def _several(*lead: int) -> tuple[Params, Minibatch, jax.Array]:
+    """Parameters, samples and expected counts, each with these leading axes."""
+    number = int(np.prod(lead))
+    params = [_params(SMALL, seed) for seed in range(number)]
+    batches = [_minibatch(p, SMALL, 40, seed) for seed, p in enumerate(params)]
+    stacked = jax.tree.map(
+        lambda *x: jnp.stack(x).reshape(*lead, *x[0].shape), *zip(params, batches, strict=True)
+    )
+    return *stacked, 20.0 + jnp.arange(number, dtype=jnp.float32).reshape(lead)
+
+
+@pytest.mark.parametrize("lead", [(3,), (2, 2)])
+def test_learners_and_seeds_side_by_side_come_to_what_each_does_alone(lead: tuple[int]) -> None:
+    several, launch = _several(*lead), Launch(32, 2, 4)
+    together = lambda p, m, n: _fused(p, m, SMALL, n, launch)  # noqa: E731 - wrapped below
+    for _ in lead:
+        together = jax.vmap(together)
+    found = together(*several)
+    for index in np.ndindex(lead):
+        params, minibatch, count = jax.tree.map(lambda x, i=index: x[i], several)
+        alone = _fused(params, minibatch, SMALL, count, launch)
+        _assert_close(jax.tree.map(lambda x, i=index: x[i], found), alone)
+
+
+def _lowered(function: Any, *arguments: Any) -> str:
+    """What a GPU would be given."""
+    with jax.sharding.use_abstract_mesh(AbstractMesh((), (), abstract_device=H100)):
+        traced = jax.jit(function).trace(*arguments)
+        return traced.lower(lowering_platforms=("cuda",)).as_text()
+
+
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
+@pytest.mark.parametrize("activation", ["tanh", "relu", "swish"])
+def test_triton_knows_all_that_the_kernels_do(activation: Any) -> None:
+    config = AlgoConfig(activation=activation)
+    params = _params(config)
+    minibatch = _minibatch(params, config, 1000)
+    text = _lowered(
+        lambda p, m: fused.gradient(p, m, config, jnp.float32(700.0)), params, minibatch
+    )
+    # 16 tiles of 64 for actor and critic each.
+    assert text.count("__gpu$xla.gpu.triton") == 2
+    assert text.count("grid_x = 16 : i32") == 2
+
+
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
+def test_triton_takes_learners_and_seeds_as_further_axes_of_its_grid() -> None:
+    function = jax.vmap(jax.vmap(lambda p, m, n: fused.gradient(p, m, SMALL, n)))
+    text = _lowered(function, *_several(2, 3))
+    assert text.count("grid_x = 1 : i32, grid_y = 3 : i32, grid_z = 2 : i32") == 2
+
+
+@pytest.mark.parametrize(("precision", "of_all"), [("highest", True), (None, False)])
+def test_products_have_the_precision_that_jax_is_set_to(
+    precision: str | None, of_all: bool
+) -> None:
+    params = _params(SMALL)
+    minibatch = _minibatch(params, SMALL, 40)
+    with jax.default_matmul_precision(precision):
+        jaxpr = str(
+            jax.make_jaxpr(lambda p, m: fused.gradient(p, m, SMALL, jnp.float32(1.0)))(
+                params, minibatch
+            )
+        )
+    # Forward two and back three products, of actor and critic each.
+    assert jaxpr.count("dot_general[") == 10
+    assert jaxpr.count("Precision.HIGHEST, Precision.HIGHEST") == (10 if of_all else 0)
+
+
+# Wiring
+
+
+def test_the_learner_steps_along_the_kernels_gradient(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = replace(SMALL, minibatches=4, epochs=2)
+    begun = ppo.init(jax.random.key(0), config, OBSERVATION, ACTION, 5)
+    drawn = _minibatch(begun.params, config, 8 * 20)
+    names = ("observation", "action", "log_prob", "advantage", "return_", "valid")
+    batch = ppo.Batch(
+        **{name: np.reshape(x := getattr(drawn, name), (8, 20, *x.shape[1:])) for name in names}
+    )
+
+    def update() -> tuple[Params, Any]:
+        made = jax.jit(lambda b: ppo.update(begun, config, b, jax.random.key(1), 5))(batch)
+        return made[0].params, made[1]
+
+    expected = update()
+    calls = []
+
+    def interpreted(*arguments: Any) -> Any:
+        calls.append(arguments)
+        return gradient(*arguments, interpret=True)
+
+    gradient = fused.gradient
+    monkeypatch.setattr(fused, "resolve", lambda *_: "fused")
+    monkeypatch.setattr(fused, "gradient", interpreted)
+    found = update()
+    assert len(calls) == 1  # traced once, in a loop over minibatches
+    # Eight steps of Adam along gradients that differ by rounding.
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), found, expected
+    )
+
+
+@pytest.mark.parametrize(
+    ("hidden", "possible"),
+    [
+        ((64, 64), True),
+        # 4 * (16 * 128 + 2 * 128 * 16 + 64 * (16 + 2 * 128)) = 94,208 bytes, of 97,280.
+        ((128,), True),
+        # 4 * (16 * 64 + 2 * (2 * 64 * 64 + 64 * 16) + 64 * (16 + 2 * 64)) = 114,688 bytes.
+        ((64, 64, 64), False),
+        ((16, 32, 16), True),
+        ((48,), False),
+        ((8,), False),
+        ((64, 8), False),
+        ((256,), False),
+    ],
+)
+def test_layers_fit_by_their_widths_and_by_the_memory_on_the_chip(
+    hidden: tuple[int, ...], possible: bool
+) -> None:
+    config = AlgoConfig(hidden=hidden)
+    assert fused.fits(config, OBSERVATION, ACTION) is possible
+    if not possible:
+        params = _params(config)
+        with pytest.raises(ValueError, match="do not take"):
+            fused.gradient(params, _minibatch(params, config, 4), config, jnp.float32(1.0))
+
+
+def test_a_wide_observation_does_not_fit() -> None:
+    assert fused.fits(SMALL, 128, ACTION)
+    assert not fused.fits(SMALL, 129, ACTION)
+    assert fused_kernel.padded_width(129) == 256
+
+
+def _on(monkeypatch: pytest.MonkeyPatch, **device: str) -> None:
+    monkeypatch.setattr(fused.jax, "devices", lambda: [SimpleNamespace(**device)])
+
+
+@pytest.mark.parametrize(
+    ("device", "choice"),
+    [
+        ({}, "autodiff"),
+        ({"compute_capability": "gfx942"}, "autodiff"),
+        ({"compute_capability": "7.5"}, "autodiff"),
+        ({"compute_capability": "8.0"}, "fused"),
+        ({"compute_capability": "12.0"}, "fused"),
+    ],
+)
+def test_auto_is_fused_on_an_nvidia_gpu_where_the_layers_fit(
+    device: dict[str, str], choice: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _on(monkeypatch, **device)
+    assert fused.resolve(AlgoConfig(), OBSERVATION, ACTION) == choice
+    assert fused.resolve(AlgoConfig(gradient="autodiff"), OBSERVATION, ACTION) == "autodiff"
+    assert fused.resolve(AlgoConfig(hidden=(8,)), OBSERVATION, ACTION) == "autodiff"
+
+
+@pytest.mark.parametrize(
+    ("capability", "hidden", "expected"),
+    [
+        # 4 B * (16 * 64 + 2 * (64 * 64 + 64 * 16) + 128 * (16 + 2 * 64)) = 116 KiB.
+        ("9.0", (64, 64), fused.LARGE),
+        ("8.0", (64, 64), fused.LARGE),
+        ("8.9", (64, 64), fused.LAUNCH),
+        ("8.9", (32, 32), fused.LARGE),
+    ],
+)
+def test_tiles_are_as_large_as_the_chip_takes(
+    capability: str, hidden: tuple[int, ...], expected: Launch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _on(monkeypatch, compute_capability=capability)
+    found = fused.choose_launch(AlgoConfig(hidden=hidden), OBSERVATION, ACTION)
+    assert found == expected
+
+
+def test_fused_is_refused_where_it_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError) as no_gpu:
+        fused.resolve(AlgoConfig(gradient="fused"), OBSERVATION, ACTION)
+    assert str(no_gpu.value) == (
+        "algo.gradient is fused, but there is no NVIDIA GPU of compute capability 8 or more: give "
+        "auto or autodiff."
+    )
+    _on(monkeypatch, compute_capability="9.0")
+    assert fused.resolve(AlgoConfig(gradient="fused"), OBSERVATION, ACTION) == "fused"
+    with pytest.raises(ConfigError) as unfit:
+        fused.resolve(AlgoConfig(gradient="fused", hidden=(48, 64)), OBSERVATION, ACTION)
+    assert str(unfit.value) == (
+        "algo.gradient is fused, but algo.hidden is [48,64], which does not fit the chip: give two "
+        "layers of 16, 32 or 64, or algo.gradient=auto."
+    )
