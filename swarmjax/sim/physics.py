@@ -38,6 +38,7 @@ SOLVER_STEPS = {
 # SOLVER_ROWS_PER_ROBOT. What stands on the floor is counted apart, and whole.
 CONTACTS_PER_ROBOT = 3
 SOLVER_ROWS_PER_ROBOT = 6  # neighbours that a disc can touch at once
+FEW_ARENAS = 64  # in so few, all may be crowded at once: there is room for every pair
 
 
 Fields = dict[str, Array]
@@ -140,10 +141,11 @@ def _limits(model: mujoco.MjModel, robots: int, arenas: int) -> dict[str, int]:
     """Room for contacts: of all arenas together, and for the solver's rows of each one."""
     on_floor = model.geom_type[model.pair_geom1] == mujoco.mjtGeom.mjGEOM_PLANE
     rows = np.where(model.pair_dim[on_floor] == 1, 1, 2 * (model.pair_dim[on_floor] - 1))
-    others = min(int(np.sum(~on_floor)), SOLVER_ROWS_PER_ROBOT * robots)
+    pairs, floor = int(np.sum(~on_floor)), int(np.sum(on_floor))
+    hulls = max(arenas * CONTACTS_PER_ROBOT * robots, min(arenas, FEW_ARENAS) * pairs)
     return {
-        "naconmax": arenas * (CONTACTS_PER_ROBOT * robots + int(np.sum(on_floor))),
-        "njmax": others + int(np.sum(rows)),
+        "naconmax": hulls + arenas * floor,
+        "njmax": min(pairs, SOLVER_ROWS_PER_ROBOT * robots) + int(np.sum(rows)),
     }
 
 

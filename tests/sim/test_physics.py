@@ -409,6 +409,16 @@ def test_auto_is_jax_without_an_nvidia_gpu() -> None:
     assert physics.resolve_impl("warp") == "warp"
 
 
+@pytest.mark.parametrize(("arenas", "room"), [(1, 50), (64, 64 * 50), (1000, 1000 * 15)])
+def test_few_arenas_have_room_for_every_pair(arenas: int, room: int) -> None:
+    """5 robots and 4 boxes: 10 pairs of robots and 5 x (4 + 4) with boxes and walls; else 3 each."""
+    given = settings("warp", "planar")
+    sim = dataclasses.replace(given.sim, max_robots=5, max_obstacles=4)
+    minibatches = dataclasses.replace(given.algo, minibatches=1)
+    many = dataclasses.replace(given, sim=sim, algo=minibatches, arenas=arenas, budget=10**6)
+    assert env.load(many).physics.template._impl.naconmax == room
+
+
 def test_substeps_make_up_one_control_step() -> None:
     sim = SimConfig(impl="jax", substeps=2, max_robots=ROBOTS, max_obstacles=OBSTACLES)
     loaded = env.load(dataclasses.replace(settings("jax", "planar"), sim=sim)).physics
