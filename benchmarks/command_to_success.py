@@ -91,6 +91,7 @@ def results(given: SuccessConfig, words: Sequence[str]) -> Iterator[Row]:
             "stop_at": given.stop_at,
             **found,
             "judged": judged,
+            "action": "sampled",
             "episodes": given.episodes,
             "measured": row["success_by_stage"][-1],
             "arena_steps": row["arena_steps"],

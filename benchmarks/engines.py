@@ -64,6 +64,7 @@ def results(words: Sequence[str]) -> Iterator[dict[str, Any]]:
             **{key: value for key, value in about.items() if key != "measures"},
             "robot": settings.robot.body,
             "steps": settings.steps,
+            "action": settings.action,
             "targets_reached": dict(zip(("c", "mjx"), targets, strict=True)),
             **compare(trial, same),
             "device": provenance.device(),

@@ -86,6 +86,7 @@ def results(words: Sequence[str], policies: dict[str, list[str]]) -> Iterator[di
                 "realism": realism,
                 "stage": settings.stage.name,
                 "levels": settings.episodes,
+                "action": settings.action,
                 "seeds": len(files),
                 **summarize(worlds[body, realism], worlds[WORLDS[0]], worlds[body, "ideal"]),
                 "digests": [policy_file.read(name).digest[:12] for name in files],

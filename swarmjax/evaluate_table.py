@@ -39,7 +39,8 @@ def show(console: Console, result: Mapping[str, Any]) -> None:
     who = " against ".join(_names(side) for side in sides)
     where = cells[0]["cell"] if result["suite"] is None else f"suite {result['suite']}"
     episodes = sum(cell["episodes"] for cell in cells)
-    _say(console, f"{who} on {where}, {episodes:,} episodes")
+    acting = ", each robot's most likely action" if result["action"] == "mean" else ""
+    _say(console, f"{who} on {where}, {episodes:,} episodes{acting}")
     if "compared" in result:
         for cell in cells:
             _show_comparison(console, cell)

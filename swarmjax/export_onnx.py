@@ -56,7 +56,7 @@ def render(policy: Policy) -> bytes:
     Returns:
         The bytes of an ONNX file. Its input `observation` is [B, O] if the policy is shared, else
         [B, R, O] with R the number of learners, as `meta["observation"]` of the policy says; its
-        outputs are `action` ([..., U], as `policy.act`) and `command` (as
+        outputs are `action` ([..., U], as `policy.act` without `normal`) and `command` (as
         `policy.command`: m/s and rad/s).
 
     Raises:

@@ -40,6 +40,7 @@ _HEADER = re.compile(
     rb"\{'descr': '([<>|][a-zA-Z]\d{0,9})', 'fortran_order': False, "
     rb"'shape': \((N,|N(?:, N){1,2}|)\), \} *\n".replace(b"N", rb"(?:0|[1-9]\d{0,8})")
 )
+_MOST_LOG_STD = 20.0  # 5e8 times the range of commands; exp of 89 is more than a float32 holds
 _MOST_HEADER = 10_000  # bytes, of a header and what is before it; NumPy reads no longer ones
 _NAME = re.compile(r"[a-zA-Z][\w.-]{0,63}", re.ASCII)
 _UNIT = re.compile(r"(?!.*(?:\*/|/\*))[a-zA-Z0-9/^*. -]{1,16}")  # nothing that bounds a comment
@@ -409,6 +410,11 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], learners: int, size: int) ->
         if name not in shapes:
             raise PolicyError(f"{name} is not known: format {FORMAT} has no such array.")
         _check_array(name, array, shapes[name])
+    if (arrays["actor/log_std"] > _MOST_LOG_STD).any():
+        raise PolicyError(
+            f"actor/log_std holds a value above {_MOST_LOG_STD:g}: expected the logarithm of a "
+            "deviation."
+        )
     if (arrays["normalizer/std"] <= 0).any():
         raise PolicyError("normalizer/std holds a value that is not above 0: it divides.")
 

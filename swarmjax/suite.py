@@ -105,6 +105,7 @@ def _search(settings: SuiteConfig, cell: CellConfig, entrants: Sequence[Entrant]
     judged = EvaluateConfig(
         policy=settings.policies,
         stage=cell.stage,
+        action="mean",  # the luck of a draw is no property of a level
         steps=settings.steps,
         workers=settings.workers,
     )

@@ -259,7 +259,7 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
                 parked_at = orders.target
             else:
                 seen = observe(trained, sensors, counts, distance, bearing)
-                normal = draw.standard_normal(len(MOTORS)) if orders.sampled else 0.0
+                normal = draw.standard_normal(len(MOTORS), np.float32) if orders.sampled else 0.0
                 wheels = wheel_speeds(trained, seen, orders.robot, normal)
         for motor, speed in zip(devices.motors, wheels, strict=True):
             motor.setVelocity(float(speed))

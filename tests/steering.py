@@ -24,7 +24,7 @@ def write(
     path: Path,
     drive: tuple = STEER,
     learners: int = 1,
-    log_std: float = NO_NOISE,
+    log_std: float | np.ndarray = NO_NOISE,
     **meta: Any,
 ) -> Path:
     """Writes a policy of one hidden layer, relu(bearing) and relu(-bearing)."""
@@ -40,7 +40,7 @@ def write(
         "normalizer/mean": zero,
         "normalizer/std": zero + 1.0,
     }
-    arrays = {n: np.repeat(a, learners, 0).astype(np.float32) for n, a in arrays.items()}
+    arrays = {n: np.repeat(a, learners // len(a), 0).astype(np.float32) for n, a in arrays.items()}
     said = {"learners": learners, "activation": "relu", "config": {}, "versions": {}, "update": 0}
     policy_file.write(path, arrays, policies.meta(**{**said, **meta}))
     return path

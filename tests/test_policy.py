@@ -137,6 +137,19 @@ def _by_hand(activation: str) -> Policy:
     )
 
 
+def test_an_action_is_drawn_by_its_own_deviation(tmp_path: Path) -> None:
+    given = policies.arrays(learners=3)
+    given["actor/log_std"][:] = np.log(np.arange(1, 7).reshape(3, 2) / 10)
+    trained = saved(tmp_path / "p.npz", given, **several(3))
+    seen = np.zeros((2, 2, SIZE), np.float32)
+    normal = _f32([[[1, -1], [2, 0.5]], [[0, 3], [-1, 1]]])
+    found = policy.act(trained, seen, normal)
+    # Robot 0 has deviations 0.1 and 0.2, robot 1 has 0.3 and 0.4.
+    expected = [[[0.1, -0.2], [0.6, 0.2]], [[0, 0.6], [-0.3, 0.4]]]
+    np.testing.assert_allclose(found - policy.act(trained, seen), expected, atol=1e-6)
+    assert found.dtype == np.float32
+
+
 def test_mean_action_by_hand() -> None:
     # Robot 0: normalised (2, 3, 0, 0, 4), hidden (2 + 4 + 0.5, 3 - 4 + 1) = (6.5, 0).
     # Robot 1: normalised (-1, 2, 0, 0, 40 -> 10), hidden (9.5, 2 - 10 + 1 < 0 -> 0).

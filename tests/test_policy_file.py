@@ -97,6 +97,11 @@ _GOOD = policies.arrays()
         (_with("actor/hidden_2/bias", _f32([[1]])), {}, r"actor/hidden_2/kernel is missing"),
         (_with("actor/hidden_7/bias", _f32([[1]])), {}, r"actor/hidden_2/kernel is missing"),
         (_with("actor/log_std", np.zeros((1, 2))), {}, r"actor/log_std is float64: expected float"),
+        (
+            _with("actor/log_std", np.full((1, 2), 21, np.float32)),
+            {},
+            r"actor/log_std holds a value above 20: expected the logarithm of a deviation",
+        ),
         (_with("actor/log_std", np.zeros((1, 2), ">f4")), {}, r"actor/log_std is >f4: expected fl"),
         (
             _with("actor/mean/bias", _f32([[1, 2, 3]])),

@@ -158,16 +158,19 @@ def _lowered(function: Any, *arguments: Any) -> str:
 
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
 @pytest.mark.parametrize("activation", ["tanh", "relu", "swish"])
-def test_triton_knows_all_that_the_kernels_do(activation: Any) -> None:
+@pytest.mark.parametrize(("launch", "tiles"), [(fused.LAUNCH, 16), (fused.LARGE, 8)])
+def test_triton_knows_all_that_the_kernels_do(activation: Any, launch: Launch, tiles: int) -> None:
     config = AlgoConfig(activation=activation)
     params = _params(config)
     minibatch = _minibatch(params, config, 1000)
     text = _lowered(
-        lambda p, m: fused.gradient(p, m, config, jnp.float32(700.0)), params, minibatch
+        lambda p, m: fused.gradient(p, m, config, jnp.float32(700.0), launch=launch),
+        params,
+        minibatch,
     )
-    # 16 tiles of 64 for actor and critic each.
+    # 1,000 samples in tiles of 64 or 128, for actor and critic each.
     assert text.count("__gpu$xla.gpu.triton") == 2
-    assert text.count("grid_x = 16 : i32") == 2
+    assert text.count(f"grid_x = {tiles} : i32") == 2
 
 
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")

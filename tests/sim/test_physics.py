@@ -411,7 +411,7 @@ def test_auto_is_jax_without_an_nvidia_gpu() -> None:
 
 @pytest.mark.parametrize(("arenas", "room"), [(1, 50), (64, 64 * 50), (1000, 1000 * 15)])
 def test_few_arenas_have_room_for_every_pair(arenas: int, room: int) -> None:
-    """5 robots and 4 boxes: 10 pairs of robots and 5 x (4 + 4) with boxes and walls; else 3 each."""
+    """5 robots, 4 boxes, 4 walls: 10 pairs of robots and 5 x 8 others; of many, 3 a robot."""
     given = settings("warp", "planar")
     sim = dataclasses.replace(given.sim, max_robots=5, max_obstacles=4)
     minibatches = dataclasses.replace(given.algo, minibatches=1)
