@@ -264,7 +264,7 @@ def test_the_robots_number_may_be_in_custom_data(tmp_path: Path) -> None:
         "not mine robot=1": ["target=0.3,0.2", "robot=2"],
         "target=0.3,0.2 robot=1": ["robot=2"],
     }.items():
-        done = _simulate(folder, [step | {"custom": custom}], *words)
+        done = _simulate(folder, [step | {"custom": custom}], "action=mean", *words)
         assert (done.returncode, done.stderr) == (0, "")
         found[custom] = _told(folder, 1)[0].tolist()
     first, *others = found.values()

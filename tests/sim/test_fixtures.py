@@ -78,7 +78,15 @@ def _turn(things: np.ndarray, angle: float) -> np.ndarray:
     return np.concatenate([np.stack([c * x - s * y, s * x + c * y, yaw], -1), things[..., 3:]], -1)
 
 
-@pytest.fixture(scope="module", params=ENGINES, ids="-".join)
+@pytest.fixture(
+    scope="module",
+    params=[
+        # It compiles for 20 s a test; test_physics.py holds it to MuJoCo C as well.
+        pytest.param(each, marks=pytest.mark.slow if each == ("jax", "wheeled") else ())
+        for each in ENGINES
+    ],
+    ids="-".join,
+)
 def loaded(request: pytest.FixtureRequest) -> Iterator[physics.Physics]:
     # A program of Warp calls back into the process that compiled it: it is not for the disk.
     seconds = jax.config.jax_persistent_cache_min_compile_time_secs
