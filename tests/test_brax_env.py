@@ -31,6 +31,7 @@ def world() -> World:
     return env.load(TrainConfig(stage=(stage,), task=task, algo=algo, sim=sim, arenas=4, budget=32))
 
 
+@pytest.mark.slow  # 22 s of compiling, for a peer of a benchmark
 def test_it_is_the_environment_robot_by_robot(world: World) -> None:
     swarm = brax_env.SwarmEnv(world, curriculum.schedule(world.config).stages)
     state = jax.jit(swarm.reset)(jax.random.split(jax.random.PRNGKey(0), 4 * 3))
