@@ -42,7 +42,7 @@ class Rows(NamedTuple):
     Attributes:
       bodies: [R, B] hull first.
       dofs: [R, D].
-      actuators: [R, U].
+      actuators: [R, U]; [R, 0] of a model whose servos are forces.
       wheel_geoms: [R, 2] left and right; [R, 0] of a body without wheels.
       wheel_bodies: [R, 2] likewise.
       grips: [R, 2] pairs of wheel and floor, likewise.
@@ -54,6 +54,20 @@ class Rows(NamedTuple):
     wheel_geoms: np.ndarray
     wheel_bodies: np.ndarray
     grips: np.ndarray
+
+
+class Servos(NamedTuple):
+    """Servos that are actuators to MuJoCo C, and to MJX, which pays for those, forces on joints.
+
+    Attributes:
+      add: adds the actuators to the robots of these names in a spec, for a physics step (s).
+      force: what they exert at the beginning of a physics step on the joints of robots with qpos
+        [..., R * Q], qvel [..., R * V], ctrl [..., R * U], a chassis, and the config's numbers, for
+        a physics step (s): [..., R * V] N or N m.
+    """
+
+    add: Callable[[mujoco.MjSpec, list[str], RobotConfig, float], None]
+    force: Callable[[Array, Array, Array, Chassis, RobotConfig, float, Any], Array]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +82,7 @@ class Body:
       pose: the inverse, [..., R, 3].
       ctrl: controls [..., R * U] that hold wheel speeds [..., R, 2] (rad/s) of a chassis.
       changes: what a chassis changes in the compiled model (the last argument is the model).
+      servos: what follows `ctrl`, if a description may do without it; None if `add` adds it.
     """
 
     gravity: bool
@@ -76,6 +91,7 @@ class Body:
     pose: Callable[[Array, Any], Array]
     ctrl: Callable[[Array, Chassis, RobotConfig, Any], Array]
     changes: Callable[[Chassis, Rows, RobotConfig, mujoco.MjModel], Changes]
+    servos: Servos | None = None
 
 
 def find_rows(model: mujoco.MjModel, robots: int) -> Rows:

@@ -24,7 +24,8 @@ WALLS = 4
 BODIES: dict[str, Body] = {"planar": PLANAR, "wheeled": WHEELED}
 # How obstacles and walls are described. MuJoCo C relies on what it worked out of the world's geoms
 # when it compiled them (`geom_sameframe`, a hierarchy of bounds for rays), so there they are bodies
-# that it knows to move. MJX relies on neither, and pays for every body.
+# that it knows to move. MJX relies on neither, and pays for every body; and for every actuator, so
+# that a body's `Servos` are left to whoever steps the world.
 Fixtures = Literal["mocap", "world"]
 
 
@@ -77,7 +78,7 @@ def build(
       timestep: one physics step, s.
       ray_geoms: add the hull as the cylinder that a ray sees; the analytic sensors need none.
       fixtures: obstacles and walls are `mocap` bodies, for MuJoCo C, or geoms of the `world`, whose
-        poses MJX is told.
+        poses MJX is told, as it is the forces of servos.
 
     Returns:
       The spec, ready to compile: qpos, qvel and ctrl hold each robot in turn, as its body says.
@@ -86,6 +87,9 @@ def build(
     _set_options(spec, timestep, gravity=BODIES[robot.body].gravity)
     names = [f"robot{i}" for i in range(size.robots)]
     hulls = [BODIES[robot.body].add(spec, name, robot, timestep) for name in names]
+    servos = BODIES[robot.body].servos
+    if servos is not None and fixtures == "mocap":
+        servos.add(spec, names, robot, timestep)
     for name in names if ray_geoms else ():
         add_ray_hull(spec.body(name), name, robot.hull_radius)
     halves = [size.largest_half] * size.obstacles + [WALL_HALF_LENGTH] * WALLS

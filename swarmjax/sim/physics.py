@@ -222,10 +222,34 @@ def step(
     chex.assert_shape(wheels, (len(physics.ids.hull_body), 2))
     of_model, of_data = _fixtures(physics, side, obstacle)
     model = _change(physics, of_model, chassis)
-    data = data.replace(ctrl=physics.body.ctrl(wheels, chassis, physics.robot, jnp), **of_data)
+    ctrl = physics.body.ctrl(wheels, chassis, physics.robot, jnp)
+    data = data.replace(**of_data)
+
+    def once(_: int, data: mjx.Data) -> mjx.Data:
+        return mjx.step(model, _drive(physics, data, ctrl, chassis))
+
     if physics.substeps == 1:
-        return mjx.step(model, data)
-    return jax.lax.fori_loop(0, physics.substeps, lambda _, d: mjx.step(model, d), data)
+        return once(0, data)
+    return jax.lax.fori_loop(0, physics.substeps, once, data)
+
+
+def _drive(physics: Physics, data: mjx.Data, ctrl: Array, chassis: Chassis) -> mjx.Data:
+    """Lets the servos act in the next physics step: as actuators, or as the forces that they are.
+
+    Args:
+      physics: the compiled side.
+      data: the arena.
+      ctrl: [R * U] as its body says.
+      chassis: of the robots.
+
+    Returns:
+      The arena, with what acts on its joints from now until the physics step is over.
+    """
+    servos, timestep = physics.body.servos, physics.host.opt.timestep
+    if servos is None:
+        return data.replace(ctrl=ctrl)
+    force = servos.force(data.qpos, data.qvel, ctrl, chassis, physics.robot, timestep, jnp)
+    return data.replace(qfrc_applied=force)
 
 
 def _fixtures(physics: Physics, side: Array, obstacle: Array) -> tuple[Fields, Fields]:

@@ -7,20 +7,34 @@ wheels push with 1.0 N. It also turns freely while it is blocked, where two slip
 turn: what policies that push things lose on the wheeled body (docs/robot.md).
 """
 
+import itertools
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 from swarmjax import epuck
 from swarmjax.config import RobotConfig
-from swarmjax.sim.body import Body, Changes, Chassis, Rows, scale_mass
+from swarmjax.sim.body import Body, Changes, Chassis, Rows, Servos, scale_mass
 from swarmjax.sim.drive import body_velocity
 from swarmjax.sim.geom import add_hull
 
 Array = Any
-_SERVOS = 3  # forward, lateral, turn
+_SERVOS = "forward", "lateral", "turn"
+_WRENCH = 0, 1, 5  # where they push and turn: along x, along y, about z of the robot
+
+
+class _Numbers(NamedTuple):
+    """Numbers of the three servos, [3], or [R, 3] of robots that differ.
+
+    Attributes:
+      gain: N s/m, N s/m, N m s/rad.
+      limit: of the force, N, N, N m.
+    """
+
+    gain: Array
+    limit: Array
 
 
 def _add(spec: mujoco.MjSpec, name: str, robot: RobotConfig, timestep: float) -> str:
@@ -34,27 +48,15 @@ def _add(spec: mujoco.MjSpec, name: str, robot: RobotConfig, timestep: float) ->
     body.add_joint(name=f"{name}_x", type=slide, axis=[1, 0, 0])
     body.add_joint(name=f"{name}_y", type=slide, axis=[0, 1, 0])
     body.add_joint(name=f"{name}_yaw", type=hinge, axis=[0, 0, 1])
-    body.add_site(name=f"{name}_axle")
-    _add_servos(spec, name, robot, timestep)
     return add_hull(body, name, robot.hull_radius)
 
 
-def _add_servos(spec: mujoco.MjSpec, name: str, robot: RobotConfig, timestep: float) -> None:
-    """Adds the servos of the forward, lateral and turning velocity of a robot.
-
-    Gains are deadbeat, mass / timestep, times the share of the way that a first-order lag goes in
-    one step: the velocity is that of the lag at every step, whatever its length. The force limits
-    are what the wheels can pass to the floor (Coulomb): mu m g along either axis, and mu m g times
-    half the track as a torque.
-    """
-    grip = robot.friction * robot.mass * epuck.GRAVITY
-    share = servo_share(robot.motor_lag, timestep)
-    servos = (
-        ("forward", 0, share * robot.mass, grip),
-        ("lateral", 1, robot.mass, grip),
-        ("turn", 5, share * robot.yaw_inertia, grip * 0.5 * robot.effective_track),
-    )
-    for label, axis, inertia, limit in servos:
+def _add_servos(spec: mujoco.MjSpec, names: list[str], robot: RobotConfig, timestep: float) -> None:
+    """Adds the servos of the forward, lateral and turning velocity as actuators."""
+    for name in names:
+        spec.body(name).add_site(name=f"{name}_axle")
+    servos = list(zip(_SERVOS, _WRENCH, *_servos(robot, timestep), strict=True))
+    for name, (label, axis, gain, limit) in itertools.product(names, servos):
         actuator = spec.add_actuator(
             name=f"{name}_{label}",
             trntype=mujoco.mjtTrn.mjTRN_SITE,
@@ -63,7 +65,70 @@ def _add_servos(spec: mujoco.MjSpec, name: str, robot: RobotConfig, timestep: fl
             forcelimited=True,
             forcerange=[-limit, limit],
         )
-        actuator.set_to_velocity(inertia / timestep)
+        actuator.set_to_velocity(gain)
+
+
+def _servos(robot: RobotConfig, timestep: float) -> _Numbers:
+    """The servos of a robot that is what the config says.
+
+    Gains are deadbeat, mass / timestep, times the share of the way that a first-order lag goes in
+    one step: the velocity is that of the lag at every step, whatever its length. The force limits
+    are what the wheels can pass to the floor (Coulomb): mu m g along either axis, and mu m g times
+    half the track as a torque.
+    """
+    grip = robot.friction * robot.mass * epuck.GRAVITY
+    share = servo_share(robot.motor_lag, timestep)
+    inertia = np.array([share * robot.mass, robot.mass, share * robot.yaw_inertia])
+    return _Numbers(inertia / timestep, grip * np.array([1.0, 1.0, 0.5 * robot.effective_track]))
+
+
+def _ratios(chassis: Chassis, robot: RobotConfig, xp: Any) -> _Numbers:
+    """What a chassis multiplies them by: [R, 3], or with axes of 1 where all are alike.
+
+    A servo stays deadbeat for another mass; the grip follows mass, friction and track.
+    """
+    mass = _ratio(chassis.mass, robot.mass)
+    # From float64 on, which MuJoCo C computes in: what is drawn is of float32.
+    grip = np.ones((1, 1)) * mass * _ratio(chassis.friction, robot.friction)
+    if chassis.track is None:
+        return _Numbers(mass, grip)
+    arm = _ratio(chassis.track, robot.effective_track)
+    turns = np.array([label == "turn" for label in _SERVOS])
+    return _Numbers(mass, grip * xp.where(turns, arm, 1.0))
+
+
+def _ratio(drawn: Array | None, nominal: float) -> Array:
+    """[R, 1] of what an episode has [R] to what the config says; [1, 1] if that is the same."""
+    return np.ones((1, 1)) if drawn is None else drawn[:, None] / nominal
+
+
+def _force(
+    qpos: Array,
+    qvel: Array,
+    ctrl: Array,
+    chassis: Chassis,
+    robot: RobotConfig,
+    timestep: float,
+    xp: Any,
+) -> Array:
+    """Forces of the servos along x and y of the world, and about z.
+
+    What the actuators of `_add_servos` do (MuJoCo, Computation: actuation model): gain * (set point
+    - velocity in the robot's frame), clamped, and turned into the world by its heading.
+    """
+    numbers, ratios = _servos(robot, timestep), _ratios(chassis, robot, xp)
+    gain, limit = numbers.gain * ratios.gain, numbers.limit * ratios.limit
+    yaw = _pose(qpos, xp)[..., 2]
+    cos, sin = xp.cos(yaw), xp.sin(yaw)
+    velocity = _turn(_each(qvel), cos, -sin, xp)
+    force = xp.clip(gain * (_each(ctrl) - velocity), -limit, limit)
+    return _flat(_turn(force, cos, sin, xp))
+
+
+def _turn(vector: Array, cos: Array, sin: Array, xp: Any) -> Array:
+    """Turns [..., R, 3] x, y and what is about z by an angle [..., R] of this cos and sin."""
+    x, y, about = vector[..., 0], vector[..., 1], vector[..., 2]
+    return xp.stack([cos * x - sin * y, sin * x + cos * y, about], axis=-1)
 
 
 def servo_share(lag: float, timestep: float) -> float:
@@ -79,12 +144,20 @@ def servo_share(lag: float, timestep: float) -> float:
     return 1.0 if lag == 0.0 else -math.expm1(-timestep / lag)
 
 
+def _flat(each: Array) -> Array:
+    return each.reshape(*each.shape[:-2], -1)
+
+
+def _each(flat: Array) -> Array:
+    return flat.reshape(*flat.shape[:-1], -1, 3)
+
+
 def _qpos(pose: Array, xp: Any) -> Array:
-    return pose.reshape(*pose.shape[:-2], -1)
+    return _flat(pose)
 
 
 def _pose(qpos: Array, xp: Any) -> Array:
-    return qpos.reshape(*qpos.shape[:-1], -1, 3)
+    return _each(qpos)
 
 
 def _ctrl(wheels: Array, chassis: Chassis, robot: RobotConfig, xp: Any) -> Array:
@@ -93,31 +166,31 @@ def _ctrl(wheels: Array, chassis: Chassis, robot: RobotConfig, xp: Any) -> Array
     track = robot.effective_track if chassis.track is None else chassis.track
     velocity = body_velocity(wheels, radius, track, xp)
     forward, turn = velocity[..., 0], velocity[..., 1]
-    servos = xp.stack([forward, 0.0 * forward, turn], axis=-1)
-    return servos.reshape(*servos.shape[:-2], -1)
+    return _flat(xp.stack([forward, 0.0 * forward, turn], axis=-1))
 
 
 def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjModel) -> Changes:
-    """The servo stays deadbeat for another mass; the grip follows mass, friction and track."""
-    acts = rows.actuators
+    """Mass and inertia, and where the servos are actuators, theirs."""
     changes: Changes = {}
-    grip: Array = np.ones((len(acts), 1))
     if chassis.mass is not None:
-        ratio = (chassis.mass / robot.mass)[:, None]
-        changes = scale_mass(ratio[:, 0], rows, model) | {
-            "actuator_gainprm": ((acts, 0), ratio * model.actuator_gainprm[acts, 0]),
-            "actuator_biasprm": ((acts, 2), ratio * model.actuator_biasprm[acts, 2]),
-        }
-        grip = grip * ratio
-    if chassis.friction is not None:
-        grip = grip * (chassis.friction / robot.friction)[:, None]
-    if chassis.track is not None:
-        turn = (chassis.track / robot.effective_track)[:, None]
-        grip = grip * (turn ** (np.arange(_SERVOS) == _SERVOS - 1))
-    if any(part is not None for part in (chassis.mass, chassis.friction, chassis.track)):
-        limits = model.actuator_forcerange[acts]
-        changes["actuator_forcerange"] = (acts, grip[..., None] * limits)
-    return changes
+        changes = scale_mass(chassis.mass / robot.mass, rows, model)
+    acts = rows.actuators
+    if acts.size == 0:
+        return changes
+    gain, limit = _ratios(chassis, robot, np)
+    return changes | {
+        "actuator_gainprm": ((acts, 0), gain * model.actuator_gainprm[acts, 0]),
+        "actuator_biasprm": ((acts, 2), gain * model.actuator_biasprm[acts, 2]),
+        "actuator_forcerange": (acts, limit[..., None] * model.actuator_forcerange[acts]),
+    }
 
 
-PLANAR = Body(gravity=False, add=_add, qpos=_qpos, pose=_pose, ctrl=_ctrl, changes=_changes)
+PLANAR = Body(
+    gravity=False,
+    add=_add,
+    qpos=_qpos,
+    pose=_pose,
+    ctrl=_ctrl,
+    changes=_changes,
+    servos=Servos(add=_add_servos, force=_force),
+)

@@ -54,8 +54,13 @@ def settings(impl: Literal["jax", "warp"], body: BodyName) -> TrainConfig:
 
 
 def load(impl: Literal["jax", "warp"], body: BodyName) -> Engine:
+    """Three robots and two obstacles, ready to drive."""
+    return load_as(settings(impl, body))
+
+
+def load_as(config: TrainConfig) -> Engine:
     """Compiles; the model is an argument of the step, so that its numbers may change."""
-    loaded = env.load(settings(impl, body)).physics
+    loaded = env.load(config).physics
 
     def run(model: Any, data: Any, side: Any, obstacle: Any, wheels: Any, chassis: Any) -> Any:
         mine = dataclasses.replace(loaded, model=model)
@@ -112,7 +117,7 @@ def drive_all(
 
 def compile_in_c(
     robot: RobotConfig, obstacle: np.ndarray, steps: int, fixtures: model.Fixtures = "mocap"
-) -> Any:
+) -> mujoco.MjModel:
     """The same model in MuJoCo C, in float64, its solver converged."""
     size = model.ArenaSize(ROBOTS, OBSTACLES, BIGGEST_HALF)
     spec = model.build(robot, size, STEP / steps, fixtures=fixtures)
@@ -133,8 +138,9 @@ def drive_in_c(
     built: mujoco.MjModel | None = None,
 ) -> Path:
     """One arena [R, 3] by MuJoCo C; wheels [T, R, 2]; the path is [T, 1, R, ...]."""
-    count = substeps(robot, None)
-    built = compile_in_c(robot, obstacle, count) if built is None else built
+    if built is None:
+        built = compile_in_c(robot, obstacle, substeps(robot, None))
+    count = round(STEP / built.opt.timestep)
     data, body = mujoco.MjData(built), model.BODIES[robot.body]
     ids = model.ids(built, model.ArenaSize(ROBOTS, OBSTACLES, BIGGEST_HALF))
     place, turn = model.fixture_poses(side, obstacle, np)
@@ -147,6 +153,14 @@ def drive_in_c(
         found.append(np.array(body.pose(data.qpos, np)))
         rate.append(data.qvel.reshape(ROBOTS, -1).copy())
     return Path(np.array(found)[:, None], np.array(rate)[:, None])
+
+
+def push(built: mujoco.MjModel, data: mujoco.MjData, robot: RobotConfig, ctrl: np.ndarray) -> None:
+    """Moves MuJoCo C on by a physics step with servos that are forces, by what they are now."""
+    servos, now = model.BODIES[robot.body].servos, (data.qpos, data.qvel, ctrl)
+    assert servos is not None
+    data.qfrc_applied = servos.force(*now, AS_BUILT, robot, built.opt.timestep, np)
+    mujoco.mj_step(built, data)
 
 
 def turned(yaw: np.ndarray) -> np.ndarray:

@@ -21,6 +21,7 @@ from engines import (
     STEP,
     BodyName,
     compile_in_c,
+    push,
     settings,
     turned,
     wheels_of,
@@ -128,12 +129,16 @@ def _drive_in_c(
     built = compile_in_c(robot, scenes.obstacle[0], count, fixtures)
     data, ids = mujoco.MjData(built), model.ids(built, SIZE)
     data.qpos = body.qpos(pose, np)
-    data.ctrl = body.ctrl(np.broadcast_to(AHEAD, (ROBOTS, 2)), AS_BUILT, robot, np)
+    ctrl = body.ctrl(np.broadcast_to(AHEAD, (ROBOTS, 2)), AS_BUILT, robot, np)
+    if built.nu:
+        data.ctrl = ctrl
+    step = mujoco.mj_step if built.nu else functools.partial(push, robot=robot, ctrl=ctrl)
     found = []
     for side, obstacle in zip(*scenes, strict=True):
         _place_in_c(built, data, ids, side, obstacle)
         for _ in range(CHUNK):
-            mujoco.mj_step(built, data, count)
+            for _ in range(count):
+                step(built, data)
             found.append(np.array(body.pose(data.qpos, np)))
     return np.array(found)
 
@@ -191,6 +196,7 @@ def test_what_moves_is_met_as_in_c(loaded: physics.Physics) -> None:
 
 @pytest.mark.parametrize("body", ["planar", "wheeled"])
 def test_both_descriptions_are_one_world(body: BodyName) -> None:
+    """Obstacles and walls as bodies or geoms; planar robots' servos as actuators or forces."""
     pose, scenes = _scenes()
     drive = functools.partial(_drive_in_c, RobotConfig(body=body))
     for arena in range(4):

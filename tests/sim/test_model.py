@@ -43,6 +43,12 @@ def test_bodies_and_geoms_of_either_description(
     robots = 3 if body == "planar" else 9
     assert built.nbody == 1 + robots + (6 if fixtures == "mocap" else 0)
     assert built.nmocap == (6 if fixtures == "mocap" else 0)
+    # Three servos of a planar robot, which MJX is told the forces of; a wheeled one has two motors.
+    assert (built.nu, built.nsite) == {
+        ("planar", "mocap"): (9, 3), ("planar", "world"): (0, 0),
+        ("wheeled", "mocap"): (6, 0), ("wheeled", "world"): (6, 0),
+    }[body, fixtures]  # fmt: skip
+    assert ids.robots.actuators.shape == (3, built.nu // 3)
     names = ["obstacle0", "obstacle1", "wall0", "wall1", "wall2", "wall3"]
     assert [built.geom(int(g)).name for g in ids.fixture_geom] == [f"{n}_box" for n in names]
     np.testing.assert_array_equal(np.diff(ids.fixture_geom), 1)  # MJX replaces them in one piece

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +27,7 @@ from engines import (
     drive_all,
     drive_in_c,
     load,
+    load_as,
     settings,
     start,
     turned,
@@ -268,17 +270,30 @@ def _check_lag(path: Path, robot: RobotConfig) -> None:
     assert np.all(np.abs(_speeds(path, robot.body) - expected) <= tolerance)
 
 
-def test_a_lagging_servo_follows_the_closed_form(engine: Engine) -> None:
-    robot = dataclasses.replace(engine.loaded.robot, motor_lag=LAG)
+def _lagging(engine: Engine, robot: RobotConfig) -> tuple[Engine, Any]:
+    """What drives this robot, and its model: the lag is a number of the model's actuators.
+
+    Where servos are forces it is one of the program, which is compiled anew.
+    """
+    if _body(engine) == "planar":
+        config = settings(engine.loaded.model.impl.value, "planar")
+        slower = load_as(dataclasses.replace(config, robot=robot))
+        return slower, slower.loaded.model
     slow = compile_in_c(robot, AWAY, engine.loaded.substeps)
     given = jnp.asarray(engine.loaded.model.actuator_gainprm).dtype
     changed = engine.loaded.model.replace(
         actuator_gainprm=jnp.asarray(slow.actuator_gainprm, given),
         actuator_biasprm=jnp.asarray(slow.actuator_biasprm, given),
     )
+    return engine, changed
+
+
+def test_a_lagging_servo_follows_the_closed_form(engine: Engine) -> None:
+    robot = dataclasses.replace(engine.loaded.robot, motor_lag=LAG)
+    slow, changed = _lagging(engine, robot)
     wheels = wheels_of(np.array(LAGGING))
     held = np.broadcast_to(wheels[:, None], (30, ARENAS, ROBOTS, 2))
-    _check_lag(drive_all(engine, alone(), held, side=4.0, model=changed), robot)
+    _check_lag(drive_all(slow, alone(), held, side=4.0, model=changed), robot)
 
 
 @pytest.mark.parametrize("body", ["planar", "wheeled"])
@@ -425,6 +440,18 @@ def test_substeps_make_up_one_control_step() -> None:
     assert loaded.substeps == 2
     # 1e-9 s: the model keeps its step in float32.
     assert float(loaded.model.opt.timestep) == pytest.approx(0.016, abs=1e-9)
+
+
+def test_servos_are_felt_anew_in_every_physics_step() -> None:
+    """Three a control step: a force that outlasted its own would drive a robot beyond its speed."""
+    given = settings("jax", "planar")
+    engine = load_as(dataclasses.replace(given, sim=dataclasses.replace(given.sim, substeps=3)))
+    pose, wheels = _yaws(5, [(-1.0, 0.0), (0.0, 0.0), (1.0, 0.0)]), _random_wheels(7, 20, 1)
+    found, robot = drive_all(engine, pose, wheels, side=4.0), engine.loaded.robot
+    built = compile_in_c(robot, AWAY, 3)
+    for arena in range(ARENAS):
+        one = drive_in_c(robot, pose[arena], wheels[:, arena], side=4.0, built=built)
+        _check_close(Path(*(part[:, [arena]] for part in found)), one)
 
 
 def test_encoders_count_whole_steps_of_the_wheels() -> None:
