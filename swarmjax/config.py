@@ -578,6 +578,9 @@ class SimConfig(Section):
     impl: Literal["auto", "jax", "warp"] = field(
         default="auto", metadata=about("MJX implementation; auto: warp on an NVIDIA GPU")
     )
+    solver: Literal["auto", "newton", "swarm"] = field(
+        default="auto", metadata=about("of contacts; swarm: made for robots, on warp alone; auto")
+    )
     max_robots: int = field(default=5, metadata=about("robots compiled in", 1, 100))
     max_obstacles: int = field(default=4, metadata=about("obstacles compiled in", 0, 32))
     substeps: int | None = field(

@@ -6,6 +6,7 @@ carried instead, because rebuilding it at every control step costs a quarter of 
 """
 
 import contextlib
+import copy
 import functools
 import importlib.util
 import io
@@ -106,12 +107,35 @@ def resolve_impl(impl: str) -> str:
     return "warp" if installed and jax.default_backend() == "gpu" else "jax"
 
 
+def resolve_solver(solver: str, impl: str) -> str:
+    """Turns `auto` into `swarm` where that can be, `newton` elsewhere.
+
+    Args:
+      solver: `auto`, `newton` or `swarm`.
+      impl: `jax` or `warp`.
+
+    Returns:
+      `newton` or `swarm`.
+
+    Raises:
+      ConfigError: if `swarm` is asked for where it cannot be.
+    """
+    if solver == "swarm" and impl != "warp":
+        raise ConfigError(
+            f"sim.solver is swarm, but sim.impl is {impl}: give newton or auto, or sim.impl=warp."
+        )
+    if solver != "auto":
+        return solver
+    return "swarm" if impl == "warp" else "newton"
+
+
 def load(
     model: mujoco.MjModel,
     ids: sim_model.Ids,
     robot: RobotConfig,
     *,
     impl: str,
+    solver: str,
     arenas: int,
     substeps: int,
 ) -> Physics:
@@ -122,6 +146,7 @@ def load(
       ids: rows of the moving bodies.
       robot: the robot's numbers.
       impl: `jax` or `warp`.
+      solver: `newton` or `swarm`.
       arenas: how many arenas will be stepped together (Warp shares its contact memory).
       substeps: physics steps per control step.
 
@@ -132,9 +157,22 @@ def load(
     if impl == "warp":
         _quiet_warp()
         limits = _limits(model, len(ids.hull_body), arenas)
+    if solver == "swarm":
+        model = copy.copy(model)
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE  # as solver_wheeled reads it
     template = mjx.make_data(model, impl=impl, **limits)
     device_model = mjx.put_model(model, impl=impl)
+    if solver == "swarm":
+        device_model = _with_swarm_solver(device_model, robot.body)
     return Physics(device_model, model, template, ids, robot, substeps)
+
+
+def _with_swarm_solver(model: mjx.Model, body: str) -> mjx.Model:
+    """Lets a model be stepped by the solver that is made for its robots."""
+    from swarmjax.sim import solver  # needs Warp
+
+    solver.install()
+    return model.tree_replace({"opt.solver": solver.NUMBERS[body]})
 
 
 def _limits(model: mujoco.MjModel, robots: int, arenas: int) -> dict[str, int]:

@@ -142,6 +142,7 @@ def load(config: TrainConfig) -> World:
         model.ids(compiled, size),
         config.robot,
         impl=impl,
+        solver=physics.resolve_solver(sim.solver, impl),
         arenas=config.arenas * (config.seeds if config.seeds_by == "vmap" else 1),
         substeps=count,
     )

@@ -1,0 +1,34 @@
+"""How MJX-Warp takes a physics step: by Newton's method, its own, or by one made for a body.
+
+MJX calls Warp's `step` by its name, and there it is replaced; a model says by its `opt.solver`
+which step is meant, and one that names none of ours is stepped as ever. Needs Warp.
+"""
+
+from typing import Any
+
+import mujoco.mjx.third_party.mujoco_warp as mjw
+from mujoco.mjx.warp import forward
+
+from swarmjax.sim import solver_planar, solver_wheeled
+
+NUMBERS = {"planar": solver_planar.NUMBER, "wheeled": solver_wheeled.NUMBER}  # by body
+_STEPS = {
+    solver_planar.NUMBER: solver_planar.step,
+    solver_wheeled.NUMBER: solver_wheeled.step,
+}
+_newton = mjw.step
+
+
+def install() -> None:
+    """Lets MJX step models as their `opt.solver` says; does nothing the second time."""
+    forward.mjwarp.step = step
+
+
+def step(m: Any, d: Any) -> None:
+    """Moves all arenas on by one physics step.
+
+    Args:
+      m: Warp's model.
+      d: Warp's data of all arenas, written to.
+    """
+    _STEPS.get(m.opt.solver, _newton)(m, d)
