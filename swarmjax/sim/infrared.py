@@ -5,11 +5,13 @@ misses, and 0 where it starts inside: a sensor sits 3.5 to 6 mm behind the hull'
 robot that is pressed against something has its sensor inside that thing. NumPy or JAX.
 """
 
+import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from swarmjax import epuck
+from swarmjax.sim.pieces import nearest, pieces
 
 Array = Any
 SENSOR_POSES = np.array(epuck.SENSOR_POSES, np.float32)
@@ -79,11 +81,15 @@ def ray_walls(origin: Array, direction: Array, half: Array, xp: Any) -> Array:
     Returns:
       [...] m; 0 outside the arena.
     """
-    spare = half[..., None] - xp.abs(origin)
-    room = half[..., None] - xp.where(direction < 0.0, -origin, origin)
-    pace = xp.maximum(xp.abs(direction), 1e-9)  # a ray along a wall never meets it
-    reach = xp.min(room / pace, axis=-1)
-    return xp.where(xp.min(spare, axis=-1) <= 0.0, 0.0, reach)
+    (x, y), (toward_x, toward_y) = xy(origin), xy(direction)
+    reach = xp.minimum(_to_wall(x, toward_x, half, xp), _to_wall(y, toward_y, half, xp))
+    return xp.where(xp.maximum(xp.abs(x), xp.abs(y)) >= half, 0.0, reach)
+
+
+def _to_wall(at: Array, toward: Array, half: Array, xp: Any) -> Array:
+    """Distance [...] along a ray to the wall that it looks at, of the two across one axis."""
+    pace = xp.maximum(xp.abs(toward), 1e-9)  # a ray along a wall never meets it
+    return (half - xp.where(toward < 0.0, -at, at)) / pace
 
 
 def ray_disc(origin: Array, direction: Array, centre: Array, radius: float, xp: Any) -> Array:
@@ -99,9 +105,10 @@ def ray_disc(origin: Array, direction: Array, centre: Array, radius: float, xp: 
     Returns:
       [...] m.
     """
-    offset = centre - origin
-    along = xp.sum(offset * direction, axis=-1)
-    power = xp.sum(offset * offset, axis=-1) - radius * radius
+    (toward_x, toward_y), (x, y) = xy(direction), xy(origin)
+    x, y = centre[..., 0] - x, centre[..., 1] - y
+    along = x * toward_x + y * toward_y
+    power = x * x + y * y - radius * radius
     discriminant = along * along - power
     meets = (discriminant >= 0.0) & (along > 0.0)
     reach = xp.where(meets, along - xp.sqrt(xp.maximum(discriminant, 0.0)), xp.inf)
@@ -114,29 +121,53 @@ def ray_box(origin: Array, direction: Array, box: Array, xp: Any) -> Array:
     Args:
       origin: [..., 2] m.
       direction: [..., 2] unit.
-      box: [..., 5] x (m), y (m), yaw (rad), half edges (m).
+      box: [..., 6] as `turned` has it.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
       [...] m.
     """
-    local = to_box_frame(origin - box[..., :2], box[..., 2], xp)
-    toward = to_box_frame(direction, box[..., 2], xp)
-    # A ray along a face gets a tiny slope, which decides between meeting the slab and missing it.
-    toward = xp.where(xp.abs(toward) < 1e-9, 1e-9, toward)
-    first = (-box[..., 3:] - local) / toward
-    second = (box[..., 3:] - local) / toward
-    enter = xp.max(xp.minimum(first, second), axis=-1)
-    leave = xp.min(xp.maximum(first, second), axis=-1)
+    (x, y), (toward_x, toward_y) = xy(origin), xy(direction)
+    x, y = to_box_frame(x - box[..., 0], y - box[..., 1], box)
+    toward_x, toward_y = to_box_frame(toward_x, toward_y, box)
+    enter_x, leave_x = _cross(x, toward_x, box[..., 4], xp)
+    enter_y, leave_y = _cross(y, toward_y, box[..., 5], xp)
+    enter, leave = xp.maximum(enter_x, enter_y), xp.minimum(leave_x, leave_y)
     meets = (enter <= leave) & (leave >= 0.0)
     return xp.where(meets, xp.maximum(enter, 0.0), xp.inf)
 
 
-def to_box_frame(vector: Array, yaw: Array, xp: Any) -> Array:
-    """Turns vectors [..., 2] from the world's frame into one that is turned by `yaw` [...]."""
-    cos, sin = xp.cos(yaw), xp.sin(yaw)
-    x, y = vector[..., 0], vector[..., 1]
-    return xp.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
+def _cross(at: Array, toward: Array, half: Array, xp: Any) -> tuple[Array, Array]:
+    """Where [...] a ray enters and leaves the slab between two faces of a rectangle."""
+    # A ray along a face gets a tiny slope, which decides between meeting the slab and missing it.
+    pace = 1.0 / xp.where(xp.abs(toward) < 1e-9, 1e-9, toward)
+    first, second = (-half - at) * pace, (half - at) * pace
+    return xp.minimum(first, second), xp.maximum(first, second)
+
+
+def xy(vector: Array) -> tuple[Array, Array]:
+    """Takes the coordinates [...] of vectors [..., 2] apart."""
+    return vector[..., 0], vector[..., 1]
+
+
+def turned(box: Array, xp: Any) -> Array:
+    """Works out which way rectangles are turned, once for all that look at them.
+
+    Args:
+      box: [..., 5] x (m), y (m), yaw (rad), half edges (m).
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [..., 6] x (m), y (m), cosine and sine of the yaw, half edges (m).
+    """
+    yaw = box[..., 2:3]
+    return xp.concatenate([box[..., :2], xp.cos(yaw), xp.sin(yaw), box[..., 3:]], axis=-1)
+
+
+def to_box_frame(x: Array, y: Array, box: Array) -> tuple[Array, Array]:
+    """Turns vectors [...] from the world's frame into that of rectangles [..., 6], as `turned`."""
+    cos, sin = box[..., 2], box[..., 3]
+    return cos * x + sin * y, cos * y - sin * x
 
 
 def distances(
@@ -163,10 +194,8 @@ def distances(
     Returns:
       [..., R, K] distance from the sensor's origin to the nearest surface, m, 0..limit.
     """
-    nearest = limit
-    for reach in _reaches(pose, side, obstacle, hull_radius, mount, xp):
-        nearest = xp.minimum(nearest, xp.min(reach, axis=-1, initial=limit))
-    return xp.maximum(nearest, 0.0)
+    reaches = itertools.chain(*_reaches(pose, side, obstacle, hull_radius, mount, xp))
+    return xp.maximum(nearest(reaches, limit, xp), 0.0)
 
 
 def sights(
@@ -199,31 +228,41 @@ def sights(
     wall, robot, box = _reaches(pose, side, obstacle, hull_radius, mount, xp)
     walls = None if reflectance.wall is None else reflectance.wall[..., None]
     things = ((wall, walls), (robot, reflectance.robot), (box, reflectance.obstacle))
-    nearest, bright = xp.inf, 1.0
-    for reach, shade in things:
-        here = xp.min(reach, axis=-1, initial=xp.inf)
-        bright = xp.where(here < nearest, _brightest(reach, here, shade, xp), bright)
-        nearest = xp.minimum(nearest, here)
-    return xp.clip(nearest, 0.0, limit), xp.where(nearest < limit, bright, 1.0)
+    least, bright = xp.inf, 1.0
+    for reaches, shade in things:
+        here = nearest(reaches, xp.inf, xp)
+        bright = xp.where(here < least, _brightest(reaches, here, shade, xp), bright)
+        least = xp.minimum(least, here)
+    return xp.clip(least, 0.0, limit), xp.where(least < limit, bright, 1.0)
 
 
-def _brightest(reach: Array, here: Array, shade: Array | None, xp: Any) -> Array | float:
+def _brightest(reaches: list[Array], here: Array, shade: Array | None, xp: Any) -> Array | float:
     """Reflectance [..., R, K] of the things of one kind, [..., N], that rays meet at `here`."""
     if shade is None:
         return 1.0
-    meets = reach <= here[..., None]
-    return xp.max(xp.where(meets, shade[..., None, None, :], 0.0), axis=-1, initial=0.0)
+    found = 0.0
+    for reach, piece in zip(reaches, pieces(shade.shape[-1], xp), strict=True):
+        meets = reach <= here[..., None]
+        shades = xp.where(meets, shade[..., None, None, piece], 0.0)
+        found = xp.maximum(found, xp.max(shades, axis=-1, initial=0.0))
+    return found
 
 
 def _reaches(
     pose: Array, side: Array, obstacle: Array, hull_radius: float, mount: Mount | None, xp: Any
-) -> tuple[Array, Array, Array]:
-    """Distances [..., R, K, N] (m) to the walls (N = 1), the other robots and the obstacles."""
+) -> tuple[list[Array], list[Array], list[Array]]:
+    """Distances (m) to the walls, the other robots and the obstacles, [..., R, K, 1] a piece."""
     origin, direction = rays(pose, xp, mount)
-    half = 0.5 * side[..., None, None] * xp.ones_like(origin[..., 0])
-    wall = ray_walls(origin, direction, half, xp)[..., None]
+    wall = ray_walls(origin, direction, 0.5 * side[..., None, None], xp)[..., None]
     start, toward = origin[..., None, :], direction[..., None, :]
-    others = ray_disc(start, toward, pose[..., None, None, :, :2], hull_radius, xp)
     myself = np.eye(pose.shape[-2], dtype=bool)[:, None, :]
-    others = xp.where(myself, xp.inf, others)
-    return wall, others, ray_box(start, toward, obstacle[..., None, None, :, :], xp)
+    centre = pose[..., None, None, :, :2]
+    box = turned(obstacle, xp)[..., None, None, :, :]
+    others = [
+        xp.where(
+            myself[..., i], xp.inf, ray_disc(start, toward, centre[..., i, :], hull_radius, xp)
+        )
+        for i in pieces(pose.shape[-2], xp)
+    ]
+    boxes = [ray_box(start, toward, box[..., i, :], xp) for i in pieces(obstacle.shape[-2], xp)]
+    return [wall], others, boxes

@@ -97,7 +97,7 @@ def test_ray_box(
     xp: ModuleType, origin: tuple, direction: tuple, box: tuple, expected: float
 ) -> None:
     start, toward = xp.array(_f32(*origin)), xp.array(_f32(*direction))
-    found = infrared.ray_box(start, toward, xp.array(_f32(*box)), xp)
+    found = infrared.ray_box(start, toward, infrared.turned(xp.array(_f32(*box)), xp), xp)
     assert float(found) == pytest.approx(expected, abs=ROUNDING)
 
 
@@ -232,7 +232,7 @@ def test_of_two_things_that_hold_a_sensor_the_wall_counts_then_the_brightest(
     # Sensors 0 and 7 are inside both boxes; 2 mm further on, inside the wall as well.
     box = xp.array(_f32([0.47, 0.0, 0.0, 0.03, 0.03], [0.48, 0.0, 0.0, 0.03, 0.03]))
     for x, shade in ((0.45, 0.7), (0.472, 0.9)):
-        pose = xp.array(_f32([x, 0.0, 0.0]))
+        pose = xp.array(_f32([x, 0.0, 0.0], [5.0, 0.0, 0.0], [5.5, 0.0, 0.0]))
         distance, bright = infrared.sights(
             pose, _f32(1.0)[0], box, RADIUS, RANGE, _reflectance(xp, **SHADES), None, xp
         )
@@ -516,7 +516,7 @@ def test_rays_that_graze_and_rays_that_start_at_a_surface(xp: ModuleType, shape:
     elif shape == "disc":
         found = infrared.ray_disc(origin, direction, xp.array(DISC[:2], kind), DISC[2], xp)
     else:
-        found = infrared.ray_box(origin, direction, xp.array(BOX, kind), xp)
+        found = infrared.ray_box(origin, direction, infrared.turned(xp.array(BOX, kind), xp), xp)
     assert (truth[0, GRAZES:] == 0.0).sum() > 1000
     if shape != "wall":  # a wall has no end that a ray could pass
         assert (grazing[0] == RANGE).sum() > 1000
