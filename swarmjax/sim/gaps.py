@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax.sim.infrared import to_box_frame, turned
-from swarmjax.sim.pieces import nearest, pieces
+from swarmjax.sim.infrared import Box, to_box_frame, turned
+from swarmjax.sim.pieces import least, pieces
 
 Array = Any
 KINDS = ("robot", "obstacle", "wall")  # the last axis of gaps and contacts
@@ -28,10 +28,10 @@ def gaps(pose: Array, side: Array, obstacle: Array, hull_radius: float, xp: Any)
     x, y = pose[:, :1], pose[:, 1:2]
     others = (_robot_distance(x, y, i, xp) for i in pieces(len(pose), xp))
     box = turned(obstacle, xp)
-    boxes = (_box_distance(x, y, box[None, i], xp) for i in pieces(len(obstacle), xp))
+    boxes = (_box_distance(x, y, box.at((None, i)), xp) for i in pieces(len(obstacle), xp))
     found = (
-        nearest(others, xp.inf, xp) - 2.0 * hull_radius,
-        nearest(boxes, xp.inf, xp) - hull_radius,
+        least(others, xp.inf, xp) - 2.0 * hull_radius,
+        least(boxes, xp.inf, xp) - hull_radius,
         0.5 * side - xp.maximum(xp.abs(x), xp.abs(y))[:, 0] - hull_radius,
     )
     return xp.stack(found, axis=-1)
@@ -44,10 +44,10 @@ def _robot_distance(x: Array, y: Array, piece: slice, xp: Any) -> Array:
     return xp.where(itself, xp.inf, xp.sqrt(across * across + along * along))
 
 
-def _box_distance(x: Array, y: Array, box: Array, xp: Any) -> Array:
-    """Signed distance [...] from points to turned rectangles [..., 6], m."""
-    x, y = to_box_frame(x - box[..., 0], y - box[..., 1], box)
-    x, y = xp.abs(x) - box[..., 4], xp.abs(y) - box[..., 5]
+def _box_distance(x: Array, y: Array, box: Box, xp: Any) -> Array:
+    """Signed distance [...] from points to turned rectangles, m."""
+    x, y = to_box_frame(x - box.x, y - box.y, box)
+    x, y = xp.abs(x) - box.half_x, xp.abs(y) - box.half_y
     outside = xp.sqrt(xp.maximum(x, 0.0) ** 2 + xp.maximum(y, 0.0) ** 2)
     return outside + xp.minimum(xp.maximum(x, y), 0.0)
 

@@ -247,40 +247,41 @@ def _fixtures(physics: Physics, side: Array, obstacle: Array) -> tuple[Fields, F
     """
     model, made = physics.model, physics.template
     first = int(physics.ids.fixture_geom[0])
-    put = functools.partial(_with_rows, first=first, xp=jnp)
+    put = functools.partial(_with_rows, first=first)
     place, turn = sim_model.fixture_poses(side, obstacle, jnp)
     middle = place + np.array([0.0, 0.0, sim_model.HALF_HEIGHT], np.float32)
     half = jnp.pad(obstacle[:, 3:], ((0, 0), (0, 1)), constant_values=sim_model.HALF_HEIGHT)
     sizes = {"geom_size": put(model.geom_size, half)}
     if model.impl.value == "warp":
-        walled = _with_rows(made.geom_xmat, _wall_matrices(), first + len(obstacle), np)
-        matrix = put(walled, _matrices(obstacle[:, 2:3], jnp))
+        walled = _with_rows(made.geom_xmat, _wall_matrices(), first + len(obstacle))
+        matrix = put(walled, _matrices(obstacle[:, 2], jnp))
         return sizes, {"geom_xpos": put(made.geom_xpos, middle), "geom_xmat": matrix}
     poses = {"geom_pos": put(model.geom_pos, middle), "geom_quat": put(model.geom_quat, turn)}
     return sizes | poses, {}
 
 
-def _with_rows(array: Array, rows: Any, first: int, xp: Any) -> Any:
-    """Replaces the rows from `first` on of a constant array.
+def _with_rows(array: Array, rows: Any, first: int) -> Array:
+    """Replaces the rows from `first` on.
 
-    As a sum: `.at` under `vmap` is a scatter, and of a concatenation every part is a branch, all of
-    which a GPU takes.
+    By a choice: `.at` under `vmap` is a scatter, and of a concatenation every part is a branch, all
+    of which a GPU takes.
     """
-    kept = np.array(array)
-    kept[first : first + len(rows)] = 0.0
-    around = [(first, len(kept) - first - len(rows)), *[(0, 0)] * (kept.ndim - 1)]
-    return kept + xp.pad(rows, around)
+    count, end = len(array), first + len(rows)
+    row = np.arange(count).reshape(-1, *[1] * (array.ndim - 1))
+    padded = jnp.pad(rows, [(first, count - end), *[(0, 0)] * (array.ndim - 1)])
+    return jnp.where((row >= first) & (row < end), padded, array)
 
 
 def _wall_matrices() -> np.ndarray:
     """Rotation matrices [4, 3, 3] of the walls."""
     turn = sim_model.fixture_poses(np.float32(0.0), np.zeros((0, 5), np.float32), np)[1]
-    return _matrices(2.0 * np.arctan2(turn[:, 3:], turn[:, :1]), np)
+    return _matrices(2.0 * np.arctan2(turn[:, 3], turn[:, 0]), np)
 
 
 def _matrices(yaw: Any, xp: Any) -> Any:
-    """Rotation matrices [F, 3, 3] about the z axis by angles [F, 1], rad; no concatenation."""
-    return xp.cos(yaw)[..., None] * _COSINES + xp.sin(yaw)[..., None] * _SINES + _ONES
+    """Rotation matrices [F, 3, 3] about the z axis by angles [F], rad; no concatenation."""
+    cos, sin = (angle[:, None, None] for angle in (xp.cos(yaw), xp.sin(yaw)))
+    return cos * _COSINES + sin * _SINES + _ONES
 
 
 def _change(physics: Physics, fields: Fields, chassis: Chassis) -> mjx.Model:

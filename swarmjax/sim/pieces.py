@@ -29,18 +29,18 @@ def pieces(count: int, xp: Any) -> list[slice]:
     return [slice(i, i + 1) for i in range(count)]
 
 
-def nearest(reaches: Iterable[Array], limit: float, xp: Any) -> Array:
-    """Least of the distances to things.
+def least(values: Iterable[Array], limit: float, xp: Any) -> Array:
+    """Least of what there is of all things.
 
     Args:
-      reaches: [..., N] m, one array a piece.
-      limit: where there is nothing nearer, m.
+      values: [..., N] of things, one array a piece.
+      limit: where there is nothing less.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [...] m, at most `limit`.
+      [...] at most `limit`.
     """
     found = limit
-    for reach in reaches:
-        found = xp.minimum(found, xp.min(reach, axis=-1, initial=limit))
+    for value in values:
+        found = xp.minimum(found, xp.min(value, axis=-1, initial=limit))
     return found

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from swarmjax.config import RewardConfig
-from swarmjax.sim.pieces import nearest, pieces
+from swarmjax.sim.pieces import least, pieces
 
 
 class Step(NamedTuple):
@@ -43,8 +43,8 @@ def progress(step: Step) -> Array:
 def proximity(step: Step) -> Array:
     """1 where any ray is shorter than the sensor's range, once a step (equation 3)."""
     rays = step.infrared.shape[-1]
-    least = nearest((step.infrared[..., i] for i in pieces(rays, jnp)), step.sensor_range, jnp)
-    return (least < step.sensor_range).astype(jnp.float32)
+    nearest = least((step.infrared[..., i] for i in pieces(rays, jnp)), step.sensor_range, jnp)
+    return (nearest < step.sensor_range).astype(jnp.float32)
 
 
 def arrival(step: Step) -> Array:
