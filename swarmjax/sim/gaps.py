@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax.sim.infrared import to_box_frame
+from swarmjax.sim.infrared import Box, to_box_frame, turned
+from swarmjax.sim.pieces import least, pieces
 
 Array = Any
 KINDS = ("robot", "obstacle", "wall")  # the last axis of gaps and contacts
@@ -24,21 +25,31 @@ def gaps(pose: Array, side: Array, obstacle: Array, hull_radius: float, xp: Any)
     Returns:
       [R, 3] m, in the order of `KINDS`; `inf` where there is nothing of the kind.
     """
-    place = pose[:, :2]
-    apart = xp.sqrt(xp.sum((place[:, None] - place[None, :]) ** 2, axis=-1)) - 2.0 * hull_radius
-    apart = xp.where(np.eye(place.shape[0], dtype=bool), xp.inf, apart)
-    robot = xp.min(apart, axis=-1, initial=xp.inf)
-    box = xp.min(_box_distance(place[:, None], obstacle[None], xp), axis=-1, initial=xp.inf)
-    wall = 0.5 * side - xp.max(xp.abs(place), axis=-1)
-    return xp.stack([robot, box - hull_radius, wall - hull_radius], axis=-1)
+    x, y = pose[:, :1], pose[:, 1:2]
+    others = (_robot_distance(x, y, i, xp) for i in pieces(len(pose), xp))
+    box = turned(obstacle, xp)
+    boxes = (_box_distance(x, y, box.at((None, i)), xp) for i in pieces(len(obstacle), xp))
+    found = (
+        least(others, xp.inf, xp) - 2.0 * hull_radius,
+        least(boxes, xp.inf, xp) - hull_radius,
+        0.5 * side - xp.maximum(xp.abs(x), xp.abs(y))[:, 0] - hull_radius,
+    )
+    return xp.stack(found, axis=-1)
 
 
-def _box_distance(place: Array, box: Array, xp: Any) -> Array:
-    """Signed distance [...] from points [..., 2] to turned rectangles [..., 5], m."""
-    local = to_box_frame(place - box[..., :2], box[..., 2], xp)
-    beyond = xp.abs(local) - box[..., 3:]
-    outside = xp.sqrt(xp.sum(xp.maximum(beyond, 0.0) ** 2, axis=-1))
-    return outside + xp.minimum(xp.max(beyond, axis=-1), 0.0)
+def _robot_distance(x: Array, y: Array, piece: slice, xp: Any) -> Array:
+    """Distance [R, N] from the centres of robots, [R, 1] each, to a piece of the others, m."""
+    across, along = x - x[piece, 0], y - y[piece, 0]
+    itself = np.eye(len(x), dtype=bool)[:, piece]
+    return xp.where(itself, xp.inf, xp.sqrt(across * across + along * along))
+
+
+def _box_distance(x: Array, y: Array, box: Box, xp: Any) -> Array:
+    """Signed distance [...] from points to turned rectangles, m."""
+    x, y = to_box_frame(x - box.x, y - box.y, box)
+    x, y = xp.abs(x) - box.half_x, xp.abs(y) - box.half_y
+    outside = xp.sqrt(xp.maximum(x, 0.0) ** 2 + xp.maximum(y, 0.0) ** 2)
+    return outside + xp.minimum(xp.maximum(x, y), 0.0)
 
 
 def count_contacts(gap: Array, apart: Array, control_step: float, xp: Any) -> tuple[Array, Array]:

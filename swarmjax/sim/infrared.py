@@ -5,11 +5,13 @@ misses, and 0 where it starts inside: a sensor sits 3.5 to 6 mm behind the hull'
 robot that is pressed against something has its sensor inside that thing. NumPy or JAX.
 """
 
+import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from swarmjax import epuck
+from swarmjax.sim.pieces import least, pieces
 
 Array = Any
 SENSOR_POSES = np.array(epuck.SENSOR_POSES, np.float32)
@@ -41,6 +43,46 @@ class Reflectance(NamedTuple):
     robot: Array | None = None
 
 
+class Ray(NamedTuple):
+    """Rays in the world frame. Their coordinates are kept apart, so that XLA has none to gather.
+
+    Attributes:
+      x: [...] of the origin, m.
+      y: [...] of the origin, m.
+      toward_x: [...] of the unit direction.
+      toward_y: [...] of the unit direction.
+    """
+
+    x: Array
+    y: Array
+    toward_x: Array
+    toward_y: Array
+
+
+class Box(NamedTuple):
+    """Turned rectangles, their turn worked out once for all that look at them.
+
+    Attributes:
+      x: [...] of the centre, m.
+      y: [...] of the centre, m.
+      cos: [...] of the yaw.
+      sin: [...] of the yaw.
+      half_x: [...] half edge, m.
+      half_y: [...] half edge, m.
+    """
+
+    x: Array
+    y: Array
+    cos: Array
+    sin: Array
+    half_x: Array
+    half_y: Array
+
+    def at(self, index: Any) -> "Box":
+        """Indexes each of the arrays."""
+        return Box(*(part[index] for part in self))
+
+
 def rays(pose: Array, xp: Any, mount: Mount | None = None) -> tuple[Array, Array]:
     """Places the rays of robots in the world.
 
@@ -52,7 +94,13 @@ def rays(pose: Array, xp: Any, mount: Mount | None = None) -> tuple[Array, Array
     Returns:
       Origins and unit directions, [..., K, 2] each, world frame.
     """
-    cos, sin = xp.cos(pose[..., 2:]), xp.sin(pose[..., 2:])
+    x, y, toward_x, toward_y = _cast(pose, xp, mount)
+    return xp.stack([x, y], axis=-1), xp.stack([toward_x, toward_y], axis=-1)
+
+
+def _cast(pose: Array, xp: Any, mount: Mount | None) -> Ray:
+    """Places the rays [..., K] of robots [..., 3] in the world."""
+    cos, sin = xp.cos(pose[..., 2])[..., None], xp.sin(pose[..., 2])[..., None]
     x, y, bearing = SENSOR_POSES.T
     # The angle-sum identities save a sine and a cosine for every ray that sits where it should.
     ahead, aside = np.cos(bearing), np.sin(bearing)
@@ -60,83 +108,96 @@ def rays(pose: Array, xp: Any, mount: Mount | None = None) -> tuple[Array, Array
         ahead, aside = xp.cos(bearing + mount.yaw), xp.sin(bearing + mount.yaw)
     if mount is not None and mount.position is not None:
         x, y = x + mount.position[..., 0], y + mount.position[..., 1]
-    origin_x = pose[..., :1] + cos * x - sin * y
-    origin_y = pose[..., 1:2] + sin * x + cos * y
-    toward_x = cos * ahead - sin * aside
-    toward_y = sin * ahead + cos * aside
-    return xp.stack([origin_x, origin_y], axis=-1), xp.stack([toward_x, toward_y], axis=-1)
+    return Ray(
+        x=pose[..., :1] + cos * x - sin * y,
+        y=pose[..., 1:2] + sin * x + cos * y,
+        toward_x=cos * ahead - sin * aside,
+        toward_y=sin * ahead + cos * aside,
+    )
 
 
-def ray_walls(origin: Array, direction: Array, half: Array, xp: Any) -> Array:
+def ray_walls(ray: Ray, half: Array, xp: Any) -> Array:
     """Distance to the walls of a square arena centred on the origin.
 
     Args:
-      origin: [..., 2] m.
-      direction: [..., 2] unit.
+      ray: [...].
       half: [...] half of the arena's side, m.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
       [...] m; 0 outside the arena.
     """
-    spare = half[..., None] - xp.abs(origin)
-    room = half[..., None] - xp.where(direction < 0.0, -origin, origin)
-    pace = xp.maximum(xp.abs(direction), 1e-9)  # a ray along a wall never meets it
-    reach = xp.min(room / pace, axis=-1)
-    return xp.where(xp.min(spare, axis=-1) <= 0.0, 0.0, reach)
+    to_x = _to_wall(ray.x, ray.toward_x, half, xp)
+    to_y = _to_wall(ray.y, ray.toward_y, half, xp)
+    outside = xp.maximum(xp.abs(ray.x), xp.abs(ray.y)) >= half
+    return xp.where(outside, 0.0, xp.minimum(to_x, to_y))
 
 
-def ray_disc(origin: Array, direction: Array, centre: Array, radius: float, xp: Any) -> Array:
+def _to_wall(at: Array, toward: Array, half: Array, xp: Any) -> Array:
+    """Distance [...] along a ray to the wall that it looks at, of the two across one axis."""
+    pace = xp.maximum(xp.abs(toward), 1e-9)  # a ray along a wall never meets it
+    return (half - xp.where(toward < 0.0, -at, at)) / pace
+
+
+def ray_disc(ray: Ray, x: Array, y: Array, radius: float, xp: Any) -> Array:
     """Distance to a disc.
 
     Args:
-      origin: [..., 2] m.
-      direction: [..., 2] unit.
-      centre: [..., 2] m.
+      ray: [...].
+      x: [...] of the centre, m.
+      y: [...] of the centre, m.
       radius: m.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
       [...] m.
     """
-    offset = centre - origin
-    along = xp.sum(offset * direction, axis=-1)
-    power = xp.sum(offset * offset, axis=-1) - radius * radius
+    x, y = x - ray.x, y - ray.y
+    along = x * ray.toward_x + y * ray.toward_y
+    power = x * x + y * y - radius * radius
     discriminant = along * along - power
     meets = (discriminant >= 0.0) & (along > 0.0)
     reach = xp.where(meets, along - xp.sqrt(xp.maximum(discriminant, 0.0)), xp.inf)
     return xp.where(power <= 0.0, 0.0, reach)
 
 
-def ray_box(origin: Array, direction: Array, box: Array, xp: Any) -> Array:
+def ray_box(ray: Ray, box: Box, xp: Any) -> Array:
     """Distance to a turned rectangle, by the slab method in the rectangle's own frame.
 
     Args:
-      origin: [..., 2] m.
-      direction: [..., 2] unit.
-      box: [..., 5] x (m), y (m), yaw (rad), half edges (m).
+      ray: [...].
+      box: [...].
       xp: `numpy` or `jax.numpy`.
 
     Returns:
       [...] m.
     """
-    local = to_box_frame(origin - box[..., :2], box[..., 2], xp)
-    toward = to_box_frame(direction, box[..., 2], xp)
-    # A ray along a face gets a tiny slope, which decides between meeting the slab and missing it.
-    toward = xp.where(xp.abs(toward) < 1e-9, 1e-9, toward)
-    first = (-box[..., 3:] - local) / toward
-    second = (box[..., 3:] - local) / toward
-    enter = xp.max(xp.minimum(first, second), axis=-1)
-    leave = xp.min(xp.maximum(first, second), axis=-1)
+    x, y = to_box_frame(ray.x - box.x, ray.y - box.y, box)
+    toward_x, toward_y = to_box_frame(ray.toward_x, ray.toward_y, box)
+    enter_x, leave_x = _cross(x, toward_x, box.half_x, xp)
+    enter_y, leave_y = _cross(y, toward_y, box.half_y, xp)
+    enter, leave = xp.maximum(enter_x, enter_y), xp.minimum(leave_x, leave_y)
     meets = (enter <= leave) & (leave >= 0.0)
     return xp.where(meets, xp.maximum(enter, 0.0), xp.inf)
 
 
-def to_box_frame(vector: Array, yaw: Array, xp: Any) -> Array:
-    """Turns vectors [..., 2] from the world's frame into one that is turned by `yaw` [...]."""
-    cos, sin = xp.cos(yaw), xp.sin(yaw)
-    x, y = vector[..., 0], vector[..., 1]
-    return xp.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
+def _cross(at: Array, toward: Array, half: Array, xp: Any) -> tuple[Array, Array]:
+    """Where [...] a ray enters and leaves the slab between two faces of a rectangle."""
+    # A ray along a face gets a tiny slope, which decides between meeting the slab and missing it.
+    pace = 1.0 / xp.where(xp.abs(toward) < 1e-9, 1e-9, toward)
+    first, second = (-half - at) * pace, (half - at) * pace
+    return xp.minimum(first, second), xp.maximum(first, second)
+
+
+def turned(box: Array, xp: Any) -> Box:
+    """Takes rectangles [..., 5], x (m), y (m), yaw (rad), half edges (m), apart."""
+    x, y, yaw, half_x, half_y = (box[..., i] for i in range(5))
+    return Box(x, y, xp.cos(yaw), xp.sin(yaw), half_x, half_y)
+
+
+def to_box_frame(x: Array, y: Array, box: Box) -> tuple[Array, Array]:
+    """Turns vectors (x, y) from the world's frame into that of rectangles, [...] each."""
+    return box.cos * x + box.sin * y, box.cos * y - box.sin * x
 
 
 def distances(
@@ -163,10 +224,8 @@ def distances(
     Returns:
       [..., R, K] distance from the sensor's origin to the nearest surface, m, 0..limit.
     """
-    nearest = limit
-    for reach in _reaches(pose, side, obstacle, hull_radius, mount, xp):
-        nearest = xp.minimum(nearest, xp.min(reach, axis=-1, initial=limit))
-    return xp.maximum(nearest, 0.0)
+    reaches = itertools.chain(*_reaches(pose, side, obstacle, hull_radius, mount, xp))
+    return xp.maximum(least(reaches, limit, xp), 0.0)
 
 
 def sights(
@@ -200,30 +259,38 @@ def sights(
     walls = None if reflectance.wall is None else reflectance.wall[..., None]
     things = ((wall, walls), (robot, reflectance.robot), (box, reflectance.obstacle))
     nearest, bright = xp.inf, 1.0
-    for reach, shade in things:
-        here = xp.min(reach, axis=-1, initial=xp.inf)
-        bright = xp.where(here < nearest, _brightest(reach, here, shade, xp), bright)
+    for reaches, shade in things:
+        here = least(reaches, xp.inf, xp)
+        bright = xp.where(here < nearest, _brightest(reaches, here, shade, xp), bright)
         nearest = xp.minimum(nearest, here)
     return xp.clip(nearest, 0.0, limit), xp.where(nearest < limit, bright, 1.0)
 
 
-def _brightest(reach: Array, here: Array, shade: Array | None, xp: Any) -> Array | float:
+def _brightest(reaches: list[Array], here: Array, shade: Array | None, xp: Any) -> Array | float:
     """Reflectance [..., R, K] of the things of one kind, [..., N], that rays meet at `here`."""
     if shade is None:
         return 1.0
-    meets = reach <= here[..., None]
-    return xp.max(xp.where(meets, shade[..., None, None, :], 0.0), axis=-1, initial=0.0)
+    found = 0.0
+    for reach, piece in zip(reaches, pieces(shade.shape[-1], xp), strict=True):
+        meets = reach <= here[..., None]
+        shades = xp.where(meets, shade[..., None, None, piece], 0.0)
+        found = xp.maximum(found, xp.max(shades, axis=-1, initial=0.0))
+    return found
 
 
 def _reaches(
     pose: Array, side: Array, obstacle: Array, hull_radius: float, mount: Mount | None, xp: Any
-) -> tuple[Array, Array, Array]:
-    """Distances [..., R, K, N] (m) to the walls (N = 1), the other robots and the obstacles."""
-    origin, direction = rays(pose, xp, mount)
-    half = 0.5 * side[..., None, None] * xp.ones_like(origin[..., 0])
-    wall = ray_walls(origin, direction, half, xp)[..., None]
-    start, toward = origin[..., None, :], direction[..., None, :]
-    others = ray_disc(start, toward, pose[..., None, None, :, :2], hull_radius, xp)
-    myself = np.eye(pose.shape[-2], dtype=bool)[:, None, :]
-    others = xp.where(myself, xp.inf, others)
-    return wall, others, ray_box(start, toward, obstacle[..., None, None, :, :], xp)
+) -> tuple[list[Array], list[Array], list[Array]]:
+    """Distances (m) to the walls, the other robots and the obstacles, [..., R, K, 1] a piece."""
+    ray = _cast(pose, xp, mount)
+    wall = ray_walls(ray, 0.5 * side[..., None, None], xp)[..., None]
+    ray = Ray(*(part[..., None] for part in ray))
+    box, myself = turned(obstacle, xp), np.eye(pose.shape[-2], dtype=bool)
+
+    def to_robots(i: slice) -> Array:
+        x, y = (pose[..., None, None, i, axis] for axis in range(2))
+        return xp.where(myself[:, None, i], xp.inf, ray_disc(ray, x, y, hull_radius, xp))
+
+    robots = [to_robots(i) for i in pieces(pose.shape[-2], xp)]
+    boxes = [ray_box(ray, box.at((..., None, None, i)), xp) for i in pieces(obstacle.shape[-2], xp)]
+    return [wall], robots, boxes

@@ -11,7 +11,7 @@ import functools
 import importlib.util
 import io
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -40,7 +40,10 @@ SOLVER_STEPS = {
 CONTACTS_PER_ROBOT = 3
 SOLVER_ROWS_PER_ROBOT = 6  # neighbours that a disc can touch at once
 FEW_ARENAS = 64  # in so few, all may be crowded at once: there is room for every pair
-
+# Where a rotation about the z axis has cosines, sines and ones.
+_COSINES = np.diag([1.0, 1.0, 0.0]).astype(np.float32)
+_SINES = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], np.float32)
+_ONES = np.diag([0.0, 0.0, 1.0]).astype(np.float32)
 
 Fields = dict[str, Array]
 
@@ -305,30 +308,42 @@ def _fixtures(physics: Physics, side: Array, obstacle: Array) -> tuple[Fields, F
       Fields of the model, and of the data.
     """
     model, made = physics.model, physics.template
-    put = functools.partial(_with_rows, first=int(physics.ids.fixture_geom[0]))
+    first = int(physics.ids.fixture_geom[0])
+    put = functools.partial(_with_rows, first=first)
     place, turn = sim_model.fixture_poses(side, obstacle, jnp)
     middle = place + np.array([0.0, 0.0, sim_model.HALF_HEIGHT], np.float32)
     half = jnp.pad(obstacle[:, 3:], ((0, 0), (0, 1)), constant_values=sim_model.HALF_HEIGHT)
     sizes = {"geom_size": put(model.geom_size, half)}
     if model.impl.value == "warp":
-        matrix = put(made.geom_xmat, _matrices(turn))
+        walled = _with_rows(made.geom_xmat, _wall_matrices(), first + len(obstacle))
+        matrix = put(walled, _matrices(obstacle[:, 2], jnp))
         return sizes, {"geom_xpos": put(made.geom_xpos, middle), "geom_xmat": matrix}
     poses = {"geom_pos": put(model.geom_pos, middle), "geom_quat": put(model.geom_quat, turn)}
     return sizes | poses, {}
 
 
-def _with_rows(array: Array, rows: Array, first: int) -> Array:
-    """Replaces the rows from `first` on: in one piece, where `.at` under `vmap` is a scatter."""
-    array = jnp.asarray(array)
-    return jnp.concatenate([array[:first], rows, array[first + len(rows) :]])
+def _with_rows(array: Array, rows: Any, first: int) -> Array:
+    """Replaces the rows from `first` on.
+
+    By a choice: `.at` under `vmap` is a scatter, and of a concatenation every part is a branch, all
+    of which a GPU takes.
+    """
+    count, end = len(array), first + len(rows)
+    row = np.arange(count).reshape(-1, *[1] * (array.ndim - 1))
+    padded = jnp.pad(rows, [(first, count - end), *[(0, 0)] * (array.ndim - 1)])
+    return jnp.where((row >= first) & (row < end), padded, array)
 
 
-def _matrices(turn: Array) -> Array:
-    """Rotation matrices [F, 3, 3] of unit quaternions [F, 4] about the z axis."""
-    w, z = turn[:, 0], turn[:, 3]
-    cos, sin, zero = w * w - z * z, 2.0 * w * z, 0.0 * w
-    rows = [cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1.0]
-    return jnp.stack(rows, axis=-1).reshape(-1, 3, 3)
+def _wall_matrices() -> np.ndarray:
+    """Rotation matrices [4, 3, 3] of the walls."""
+    turn = sim_model.fixture_poses(np.float32(0.0), np.zeros((0, 5), np.float32), np)[1]
+    return _matrices(2.0 * np.arctan2(turn[:, 3], turn[:, 0]), np)
+
+
+def _matrices(yaw: Any, xp: Any) -> Any:
+    """Rotation matrices [F, 3, 3] about the z axis by angles [F], rad; no concatenation."""
+    cos, sin = (angle[:, None, None] for angle in (xp.cos(yaw), xp.sin(yaw)))
+    return cos * _COSINES + sin * _SINES + _ONES
 
 
 def _change(physics: Physics, fields: Fields, chassis: Chassis) -> mjx.Model:

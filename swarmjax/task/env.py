@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import chex
+import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
@@ -287,6 +288,8 @@ def _look(world: World, pose: Array, level: Level, factors: Factors) -> Sight:
         ray, bright = infrared.distances(*arena, jnp, mount), None
     else:
         ray, bright = infrared.sights(*arena, shades, mount, jnp)
+    # Looked at by several: without the barrier XLA works rays out anew for each, on a GPU.
+    ray, bright = jax.lax.optimization_barrier((ray, bright))
     return Sight(ray, bright, distance, bearing)
 
 

@@ -66,12 +66,10 @@ def to_target(pose: Array, target: Array, xp: Any) -> tuple[Array, Array]:
     Returns:
       Distance [...] (m), and bearing [...] from the robot's x axis (rad, -pi..pi, left positive).
     """
-    offset = target - pose[..., :2]
-    distance = xp.sqrt(xp.sum(offset * offset, axis=-1))
+    x, y = target[..., 0] - pose[..., 0], target[..., 1] - pose[..., 1]
     cos, sin = xp.cos(pose[..., 2]), xp.sin(pose[..., 2])
-    ahead = cos * offset[..., 0] + sin * offset[..., 1]
-    left = cos * offset[..., 1] - sin * offset[..., 0]
-    return distance, xp.arctan2(left, ahead)
+    bearing = xp.arctan2(cos * y - sin * x, cos * x + sin * y)
+    return xp.sqrt(x * x + y * y), bearing
 
 
 def observe(infrared: Array, distance: Array, bearing: Array, layout: Layout, xp: Any) -> Array:

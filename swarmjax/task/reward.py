@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from swarmjax.config import RewardConfig
+from swarmjax.sim.pieces import least, pieces
 
 
 class Step(NamedTuple):
@@ -41,7 +42,9 @@ def progress(step: Step) -> Array:
 
 def proximity(step: Step) -> Array:
     """1 where any ray is shorter than the sensor's range, once a step (equation 3)."""
-    return jnp.any(step.infrared < step.sensor_range, axis=-1).astype(jnp.float32)
+    rays = step.infrared.shape[-1]
+    nearest = least((step.infrared[..., i] for i in pieces(rays, jnp)), step.sensor_range, jnp)
+    return (nearest < step.sensor_range).astype(jnp.float32)
 
 
 def arrival(step: Step) -> Array:

@@ -29,6 +29,10 @@ def _f32(*values: Any) -> np.ndarray:
     return np.array(values, np.float32)
 
 
+def _ray(xp: ModuleType, origin: tuple, direction: tuple) -> infrared.Ray:
+    return infrared.Ray(*xp.array(_f32(*origin, *direction)))
+
+
 @MODULES
 @pytest.mark.parametrize(
     ("origin", "direction", "expected"),
@@ -45,9 +49,7 @@ def _f32(*values: Any) -> np.ndarray:
     ],
 )
 def test_ray_walls(xp: ModuleType, origin: tuple, direction: tuple, expected: float) -> None:
-    found = infrared.ray_walls(
-        xp.array(_f32(*origin)), xp.array(_f32(*direction)), _f32(0.5)[0], xp
-    )
+    found = infrared.ray_walls(_ray(xp, origin, direction), _f32(0.5)[0], xp)
     assert float(found) == pytest.approx(expected, abs=ROUNDING)
 
 
@@ -67,8 +69,8 @@ def test_ray_walls(xp: ModuleType, origin: tuple, direction: tuple, expected: fl
 )
 def test_ray_disc(xp: ModuleType, origin: tuple, expected: float) -> None:
     """A disc of radius 0.25 at (1, 0), from the left along +x."""
-    start, toward = xp.array(_f32(*origin)), xp.array(_f32(1.0, 0.0))
-    found = infrared.ray_disc(start, toward, xp.array(_f32(1.0, 0.0)), 0.25, xp)
+    x, y = xp.array(_f32(1.0, 0.0))
+    found = infrared.ray_disc(_ray(xp, origin, (1.0, 0.0)), x, y, 0.25, xp)
     assert float(found) == pytest.approx(expected, abs=ROUNDING)
 
 
@@ -96,8 +98,8 @@ def test_ray_disc(xp: ModuleType, origin: tuple, expected: float) -> None:
 def test_ray_box(
     xp: ModuleType, origin: tuple, direction: tuple, box: tuple, expected: float
 ) -> None:
-    start, toward = xp.array(_f32(*origin)), xp.array(_f32(*direction))
-    found = infrared.ray_box(start, toward, xp.array(_f32(*box)), xp)
+    there = infrared.turned(xp.array(_f32(*box)), xp)
+    found = infrared.ray_box(_ray(xp, origin, direction), there, xp)
     assert float(found) == pytest.approx(expected, abs=ROUNDING)
 
 
@@ -232,7 +234,7 @@ def test_of_two_things_that_hold_a_sensor_the_wall_counts_then_the_brightest(
     # Sensors 0 and 7 are inside both boxes; 2 mm further on, inside the wall as well.
     box = xp.array(_f32([0.47, 0.0, 0.0, 0.03, 0.03], [0.48, 0.0, 0.0, 0.03, 0.03]))
     for x, shade in ((0.45, 0.7), (0.472, 0.9)):
-        pose = xp.array(_f32([x, 0.0, 0.0]))
+        pose = xp.array(_f32([x, 0.0, 0.0], [5.0, 0.0, 0.0], [5.5, 0.0, 0.0]))
         distance, bright = infrared.sights(
             pose, _f32(1.0)[0], box, RADIUS, RANGE, _reflectance(xp, **SHADES), None, xp
         )
@@ -509,14 +511,15 @@ def test_rays_that_graze_and_rays_that_start_at_a_surface(xp: ModuleType, shape:
     truth = _seen_of_edges(shape)
     grazing = truth[:, :GRAZES]
     kind = xp.float32 if xp is jnp else float
-    origin, direction = (xp.array(each, kind) for each in _edge_rays(shape))
+    ray = infrared.Ray(*(xp.array(part, kind) for each in _edge_rays(shape) for part in each.T))
     if shape == "wall":
         half = xp.full(2 * GRAZES, 0.5 * ARENA, kind)
-        found = infrared.ray_walls(origin, direction, half, xp)
+        found = infrared.ray_walls(ray, half, xp)
     elif shape == "disc":
-        found = infrared.ray_disc(origin, direction, xp.array(DISC[:2], kind), DISC[2], xp)
+        x, y = xp.array(DISC[:2], kind)
+        found = infrared.ray_disc(ray, x, y, DISC[2], xp)
     else:
-        found = infrared.ray_box(origin, direction, xp.array(BOX, kind), xp)
+        found = infrared.ray_box(ray, infrared.turned(xp.array(BOX, kind), xp), xp)
     assert (truth[0, GRAZES:] == 0.0).sum() > 1000
     if shape != "wall":  # a wall has no end that a ray could pass
         assert (grazing[0] == RANGE).sum() > 1000
