@@ -117,7 +117,7 @@ def drive_all(
 
 def compile_in_c(
     robot: RobotConfig, obstacle: np.ndarray, steps: int, fixtures: model.Fixtures = "mocap"
-) -> mujoco.MjModel:
+) -> Any:
     """The same model in MuJoCo C, in float64, its solver converged."""
     size = model.ArenaSize(ROBOTS, OBSTACLES, BIGGEST_HALF)
     spec = model.build(robot, size, STEP / steps, fixtures=fixtures)
@@ -138,18 +138,17 @@ def drive_in_c(
     built: mujoco.MjModel | None = None,
 ) -> Path:
     """One arena [R, 3] by MuJoCo C; wheels [T, R, 2]; the path is [T, 1, R, ...]."""
-    if built is None:
-        built = compile_in_c(robot, obstacle, substeps(robot, None))
-    count = round(STEP / built.opt.timestep)
-    data, body = mujoco.MjData(built), model.BODIES[robot.body]
-    ids = model.ids(built, model.ArenaSize(ROBOTS, OBSTACLES, BIGGEST_HALF))
+    given: Any = built or compile_in_c(robot, obstacle, substeps(robot, None))
+    count = round(STEP / given.opt.timestep)
+    data, body = mujoco.MjData(given), model.BODIES[robot.body]
+    ids = model.ids(given, model.ArenaSize(ROBOTS, OBSTACLES, BIGGEST_HALF))
     place, turn = model.fixture_poses(side, obstacle, np)
     data.mocap_pos[ids.fixture_mocap], data.mocap_quat[ids.fixture_mocap] = place, turn
     data.qpos[:] = body.qpos(np.asarray(pose, np.float64), np)
     found, rate = [], []
     for now in np.broadcast_to(wheels, (len(wheels), ROBOTS, 2)).astype(np.float64):
         data.ctrl[:] = body.ctrl(now, AS_BUILT, robot, np)
-        mujoco.mj_step(built, data, count)
+        mujoco.mj_step(given, data, count)
         found.append(np.array(body.pose(data.qpos, np)))
         rate.append(data.qvel.reshape(ROBOTS, -1).copy())
     return Path(np.array(found)[:, None], np.array(rate)[:, None])

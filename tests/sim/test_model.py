@@ -124,6 +124,15 @@ def test_robot_has_the_numbers_of_the_config() -> None:
     np.testing.assert_allclose(gains, [0.2 / STEP, 0.2 / STEP, 3e-4 / STEP], rtol=1e-12)
 
 
+def test_servos_lag_along_what_the_motors_drive() -> None:
+    built = model.build(RobotConfig(motor_lag=0.1), SIZE, STEP).compile()
+    # 0.32 time constants a step: 1 - exp(-0.32) = 0.273851 of the way; sideways there is no motor.
+    robot, share = RobotConfig(), np.array([0.273851, 1.0, 0.273851])
+    inertia = np.array([robot.mass, robot.mass, robot.yaw_inertia])
+    gains = built.actuator_gainprm[3:6, 0]
+    np.testing.assert_allclose(gains, share * inertia / STEP, rtol=1e-6)  # digits of the share
+
+
 def test_a_ray_sees_the_hull_as_the_webots_cylinder() -> None:
     assert "robot0_body" not in _geom_names(ray_geoms=False)
     built = model.build(RobotConfig(), SIZE, STEP, ray_geoms=True).compile()
