@@ -5,12 +5,12 @@ problem"), with rows of pyramidal friction cones and of contacts that only push,
 
     minimise  1/2 (a - a0)' M (a - a0) + sum_i D_i / 2 min(0, J_i a - aref_i)^2,
 
-falls into one of 8 unknowns for each robot as long as robots touch the floor, walls and obstacles
-alone: M and those rows of J have entries of one robot each. MJX-Warp's Newton method takes all
-robots of an arena together and factorises a matrix of 8 R rows at every iteration. Where robots do
-touch each other, the robots of that arena are gone through in turn, each with the others'
-accelerations given, until none changes any more: the cost is smooth and strictly convex, so this
-ends at its one minimum (Bertsekas 1999, "Nonlinear Programming", proposition 2.7.1).
+falls into one of 8 unknowns for each robot that touches the floor, walls and obstacles alone: M
+and those rows of J have entries of one robot each. MJX-Warp's Newton method takes all robots of an
+arena together and factorises a matrix of 8 R rows at every iteration. Here only robots that touch
+each other are taken together, and even their Hessian is one block of 8 x 8 a robot, and a term of
+rank one for each contact between two, which the Woodbury identity takes out of the inverse (Golub
+and Van Loan 2013, "Matrix Computations", 2.1.4).
 """
 
 from typing import Any
@@ -24,12 +24,15 @@ JOINTS = wp.constant(8)  # of a robot: free in space, and two wheels
 MOST_ROWS = wp.constant(24)
 _ITERATIONS = wp.constant(20)  # of Newton's method; two or three do
 _SEARCHES = wp.constant(12)  # of a step's length
-_SWEEPS = wp.constant(200)
-# Shares of the slope at a step's beginning, and of the largest acceleration, that count for
-# nothing: float32 rounds at 1e-7, and the grips of a robot are 1e3 times as stiff as its mass.
+# Share of the slope at a step's beginning that counts for nothing: float32 rounds at 1e-7, and the
+# grips of a robot are 1e3 times as stiff as its mass.
 _FLAT = wp.constant(1e-4)
-_STILL = wp.constant(1e-5)
-_SHORT = wp.constant(1e-2)  # share of the acceleration that a last step may be
+# Shares of the acceleration: a step that may be the last, and one that is nothing but rounding.
+_SHORT = wp.constant(1e-2)
+_ROUNDING = wp.constant(1e-5)
+# Contacts between robots that are taken as terms of their own; more go into the robots' blocks,
+# which makes for shorter steps.
+_PAIRS = wp.constant(8)
 
 
 class _Vector(wp.types.vector(length=8, dtype=wp.float32)):
@@ -60,7 +63,8 @@ def step(m: Any, d: Any) -> None:
     wp.launch(_begin, dim=(d.nworld, m.nv), inputs=[problem, *forces])
     wp.launch(_share_out, dim=d.nworld, inputs=[problem, _sides(m, d), robots])
     wp.launch(_relax_each, dim=(d.nworld, robots), inputs=[problem])
-    wp.launch(_relax_touching, dim=d.nworld, inputs=[problem, robots, d.solver_niter])
+    together = _together(m, d, robots)
+    wp.launch(_relax_pairs, dim=d.nworld, inputs=[problem, together, robots, d.solver_niter])
     mjw.euler(m, d)
 
 
@@ -82,7 +86,8 @@ class Problem:
       J_column: [A, 1, E].
       D: [A, N] weight of a row.
       aref: [A, N] acceleration that it asks for.
-      other: [A, N] sum of the numbers of the two robots of a row, -1 being none.
+      first: [A, N] a robot of a row; -1: none.
+      second: [A, N] the other.
       own: [A, R] rows of a robot.
       row: [A, R, K] which they are.
       touches: [A, R] whether any is of another robot too.
@@ -101,10 +106,36 @@ class Problem:
     J_column: wp.array3d[int]
     D: wp.array2d[float]
     aref: wp.array2d[float]
-    other: wp.array2d[int]
+    first: wp.array2d[int]
+    second: wp.array2d[int]
     own: wp.array2d[int]
     row: wp.array3d[int]
     touches: wp.array2d[bool]
+
+
+@wp.struct
+class Together:
+    """What is worked out for robots that touch each other.
+
+    Attributes:
+      step: [A, V] Newton's; 0 of all other robots.
+      gap: [A, N] J a - aref: a row acts below 0.
+      slope: [A, N] J times the step.
+      slot: [A, N] which of the terms of their own a row is; -1: none.
+      taken: [A] how many there are.
+      pair: [A, P] the rows that they are.
+      factor: [A, R] Cholesky's, of a robot's block.
+      response: [A, P, 2] what a unit of the force of a pair's contact brings about in either robot.
+    """
+
+    step: wp.array2d[float]
+    gap: wp.array2d[float]
+    slope: wp.array2d[float]
+    slot: wp.array2d[int]
+    taken: wp.array[int]
+    pair: wp.array2d[int]
+    factor: wp.array2d[_Matrix]
+    response: wp.array3d[_Vector]
 
 
 @wp.struct
@@ -135,11 +166,26 @@ def _problem(m: Any, d: Any, robots: int) -> Any:
     problem.count, problem.J, problem.D, problem.aref = d.nefc, d.efc.J, d.efc.D, d.efc.aref
     problem.J_first, problem.J_count = d.efc.J_rowadr, d.efc.J_rownnz
     problem.J_column = d.efc.J_colind
-    problem.other = wp.empty((d.nworld, d.njmax), dtype=int)
+    problem.first = wp.empty((d.nworld, d.njmax), dtype=int)
+    problem.second = wp.empty((d.nworld, d.njmax), dtype=int)
     problem.own = wp.empty((d.nworld, robots), dtype=int)
     problem.row = wp.empty((d.nworld, robots, 24), dtype=int)
     problem.touches = wp.empty((d.nworld, robots), dtype=bool)
     return problem
+
+
+def _together(m: Any, d: Any, robots: int) -> Any:
+    """Makes room for what is worked out for robots that touch each other."""
+    arenas, together = d.nworld, Together()
+    together.step = wp.empty((arenas, m.nv), dtype=float)
+    together.gap = wp.empty((arenas, d.njmax), dtype=float)
+    together.slope = wp.empty((arenas, d.njmax), dtype=float)
+    together.slot = wp.empty((arenas, d.njmax), dtype=int)
+    together.taken = wp.empty(arenas, dtype=int)
+    together.pair = wp.empty((arenas, 8), dtype=int)
+    together.factor = wp.empty((arenas, robots), dtype=_Matrix)
+    together.response = wp.empty((arenas, 8, 2), dtype=_Vector)
+    return together
 
 
 def _sides(m: Any, d: Any) -> Any:
@@ -173,13 +219,20 @@ def _share_out(problem: Problem, sides: Sides, robots: int) -> None:
     for robot in range(robots):
         problem.own[arena, robot] = 0
         problem.touches[arena, robot] = False
-    for row in range(wp.min(problem.count[arena], problem.other.shape[1])):
+    for row in range(_count(problem, arena)):
         geoms = sides.geom[sides.contact[arena, row]]
         first = _robot(sides, geoms[0])
         second = _robot(sides, geoms[1])
-        problem.other[arena, row] = first + second
+        problem.first[arena, row] = first
+        problem.second[arena, row] = second
         _list(problem, arena, row, first, first >= 0 and second >= 0)
         _list(problem, arena, row, second, first >= 0 and second >= 0)
+
+
+@wp.func
+def _count(problem: Problem, arena: int) -> int:
+    """How many rows there are; of more than there is room for, the rest is left out."""
+    return wp.min(problem.count[arena], problem.first.shape[1])
 
 
 @wp.func
@@ -201,57 +254,51 @@ def _list(problem: Problem, arena: int, row: int, robot: int, touches: bool) -> 
 
 @wp.kernel(enable_backward=False)
 def _relax_each(problem: Problem) -> None:
-    """Finds a robot's accelerations by itself."""
+    """Finds the accelerations of a robot that touches no other."""
     arena, robot = wp.tid()
-    _relax(problem, arena, robot)
-
-
-@wp.kernel(enable_backward=False)
-def _relax_touching(problem: Problem, robots: int, niter: wp.array[int]) -> None:
-    """Goes through the robots of an arena that touch each other until none changes any more."""
-    arena = wp.tid()
-    sweeps = wp.int32(0)
-    moves = wp.bool(True)
-    while moves and sweeps < _SWEEPS:
-        moves = wp.bool(False)
-        for robot in range(robots):
-            if problem.touches[arena, robot] and _relax(problem, arena, robot):
-                moves = True
-        sweeps += 1
-    niter[arena] = sweeps
+    if not problem.touches[arena, robot]:
+        _relax(problem, arena, robot)
 
 
 @wp.func
-def _relax(problem: Problem, arena: int, robot: int) -> bool:
-    """Sets a robot's accelerations to their best, the others' given; says whether they changed."""
-    begin = _accelerations(problem, arena, robot)
-    now = begin + _Vector()  # a copy: Warp's names are references
-    rest = _rest(problem, arena, robot)
+def _relax(problem: Problem, arena: int, robot: int) -> None:
+    """Newton's method for a robot alone."""
+    now = _of_robot(problem.qacc, arena, robot)
     inertia = _inertia(problem, arena, robot)
     done = wp.int32(0)
     moves = wp.bool(True)
     while moves and done < _ITERATIONS:
-        gap = _gaps(problem, arena, robot, rest, now)
+        gap = _gaps(problem, arena, robot, now, 1.0)
         downhill = _newton(problem, arena, robot, inertia, gap, now)
-        slope = _gaps(problem, arena, robot, _Rows(), downhill)
+        slope = _gaps(problem, arena, robot, downhill, 0.0)
         length = _length(problem, arena, robot, inertia, gap, slope, now, downhill)
         moves = _switches(problem.own[arena, robot], gap, slope, length) or length != 1.0
-        # A long step leaves its rounding behind, which one more takes out.
-        moves = moves or wp.max(wp.abs(downhill)) > _SHORT * wp.max(wp.abs(now))
+        moves = _goes_on(moves, wp.max(wp.abs(downhill)), wp.max(wp.abs(now)))
         now = now + length * downhill
         done += 1
-    for i in range(8):
-        problem.qacc[arena, robot * JOINTS + i] = now[i]
-    return wp.max(wp.abs(now - begin)) > _STILL * wp.max(wp.abs(now))
+    _set(problem.qacc, arena, robot, now)
 
 
 @wp.func
-def _accelerations(problem: Problem, arena: int, robot: int) -> _Vector:
-    """Those of a robot's joints."""
+def _goes_on(moves: bool, step: float, acceleration: float) -> bool:
+    """Whether there is more to do: a long step leaves its rounding behind, a tiny one is that."""
+    return (moves or step > _SHORT * acceleration) and step > _ROUNDING * acceleration
+
+
+@wp.func
+def _of_robot(of_joints: wp.array2d[float], arena: int, robot: int) -> _Vector:
+    """What a robot has at its joints."""
     found = _Vector()
     for i in range(8):
-        found[i] = problem.qacc[arena, robot * JOINTS + i]
+        found[i] = of_joints[arena, robot * JOINTS + i]
     return found
+
+
+@wp.func
+def _set(of_joints: wp.array2d[float], arena: int, robot: int, numbers: _Vector) -> None:
+    """Gives a robot's joints their numbers."""
+    for i in range(8):
+        of_joints[arena, robot * JOINTS + i] = numbers[i]
 
 
 @wp.func
@@ -281,26 +328,13 @@ def _jacobian(problem: Problem, arena: int, row: int, robot: int) -> _Vector:
 
 
 @wp.func
-def _rest(problem: Problem, arena: int, robot: int) -> _Rows:
-    """Of a robot's rows, J a - aref without its own part."""
-    rest = _Rows()
+def _gaps(problem: Problem, arena: int, robot: int, along: _Vector, asked: float) -> _Rows:
+    """J a of a robot's rows, less what is `asked` of aref; with all of it, below 0 a row acts."""
+    found = _Rows()
     for k in range(problem.own[arena, robot]):
         row = problem.row[arena, robot, k]
-        rest[k] = -problem.aref[arena, row]
-        other = problem.other[arena, row] - robot
-        if other >= 0:
-            slope = _jacobian(problem, arena, row, other)
-            rest[k] = rest[k] + wp.dot(slope, _accelerations(problem, arena, other))
-    return rest
-
-
-@wp.func
-def _gaps(problem: Problem, arena: int, robot: int, rest: _Rows, along: _Vector) -> _Rows:
-    """Of a robot's rows, the rest and the robot's own part; below 0 a row acts."""
-    found = rest + _Rows()
-    for k in range(problem.own[arena, robot]):
-        slope = _jacobian(problem, arena, problem.row[arena, robot, k], robot)
-        found[k] = rest[k] + wp.dot(slope, along)
+        slope = _jacobian(problem, arena, row, robot)
+        found[k] = wp.dot(slope, along) - asked * problem.aref[arena, row]
     return found
 
 
@@ -310,9 +344,7 @@ def _newton(
 ) -> _Vector:
     """Newton's step, of the rows that act now."""
     hessian = inertia + _Matrix()
-    uphill = inertia * now
-    for i in range(8):
-        uphill[i] = uphill[i] - problem.force[arena, robot * JOINTS + i]
+    uphill = inertia * now - _of_robot(problem.force, arena, robot)
     for k in range(problem.own[arena, robot]):
         if gap[k] < 0.0:
             row = problem.row[arena, robot, k]
@@ -320,13 +352,13 @@ def _newton(
             weighted = problem.D[arena, row] * slope
             uphill = uphill + gap[k] * weighted
             hessian = hessian + wp.outer(weighted, slope)
-    return _solve(hessian, -uphill)
+    return _substitute(_factor(hessian), -uphill)
 
 
 @wp.func
-def _solve(matrix: _Matrix, right: _Vector) -> _Vector:
-    """Solves for a symmetric positive definite matrix, by Cholesky's factors L L'."""
-    lower, found = matrix + _Matrix(), right + _Vector()
+def _factor(matrix: _Matrix) -> _Matrix:
+    """Cholesky's L, of a symmetric positive definite matrix L L'; above it is what was there."""
+    lower = matrix + _Matrix()
     for i in range(8):
         for j in range(i + 1):
             entry = lower[i, j]
@@ -336,11 +368,19 @@ def _solve(matrix: _Matrix, right: _Vector) -> _Vector:
                 lower[i, i] = wp.sqrt(entry)
             else:
                 lower[i, j] = entry / lower[j, j]
+    return lower
+
+
+@wp.func
+def _substitute(lower: _Matrix, right: _Vector) -> _Vector:
+    """Solves L L' x = right."""
+    found = right + _Vector()
+    for i in range(8):
         for k in range(i):
             found[i] = found[i] - lower[i, k] * found[k]
         found[i] = found[i] / lower[i, i]
-    for step_back in range(8):
-        i = 7 - step_back
+    for back in range(8):
+        i = 7 - back
         for k in range(i + 1, 8):
             found[i] = found[i] - lower[k, i] * found[k]
         found[i] = found[i] / lower[i, i]
@@ -359,9 +399,7 @@ def _length(
     downhill: _Vector,
 ) -> float:
     """How far to go along a step: where the cost, which is convex along it, is least."""
-    pull = inertia * now
-    for i in range(8):
-        pull[i] = pull[i] - problem.force[arena, robot * JOINTS + i]
+    pull = inertia * now - _of_robot(problem.force, arena, robot)
     first, curve = wp.dot(pull, downhill), wp.dot(downhill, inertia * downhill)
     begin = _tilt(problem, arena, robot, gap, slope, 0.0)[0] + first
     low, high, length = wp.float32(0.0), wp.float32(1e6), wp.float32(1.0)
@@ -399,3 +437,174 @@ def _switches(count: int, gap: _Rows, slope: _Rows, length: float) -> bool:
         if (gap[k] < 0.0) != (gap[k] + length * slope[k] < 0.0):
             switches = True
     return switches
+
+
+@wp.kernel(enable_backward=False)
+def _relax_pairs(problem: Problem, together: Together, robots: int, niter: wp.array[int]) -> None:
+    """Newton's method for the robots of an arena that touch each other."""
+    arena = wp.tid()
+    done = wp.int32(0)
+    moves = wp.bool(False)
+    for robot in range(robots):
+        moves = moves or problem.touches[arena, robot]
+    while moves and done < _ITERATIONS:
+        _pick(problem, together, arena)
+        for robot in range(robots):
+            _descend(problem, together, arena, robot)
+        _couple(problem, together, arena)
+        length = _length_together(problem, together, arena, robots)
+        moves = _moves(problem, together, arena, length)
+        done += 1
+    niter[arena] = done
+
+
+@wp.func
+def _along(problem: Problem, arena: int, row: int, of_joints: wp.array2d[float]) -> float:
+    """A row of J times what all joints of its arena have."""
+    found = wp.float32(0.0)
+    first = problem.J_first[arena, row]
+    for entry in range(first, first + problem.J_count[arena, row]):
+        found += problem.J[arena, 0, entry] * of_joints[arena, problem.J_column[arena, 0, entry]]
+    return found
+
+
+@wp.func
+def _pick(problem: Problem, together: Together, arena: int) -> None:
+    """Finds out which rows act, and which of those between robots become terms of their own."""
+    taken = wp.int32(0)
+    for row in range(_count(problem, arena)):
+        gap = _along(problem, arena, row, problem.qacc) - problem.aref[arena, row]
+        together.gap[arena, row] = gap
+        together.slot[arena, row] = -1
+        between = problem.first[arena, row] >= 0 and problem.second[arena, row] >= 0
+        if between and gap < 0.0 and taken < _PAIRS:
+            together.slot[arena, row] = taken
+            together.pair[arena, taken] = row
+            taken += 1
+    together.taken[arena] = taken
+
+
+@wp.func
+def _descend(problem: Problem, together: Together, arena: int, robot: int) -> None:
+    """Works out a robot's step as if its pairs' terms were not there, and its block's factor."""
+    _set(together.step, arena, robot, _Vector())
+    if problem.touches[arena, robot]:
+        inertia = _inertia(problem, arena, robot)
+        now = _of_robot(problem.qacc, arena, robot)
+        uphill = inertia * now - _of_robot(problem.force, arena, robot)
+        for k in range(problem.own[arena, robot]):
+            row = problem.row[arena, robot, k]
+            gap = together.gap[arena, row]
+            if gap < 0.0:
+                slope = _jacobian(problem, arena, row, robot)
+                weighted = problem.D[arena, row] * slope
+                uphill = uphill + gap * weighted
+                if together.slot[arena, row] < 0:
+                    inertia = inertia + wp.outer(weighted, slope)
+        factor = _factor(inertia)
+        together.factor[arena, robot] = factor
+        _set(together.step, arena, robot, _substitute(factor, -uphill))
+
+
+@wp.func
+def _couple(problem: Problem, together: Together, arena: int) -> None:
+    """Takes the pairs' terms into the step: Woodbury's identity."""
+    taken = together.taken[arena]
+    matrix = wp.identity(n=8, dtype=wp.float32) + _Matrix()
+    right = _Vector()
+    for i in range(taken):
+        row = together.pair[arena, i]
+        right[i] = _along(problem, arena, row, together.step)
+        for side in range(2):
+            robot = _side(problem, arena, row, side)
+            slope = _jacobian(problem, arena, row, robot)
+            factor = together.factor[arena, robot]
+            together.response[arena, i, side] = _substitute(factor, slope)
+        matrix[i, i] = 1.0 / problem.D[arena, row]
+    for i in range(taken):
+        for j in range(taken):
+            for sides in range(4):
+                push = _overlap(problem, together, arena, i, j, sides)
+                matrix[i, j] = matrix[i, j] + push
+    force = _substitute(_factor(matrix), right)
+    for i in range(taken):
+        for side in range(2):
+            robot = _side(problem, arena, together.pair[arena, i], side)
+            step = _of_robot(together.step, arena, robot)
+            response = together.response[arena, i, side]
+            _set(together.step, arena, robot, step - force[i] * response)
+
+
+@wp.func
+def _side(problem: Problem, arena: int, row: int, side: int) -> int:
+    """The first or the second robot of a row."""
+    return wp.where(side == 0, problem.first[arena, row], problem.second[arena, row])
+
+
+@wp.func
+def _overlap(problem: Problem, together: Together, arena: int, i: int, j: int, sides: int) -> float:
+    """What pair j brings about along pair i in the robot that is on these sides of both."""
+    row = together.pair[arena, i]
+    mine = _side(problem, arena, row, sides % 2)
+    theirs = _side(problem, arena, together.pair[arena, j], sides // 2)
+    if mine != theirs:
+        return 0.0
+    slope = _jacobian(problem, arena, row, mine)
+    return wp.dot(slope, together.response[arena, j, sides // 2])
+
+
+@wp.func
+def _length_together(problem: Problem, together: Together, arena: int, robots: int) -> float:
+    """How far to go along the step of all, as `_length` says of one."""
+    first, curve = wp.float32(0.0), wp.float32(0.0)
+    for robot in range(robots):
+        if problem.touches[arena, robot]:
+            inertia = _inertia(problem, arena, robot)
+            step = _of_robot(together.step, arena, robot)
+            now = _of_robot(problem.qacc, arena, robot)
+            first += wp.dot(inertia * now - _of_robot(problem.force, arena, robot), step)
+            curve += wp.dot(inertia * step, step)
+    for row in range(_count(problem, arena)):
+        together.slope[arena, row] = _along(problem, arena, row, together.step)
+    begin = _tilt_together(problem, together, arena, 0.0)[0] + first
+    low, high, length = wp.float32(0.0), wp.float32(1e6), wp.float32(1.0)
+    for _ in range(_SEARCHES):
+        bend = _tilt_together(problem, together, arena, length)
+        tilt = bend[0] + first + length * curve
+        if wp.abs(tilt) <= _FLAT * wp.abs(begin):
+            break
+        low = wp.where(tilt < 0.0, length, low)
+        high = wp.where(tilt < 0.0, high, length)
+        there = length - tilt / (bend[1] + curve)
+        length = wp.where(low < there and there < high, there, 0.5 * (low + high))
+    return length
+
+
+@wp.func
+def _tilt_together(problem: Problem, together: Together, arena: int, length: float) -> wp.vec2:
+    """First and second derivative of all rows' cost along the step."""
+    tilt = wp.vec2()
+    for row in range(_count(problem, arena)):
+        slope = together.slope[arena, row]
+        there = together.gap[arena, row] + length * slope
+        if there < 0.0:
+            tilt = tilt + problem.D[arena, row] * slope * wp.vec2(there, slope)
+    return tilt
+
+
+@wp.func
+def _moves(problem: Problem, together: Together, arena: int, length: float) -> bool:
+    """Takes the step; says whether another is needed."""
+    moves = length != 1.0
+    for row in range(_count(problem, arena)):
+        gap = together.gap[arena, row]
+        if (gap < 0.0) != (gap + length * together.slope[arena, row] < 0.0):
+            moves = wp.bool(True)
+    largest, longest = wp.float32(0.0), wp.float32(0.0)
+    for dof in range(problem.qacc.shape[1]):
+        step = together.step[arena, dof]
+        if step != 0.0:
+            largest = wp.max(largest, wp.abs(problem.qacc[arena, dof]))
+            longest = wp.max(longest, wp.abs(step))
+            problem.qacc[arena, dof] = problem.qacc[arena, dof] + length * step
+    return _goes_on(moves, longest, largest)
