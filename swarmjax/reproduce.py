@@ -126,9 +126,9 @@ def _write(out: Path, given: ReproduceConfig) -> None:
         "seeds": list(range(given.seed, given.seed + given.seeds)),
         "budget": given.budget,
         "fine_tune": given.fine_tune,
-        "device": provenance.device(),
+        "device": {arm: summary["device"] for arm, summary in done.items()},
         "versions": provenance.versions(),
-        "commit": provenance.commit(),
+        "commit": {arm: summary["commit"] for arm, summary in done.items()},
         "seconds": {arm: summary["train_s"] for arm, summary in done.items()},
         "compile_s": {arm: summary["compile_s"] for arm, summary in done.items()},
     }

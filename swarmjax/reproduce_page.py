@@ -126,8 +126,7 @@ def facts(data: Reproduction) -> list[tuple[str, str]]:
             f"{found['budget']:,} arena control steps of each seed; at 1.5 m "
             f"{found['fine_tune']:,} more",
         ),
-        ("device", str(found.get("device"))),
-        ("commit", str(found.get("commit") or "unknown")),
+        ("commit", ", ".join(dict.fromkeys(map(_known, found["commit"].values())))),
         ("versions", ", ".join(f"{name} {of}" for name, of in found["versions"].items())),
     ]
 
@@ -160,12 +159,16 @@ def _arms(data: Reproduction) -> str:
     """Tables the arms: what they are, and how long they took."""
     rows = []
     for arm, words in ARMS.items():
-        times = ("not trained to the end", "")
+        made = ("not trained to the end", "", "")
         if arm in data.logs:
-            times = (data.facts[key].get(arm) for key in ("seconds", "compile_s"))
-            times = tuple(map(_seconds, times))
-        rows.append((arm, words, *times))
-    return _table(("arm", "what it is", "trained in", "compiled in"), rows)
+            times = [_seconds(data.facts[key].get(arm)) for key in ("seconds", "compile_s")]
+            made = (*times, _known(data.facts["device"].get(arm)))
+        rows.append((arm, words, *made))
+    return _table(("arm", "what it is", "trained in", "compiled in", "on"), rows)
+
+
+def _known(value: str | None) -> str:
+    return value or "unknown"
 
 
 def _seconds(value: float | None) -> str:

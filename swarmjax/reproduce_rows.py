@@ -33,7 +33,7 @@ ARMS = {
 JUDGED = ("targets_reached", "all_reached", "sensed_share", "contacts_per_robot", "return")
 _COUNTS = ("seed", "update", "arena_steps", "steps", "robots")
 _BY_ROBOT = ("reached", "reward", "robot_steps", "sensed", "contacts")
-_MAPS = ("settings", "versions", "seconds", "compile_s")
+_MAPS = ("settings", "versions", "device", "commit", "seconds", "compile_s")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

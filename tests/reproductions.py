@@ -16,9 +16,9 @@ FACTS = {
     "seeds": list(SEEDS),
     "budget": 1_000_000,
     "fine_tune": 250_000,
-    "device": "CPU x86_64, 2 cores",
+    "device": {"curriculum": "CPU x86_64, 2 cores"},
     "versions": {"jax": "0.11.2"},
-    "commit": "60ed72f",
+    "commit": {"curriculum": "60ed72f"},
     "compile_s": {},
 }
 
