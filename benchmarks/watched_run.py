@@ -38,7 +38,7 @@ class Watched:
           directory: for the run, not there yet.
           environment: variables that it is given besides those of this process.
         """
-        self.directory, self.seconds = directory, 0.0
+        self.directory, self.seconds, self._asked = directory, 0.0, False
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115  # `_finish` closes it
         self._began = time.perf_counter()
         self._process = subprocess.Popen(
@@ -67,9 +67,10 @@ class Watched:
         self._finish()
 
     def stop(self) -> None:
-        """Asks it to save and stop; `rows` goes on until it has."""
-        if self._process.poll() is None:
+        """Asks it to save and stop; `rows` goes on until it has. A second time would end it."""
+        if self._process.poll() is None and not self._asked:
             self._process.send_signal(signal.SIGINT)
+            self._asked = True
 
     def summary(self) -> dict[str, Any]:
         """What it came to. Device, versions and commit are in it: this process takes no card."""

@@ -1,0 +1,106 @@
+"""The solvers made for swarms, on arenas so crowded that all robots push each other, against C."""
+
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from swarmjax.config import ConfigError, RobotConfig, SimConfig, StageConfig, TrainConfig, substeps
+from swarmjax.sim import drive, model, physics
+from swarmjax.sim.body import AS_BUILT
+from swarmjax.task import env
+
+ROBOTS, ARENAS, STEP = 5, 24, 0.032
+SIZE = model.ArenaSize(ROBOTS, 1, 0.05)
+BOX = np.array([[0.05, 0.02, 0.4, 0.05, 0.05]], np.float32)
+
+
+def _load(body: Literal["planar", "wheeled"]) -> physics.Physics:
+    stage = StageConfig(name="box", robots=ROBOTS, side=1.3, obstacles=1, obstacle_size=0.1)
+    sim = SimConfig(impl="warp", max_robots=ROBOTS, max_obstacles=1)
+    robot = RobotConfig(body=body)
+    settings = TrainConfig(stage=(stage,), robot=robot, sim=sim, arenas=ARENAS, budget=10_000)
+    return env.load(settings).physics
+
+
+def _crowds(side: float) -> tuple[np.ndarray, np.ndarray]:
+    """Poses [A, R, 3] anywhere in the arena, one robot within another, and speeds of their wheels.
+
+    Half of the robots in one arena in two overlap a wall or the box as well.
+    """
+    random = np.random.default_rng(3)
+    pose = random.uniform(-0.5, 0.5, (ARENAS, ROBOTS, 3)) * [side, side, 6.0]
+    action = random.uniform(-1.0, 1.0, (ARENAS, ROBOTS, 2))
+    robot = drive.from_config(RobotConfig())
+    wheels = drive.wheel_speeds(drive.command(action, robot, np), robot, np)
+    return pose.astype(np.float32), wheels.astype(np.float32)
+
+
+def _by_mjx(loaded: physics.Physics, side: float, pose: np.ndarray, wheels: np.ndarray) -> Any:
+    """Velocities of the joints [A, V] after a control step from rest."""
+
+    def move(pose: Any, wheels: Any) -> Any:
+        data = physics.unpack(loaded, physics.rest(loaded, pose))
+        return physics.step(loaded, data, jnp.float32(side), jnp.asarray(BOX), wheels).qvel
+
+    return np.asarray(jax.jit(jax.vmap(move))(pose, wheels))
+
+
+def _in_c(
+    robot: RobotConfig, side: float, pose: np.ndarray, wheels: np.ndarray
+) -> tuple[np.ndarray, int]:
+    """The same by MuJoCo C in float64, converged; and how many pairs of robots touch at first."""
+    count = substeps(robot, None)
+    spec = model.build(robot, SIZE, STEP / count)
+    spec.option.iterations, spec.option.tolerance = 100, 1e-14
+    spec.option.ls_iterations, spec.option.ls_tolerance = 100, 1e-6
+    built = spec.compile()
+    ids, body = model.ids(built, SIZE), model.BODIES[robot.body]
+    built.geom_size[ids.obstacle_geom, :2] = BOX[:, 3:]
+    data = mujoco.MjData(built)
+    place, turn = model.fixture_poses(side, BOX, np)
+    data.mocap_pos[ids.fixture_mocap], data.mocap_quat[ids.fixture_mocap] = place, turn
+    data.qpos[:] = body.qpos(pose.astype(np.float64), np)
+    data.ctrl[:] = body.ctrl(wheels.astype(np.float64), AS_BUILT, robot, np)
+    mujoco.mj_forward(built, data)
+    moving = built.body_rootid[built.geom_bodyid[data.contact.geom]]
+    pairs = int(np.sum(np.isin(moving, ids.hull_body).all(axis=1)))
+    mujoco.mj_step(built, data, count)
+    return data.qvel.copy(), pairs
+
+
+# In 0.16 m more pairs touch than the wheeled robots' solver takes as terms of their own (8), and
+# sweeps come to rest slowly. Float32 rounds at 1e-7, and a wheel's grip is 1e3 times as stiff as its
+# robot: seen were 1.9e-4, 1.3e-5, 1.7e-6 and 6.6e-6 of the largest speed; twice that, rounded up.
+# (MJX-Warp's own Newton has 2.4e-5, 5.1e-5, 1.7e-6 and 2.0e-5.)
+@pytest.mark.parametrize(
+    ("body", "side", "most", "close"),
+    [
+        ("planar", 0.16, 9, 4e-4),
+        ("wheeled", 0.16, 9, 3e-5),
+        ("planar", 0.5, 2, 4e-6),
+        ("wheeled", 0.5, 2, 1.5e-5),
+    ],
+)
+def test_crowds_push_each_other_apart_as_in_c(
+    body: Literal["planar", "wheeled"], side: float, most: int, close: float
+) -> None:
+    pose, wheels = _crowds(side)
+    found = _by_mjx(_load(body), side, pose, wheels)
+    each = [_in_c(RobotConfig(body=body), side, p, w) for p, w in zip(pose, wheels, strict=True)]
+    expected, pairs = np.array([one[0] for one in each]), [one[1] for one in each]
+    assert max(pairs) >= most
+    fastest = np.abs(expected).max(axis=1)
+    assert fastest.min() > 1.0  # they do fly apart
+    assert (np.abs(found - expected).max(axis=1) <= close * fastest).all()
+
+
+def test_the_solver_is_chosen() -> None:
+    assert physics.resolve_solver("auto", "warp") == "swarm"
+    assert physics.resolve_solver("auto", "jax") == "newton"
+    assert physics.resolve_solver("newton", "warp") == "newton"
+    with pytest.raises(ConfigError, match=r"sim\.solver is swarm, but sim\.impl is jax: give newton"):
+        physics.resolve_solver("swarm", "jax")
