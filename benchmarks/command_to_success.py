@@ -15,6 +15,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -64,15 +65,16 @@ def train(words: Sequence[str], run: Path, stop_at: float) -> tuple[dict[str, fl
     return found | {"saved_s": watched.seconds}, row
 
 
-def judge(run: Path, stage: str, episodes: int) -> float:
-    """Share of targets that a run's policy reaches in MuJoCo C, on the wheeled body."""
+def judge(run: Path, stage: str, episodes: int) -> dict[str, Any]:
+    """Share of targets that a run's policy reaches in MuJoCo C on wheels, and how it acts there."""
     path = run / export.POLICY
     settings = config.load_evaluate(
         [f"policy={path}", f"stage={stage}", "robot=wheeled", f"episodes={episodes}"]
     )
     policies = evaluate_run.read_policies([str(path)])
     (trial,) = evaluate_run.run(settings, cells.load(settings).cells, policies)
-    return float(np.mean(trial.found["targets_reached"]))
+    judged = float(np.mean(trial.found["targets_reached"]))
+    return {"judged": judged, "action": settings.action}
 
 
 def results(given: SuccessConfig, words: Sequence[str]) -> Iterator[Row]:
@@ -90,8 +92,7 @@ def results(given: SuccessConfig, words: Sequence[str]) -> Iterator[Row]:
             "stage": trained.stage_name,
             "stop_at": given.stop_at,
             **found,
-            "judged": judged,
-            "action": "sampled",
+            **judged,
             "episodes": given.episodes,
             "measured": row["success_by_stage"][-1],
             "arena_steps": row["arena_steps"],

@@ -579,7 +579,8 @@ class SimConfig(Section):
         default="auto", metadata=about("MJX implementation; auto: warp on an NVIDIA GPU")
     )
     solver: Literal["auto", "newton", "swarm"] = field(
-        default="auto", metadata=about("of contacts; swarm: made for robots, on warp alone; auto")
+        default="auto",
+        metadata=about("of contacts; swarm: made for the body, warp alone; auto: swarm there"),
     )
     max_robots: int = field(default=5, metadata=about("robots compiled in", 1, 100))
     max_obstacles: int = field(default=4, metadata=about("obstacles compiled in", 0, 32))
@@ -589,11 +590,11 @@ class SimConfig(Section):
     )
     iterations: int | None = field(
         default=None,
-        metadata=about("solver iterations; null: measured for the implementation", 1, 1000),
+        metadata=about("of the solver, of swarm on wheels 20 at most; null: measured", 1, 1000),
     )
     ls_iterations: int | None = field(
         default=None,
-        metadata=about("line-search iterations; null: measured likewise", 1, 1000),
+        metadata=about("line-search iterations of newton; null: measured", 1, 1000),
     )
 
 

@@ -19,7 +19,7 @@ from swarmjax.report_rows import Row
 from swarmjax.statistics import LEAST_DRAWN
 
 FACTS, EVALUATION = "reproduce.json", "evaluation.json"
-FORMAT = 1  # of both
+FORMAT = 2  # of both
 LAST, EXPANDED = "paper6", "paper_expanded"  # the stages that policies are judged on
 ARMS = {
     "curriculum": "the paper's algorithm with its curriculum",

@@ -35,6 +35,7 @@ from swarmjax.display import Display
 from swarmjax.loop import Program, TrainState
 from swarmjax.sim import physics
 from swarmjax.start import Source
+from swarmjax.task import env
 from swarmjax.trainer import (
     Stop,
     Tally,
@@ -263,6 +264,7 @@ def _write_results(run: Path, program: Program, state: TrainState, tally: Tally)
             [entry for entry in tally.decisions if entry["seed"] == seed] for seed in every
         ],
         "impl": physics.resolve_impl(settings.sim.impl),
+        "solver": env.resolve_solver(settings),
         "gradient": loop.resolve_gradient(settings),
         "device": provenance.device(),
         "versions": provenance.versions(),

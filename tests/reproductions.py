@@ -11,7 +11,7 @@ from swarmjax.reproduce_rows import ARMS, EXPANDED, JUDGED, LAST, Log, Reproduct
 
 SEEDS = (0, 1, 2)
 FACTS = {
-    "format": 1,
+    "format": 2,
     "settings": {"seeds": 3, "budget": 1e6, "out": "somewhere", "sim": {"impl": "jax"}},
     "seeds": list(SEEDS),
     "budget": 1_000_000,
@@ -67,7 +67,7 @@ def write(
     if judged is None:
         stages = (LAST, EXPANDED)
         judged = [row(arm, seed, stage) for arm in logs for seed in SEEDS for stage in stages]
-    text = json.dumps({"format": 1, "rows": list(judged)})
+    text = json.dumps({"format": 2, "rows": list(judged)})
     (out / "evaluation.json").write_text(text)
     return out
 

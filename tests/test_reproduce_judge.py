@@ -78,7 +78,7 @@ def test_a_row_says_what_became_of_a_policy(tmp_path: Path) -> None:
 
 def test_rows_that_were_written_are_read(tmp_path: Path) -> None:
     assert reproduce_judge.read(tmp_path) == []
-    (tmp_path / "evaluation.json").write_text(json.dumps({"format": 1, "rows": [{"seed": 1}]}))
+    (tmp_path / "evaluation.json").write_text(json.dumps({"format": 2, "rows": [{"seed": 1}]}))
     assert reproduce_judge.read(tmp_path) == [{"seed": 1}]
 
 

@@ -60,7 +60,7 @@ def partial(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page]:
         for seed in SEEDS
         for stage in (LAST, EXPANDED)
     ]
-    (out / "evaluation.json").write_text(json.dumps({"format": 1, "rows": judged}))
+    (out / "evaluation.json").write_text(json.dumps({"format": 2, "rows": judged}))
     facts = json.loads((out / "reproduce.json").read_text())
     (out / "reproduce.json").write_text(json.dumps(facts | {"commit": HOSTILE}))
     page = reproduce_page.write(out)

@@ -1,6 +1,7 @@
 """A training run watched from the outside, with a script in the place of training."""
 
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from sentences import refusal
 
 from benchmarks import command_to_success
 from benchmarks.watched_run import Watched
+from swarmjax.config import ConfigError
 
 # Writes a row of metrics with each of these successes, and ends where it is asked to.
 SCRIPT = """#!{python}
@@ -55,6 +57,20 @@ def test_what_was_never_reached_has_no_seconds(
     assert found["seconds_to_0.90"] is not None
     assert found["seconds_to_0.95"] is None
     assert row["success_by_stage"] == [1.0, 0.92]
+
+
+def test_a_run_is_asked_to_stop_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # A second Ctrl-C ends a run before it has saved itself.
+    _put(tmp_path, monkeypatch, [0.97])
+    watched, sent = Watched([], tmp_path / "run", {}), []
+    with monkeypatch.context() as patched:
+        patched.setattr(watched._process, "send_signal", sent.append)
+        watched.stop()
+        watched.stop()
+    assert sent == [signal.SIGINT]
+    watched._process.kill()
+    with pytest.raises(ConfigError):  # it did not end as one that was asked to
+        list(watched.rows())
 
 
 def test_a_run_that_fails_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,6 +39,8 @@ SOLVER_STEPS = {
 # SOLVER_ROWS_PER_ROBOT. What stands on the floor is counted apart, and whole.
 CONTACTS_PER_ROBOT = 3
 SOLVER_ROWS_PER_ROBOT = 6  # neighbours that a disc can touch at once
+# In a jam of more wheeled robots the solver made for them leaves up to 7 mm/s (design.md, 38).
+MOST_WHEELED = 5
 FEW_ARENAS = 64  # in so few, all may be crowded at once: there is room for every pair
 # Where a rotation about the z axis has cosines, sines and ones.
 _COSINES = np.diag([1.0, 1.0, 0.0]).astype(np.float32)
@@ -110,12 +112,14 @@ def resolve_impl(impl: str) -> str:
     return "warp" if installed and jax.default_backend() == "gpu" else "jax"
 
 
-def resolve_solver(solver: str, impl: str) -> str:
+def resolve_solver(solver: str, impl: str, body: str, robots: int) -> str:
     """Turns `auto` into `swarm` where that can be, `newton` elsewhere.
 
     Args:
       solver: `auto`, `newton` or `swarm`.
       impl: `jax` or `warp`.
+      body: `planar` or `wheeled`.
+      robots: that are compiled in.
 
     Returns:
       `newton` or `swarm`.
@@ -127,9 +131,15 @@ def resolve_solver(solver: str, impl: str) -> str:
         raise ConfigError(
             f"sim.solver is swarm, but sim.impl is {impl}: give newton or auto, or sim.impl=warp."
         )
+    if solver == "swarm" and body == "wheeled" and robots > MOST_WHEELED:
+        raise ConfigError(
+            f"sim.solver is swarm, but robot.body is wheeled and sim.max_robots is {robots}: give "
+            f"newton or auto, or {MOST_WHEELED} robots at most."
+        )
     if solver != "auto":
         return solver
-    return "swarm" if impl == "warp" else "newton"
+    possible = impl == "warp" and (body == "planar" or robots <= MOST_WHEELED)
+    return "swarm" if possible else "newton"
 
 
 def load(

@@ -18,11 +18,13 @@ from typing import Any
 import mujoco.mjx.third_party.mujoco_warp as mjw
 import warp as wp
 
+_ITERATIONS = 20  # of Newton's method, at most; two or three do, thirteen were seen
 NUMBER = -1  # what `opt.solver` says; MuJoCo has none of it
+# A sum with nothing, below, is a copy: names in Warp are references, and what is changed in a loop
+# would change what it was called before.
 JOINTS = wp.constant(8)  # of a robot: free in space, and two wheels
 # Rows of a robot: 4 of each wheel, 1 of each skid, and contacts of its hull.
 MOST_ROWS = wp.constant(24)
-_ITERATIONS = wp.constant(20)  # of Newton's method; two or three do
 _SEARCHES = wp.constant(12)  # of a step's length
 # Share of the slope at a step's beginning that counts for nothing: float32 rounds at 1e-7, and the
 # grips of a robot are 1e3 times as stiff as its mass.
@@ -30,8 +32,9 @@ _FLAT = wp.constant(1e-4)
 # Shares of the acceleration: a step that may be the last, and one that is nothing but rounding.
 _SHORT = wp.constant(1e-2)
 _ROUNDING = wp.constant(1e-5)
-# Contacts between robots that are taken as terms of their own; more go into the robots' blocks,
-# which makes for shorter steps.
+# Contacts between robots that are taken as terms of their own. More go into the robots' blocks,
+# which makes for more and shorter steps: five robots have ten pairs, swarms of more get Newton's
+# method (`physics.MOST_WHEELED`).
 _PAIRS = wp.constant(8)
 
 
@@ -50,6 +53,8 @@ class _Rows(wp.types.vector(length=24, dtype=wp.float32)):
 def step(m: Any, d: Any) -> None:
     """Moves all arenas of wheeled robots on by one physics step (MuJoCo's semi-implicit Euler).
 
+    Of what acts on bodies, `xfrc_applied` is left out: nothing here uses it.
+
     Args:
       m: Warp's model: robots of eight joints each, and no others; a sparse Jacobian.
       d: Warp's data of all arenas, written to; the forces of contacts are not.
@@ -62,9 +67,10 @@ def step(m: Any, d: Any) -> None:
     forces = [d.qfrc_applied, d.qfrc_bias, d.qfrc_passive, d.qfrc_actuator, d.qacc_warmstart]
     wp.launch(_begin, dim=(d.nworld, m.nv), inputs=[problem, *forces])
     wp.launch(_share_out, dim=d.nworld, inputs=[problem, _sides(m, d), robots])
-    wp.launch(_relax_each, dim=(d.nworld, robots), inputs=[problem])
+    most = min(m.opt.iterations, _ITERATIONS)
+    wp.launch(_relax_each, dim=(d.nworld, robots), inputs=[problem, most])
     together = _together(m, d, robots)
-    wp.launch(_relax_pairs, dim=d.nworld, inputs=[problem, together, robots, d.solver_niter])
+    wp.launch(_relax_pairs, dim=d.nworld, inputs=[problem, together, robots, most, d.solver_niter])
     mjw.euler(m, d)
 
 
@@ -223,10 +229,9 @@ def _share_out(problem: Problem, sides: Sides, robots: int) -> None:
         geoms = sides.geom[sides.contact[arena, row]]
         first = _robot(sides, geoms[0])
         second = _robot(sides, geoms[1])
-        problem.first[arena, row] = first
-        problem.second[arena, row] = second
-        _list(problem, arena, row, first, first >= 0 and second >= 0)
-        _list(problem, arena, row, second, first >= 0 and second >= 0)
+        between = first >= 0 and second >= 0
+        problem.first[arena, row] = _list(problem, arena, row, first, between)
+        problem.second[arena, row] = _list(problem, arena, row, second, between)
 
 
 @wp.func
@@ -243,31 +248,33 @@ def _robot(sides: Sides, geom: int) -> int:
 
 
 @wp.func
-def _list(problem: Problem, arena: int, row: int, robot: int, touches: bool) -> None:
-    """Adds a row to those of a robot."""
-    if robot >= 0 and problem.own[arena, robot] < MOST_ROWS:
-        problem.row[arena, robot, problem.own[arena, robot]] = row
-        problem.own[arena, robot] = problem.own[arena, robot] + 1
-        if touches:
-            problem.touches[arena, robot] = True
+def _list(problem: Problem, arena: int, row: int, robot: int, between: bool) -> int:
+    """Adds a row to those of a robot; -1 if it is none's, or the robot has no room for more."""
+    if robot < 0 or problem.own[arena, robot] >= MOST_ROWS:
+        return -1
+    problem.row[arena, robot, problem.own[arena, robot]] = row
+    problem.own[arena, robot] = problem.own[arena, robot] + 1
+    if between:
+        problem.touches[arena, robot] = True
+    return robot
 
 
 @wp.kernel(enable_backward=False)
-def _relax_each(problem: Problem) -> None:
+def _relax_each(problem: Problem, iterations: int) -> None:
     """Finds the accelerations of a robot that touches no other."""
     arena, robot = wp.tid()
     if not problem.touches[arena, robot]:
-        _relax(problem, arena, robot)
+        _relax(problem, arena, robot, iterations)
 
 
 @wp.func
-def _relax(problem: Problem, arena: int, robot: int) -> None:
+def _relax(problem: Problem, arena: int, robot: int, iterations: int) -> None:
     """Newton's method for a robot alone."""
     now = _of_robot(problem.qacc, arena, robot)
     inertia = _inertia(problem, arena, robot)
     done = wp.int32(0)
     moves = wp.bool(True)
-    while moves and done < _ITERATIONS:
+    while moves and done < iterations:
         gap = _gaps(problem, arena, robot, now, 1.0)
         downhill = _newton(problem, arena, robot, inertia, gap, now)
         slope = _gaps(problem, arena, robot, downhill, 0.0)
@@ -440,14 +447,16 @@ def _switches(count: int, gap: _Rows, slope: _Rows, length: float) -> bool:
 
 
 @wp.kernel(enable_backward=False)
-def _relax_pairs(problem: Problem, together: Together, robots: int, niter: wp.array[int]) -> None:
+def _relax_pairs(
+    problem: Problem, together: Together, robots: int, iterations: int, niter: wp.array[int]
+) -> None:
     """Newton's method for the robots of an arena that touch each other."""
     arena = wp.tid()
     done = wp.int32(0)
     moves = wp.bool(False)
     for robot in range(robots):
         moves = moves or problem.touches[arena, robot]
-    while moves and done < _ITERATIONS:
+    while moves and done < iterations:
         _pick(problem, together, arena)
         for robot in range(robots):
             _descend(problem, together, arena, robot)

@@ -143,7 +143,7 @@ def load(config: TrainConfig) -> World:
         model.ids(compiled, size),
         config.robot,
         impl=impl,
-        solver=physics.resolve_solver(sim.solver, impl),
+        solver=resolve_solver(config),
         arenas=config.arenas * (config.seeds if config.seeds_by == "vmap" else 1),
         substeps=count,
     )
@@ -152,6 +152,16 @@ def load(config: TrainConfig) -> World:
     )
     electronics = senses.load(config.task, config.realism)
     return World(config, engine, spacing, sim_drive.from_config(config.robot), electronics)
+
+
+def resolve_solver(config: TrainConfig) -> str:
+    """Says which solver a run uses: `newton` or `swarm`.
+
+    Raises:
+      ConfigError: if it asks for one that cannot be.
+    """
+    sim, impl = config.sim, physics.resolve_impl(config.sim.impl)
+    return physics.resolve_solver(sim.solver, impl, config.robot.body, sim.max_robots)
 
 
 def reset(world: World, level: Level, stage: Array, cohort: Array) -> EnvState:

@@ -20,6 +20,7 @@ BIGGEST_HALF = 0.15  # m, the bound that the model is compiled for
 FULL = 0.1256  # m/s
 AWAY = np.array([[-5.0, -5.0, 0.0, 0.05, 0.05], [-5.5, -5.0, 0.0, 0.05, 0.05]], np.float32)
 BodyName = Literal["planar", "wheeled"]
+ENGINES = [(impl, body) for body in ("planar", "wheeled") for impl in ("jax", "warp")]
 
 
 class Path(NamedTuple):

@@ -14,6 +14,7 @@ from engines import (
     AWAY,
     BIGGEST_HALF,
     CHUNK,
+    ENGINES,
     FULL,
     OBSTACLES,
     RADIUS,
@@ -32,7 +33,6 @@ from swarmjax.sim import model, physics
 from swarmjax.sim.body import AS_BUILT
 from swarmjax.task import env
 
-ENGINES = [(impl, body) for body in ("planar", "wheeled") for impl in ("jax", "warp")]
 SIZE = model.ArenaSize(ROBOTS, OBSTACLES, BIGGEST_HALF)
 AHEAD = wheels_of(np.array([FULL, 0.0]))
 CLEAR = 0.01  # m; what is in a robot's way is this far from its hull when it is put there

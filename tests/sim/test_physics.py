@@ -15,6 +15,7 @@ from engines import (
     AWAY,
     BIGGEST_HALF,
     CHUNK,
+    ENGINES,
     FULL,
     OBSTACLES,
     RADIUS,
@@ -41,7 +42,6 @@ from swarmjax.sim.body import Chassis
 from swarmjax.task import env
 
 SIDE = 0.6  # m
-ENGINES = [(impl, body) for body in ("planar", "wheeled") for impl in ("jax", "warp")]
 GRIP = 9.81  # m/s^2; friction 1
 
 
