@@ -62,7 +62,7 @@ def partial(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page]:
     ]
     (out / "evaluation.json").write_text(json.dumps({"format": 2, "rows": judged}))
     facts = json.loads((out / "reproduce.json").read_text())
-    (out / "reproduce.json").write_text(json.dumps(facts | {"commit": HOSTILE}))
+    (out / "reproduce.json").write_text(json.dumps(facts | {"commit": {"curriculum": HOSTILE}}))
     page = reproduce_page.write(out)
     assert page == out / "report.html"
     return out, Page(page.read_text())
@@ -73,8 +73,10 @@ def test_the_header_says_how_the_data_came_about(partial: tuple[Path, Page]) -> 
     assert "python -m swarmjax.reproduce seeds=3 budget=1000000 sim.impl=jax" in page.text
     assert "1,000,000 arena control steps of each seed" in page.text
     assert HOSTILE in page.text
-    assert page.starting("curriculum")[0] == ["curriculum", ARMS["curriculum"], "60 s", "60 s"]
-    assert page.starting("modern_baseline")[0][2:] == ["not trained to the end", ""]
+    made = ["60 s", "60 s", "CPU x86_64, 2 cores"]
+    assert page.starting("curriculum")[0] == ["curriculum", ARMS["curriculum"], *made]
+    assert page.starting("baseline")[0][2:] == ["60 s", "60 s", "unknown"]
+    assert page.starting("modern_baseline")[0][2:] == ["not trained to the end", "", ""]
 
 
 def test_the_table_that_the_paper_lacks(partial: tuple[Path, Page]) -> None:

@@ -101,7 +101,7 @@ def _drop(out: Path, text: str) -> None:
 
 REFUSED = {
     "no facts": (lambda out: (out / "reproduce.json").unlink(), "is no reproduction"),
-    "format": (lambda out: _change(out, "reproduce.json", format=2), "has format 2"),
+    "format": (lambda out: _change(out, "reproduce.json", format=1), "has format 1"),
     "no arm": (lambda out: _change(out, "reproduce.json", seconds={}), "no finished arm"),
     "two seeds": (
         lambda out: _change(out, "reproduce.json", seeds=[0, 1]),

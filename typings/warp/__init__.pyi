@@ -1,3 +1,4 @@
+# ruff: noqa: N801  # they are Warp's names
 # Kernels are Warp's language, not Python, and are checked by Warp; here little is known of them.
 from collections.abc import Callable
 from typing import Any
@@ -18,6 +19,7 @@ class vec3:
     def __rmul__(self, factor: Any) -> vec3: ...
 
 class vec2i(vec3): ...
+
 class vec2(vec3):
     def __add__(self, other: Any) -> Any: ...
 
