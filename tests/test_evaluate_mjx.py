@@ -196,6 +196,7 @@ def test_each_learner_drives_its_own_robot(tmp_path: Path, judge: Run, world: Wo
         )
 
 
+@pytest.mark.slow
 def test_seeds_side_by_side_are_judged_as_each_alone(judge: Run, world: World) -> None:
     levels = evaluate_mjx.draw_levels(world, STAGES[0], SEED, EPISODES)
     one, two = _learners(STEER), _learners(STAY)

@@ -39,6 +39,7 @@ def pages(monkeypatch: pytest.MonkeyPatch) -> list[reproduce_rows.Reproduction]:
     return found
 
 
+@pytest.mark.slow
 def test_what_was_stopped_goes_on_and_is_judged(
     tmp_path: Path, pages: list, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -77,6 +77,7 @@ def _assert_same(found: Leaves, expected: Leaves) -> None:
         np.testing.assert_array_equal(leaf, expected[name], err_msg=name, strict=True)
 
 
+@pytest.mark.slow
 def test_every_seed_is_another_run(start: TrainState, run: Run) -> None:
     lanes = [_lane(run(start, UPDATES), k) for k in range(SEEDS)]
     for name in ("key", "arenas/level/start", "learners/params/actor/mean/kernel", "policy_loss"):

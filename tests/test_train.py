@@ -245,6 +245,7 @@ def test_export_gives_all_seeds_or_the_one_that_is_asked_for(
     assert (several / "policy-seed4.npz").read_bytes() == first[4]
 
 
+@pytest.mark.slow
 def test_another_seed_is_another_run(whole: Path, tmp_path: Path) -> None:
     assert _train(f"run.dir={tmp_path}", "seed=1") == 0
     assert _digest(tmp_path) != _digest(whole)

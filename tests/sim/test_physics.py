@@ -45,6 +45,16 @@ SIDE = 0.6  # m
 GRIP = 9.81  # m/s^2; friction 1
 
 
+# What compiles a program of its own, by `jax` half a minute each, is done by `warp` alone unless
+# slow proofs are asked for.
+ONCE_MORE = pytest.mark.parametrize(
+    "engine",
+    [pytest.param(each, marks=[pytest.mark.slow] * (each[0] == "jax")) for each in ENGINES],
+    indirect=True,
+    ids="-".join,
+)
+
+
 @pytest.fixture(scope="module", params=ENGINES, ids="-".join)
 def engine(request: pytest.FixtureRequest) -> Iterator[Engine]:
     # A program of Warp calls back into the process that compiled it: it is not for the disk.
@@ -288,6 +298,7 @@ def _lagging(engine: Engine, robot: RobotConfig) -> tuple[Engine, Any]:
     return engine, changed
 
 
+@ONCE_MORE
 def test_a_lagging_servo_follows_the_closed_form(engine: Engine) -> None:
     robot = dataclasses.replace(engine.loaded.robot, motor_lag=LAG)
     slow, changed = _lagging(engine, robot)
@@ -306,6 +317,7 @@ def test_a_lagging_servo_follows_the_closed_form_in_c(body: str) -> None:
     _check_lag(Path(*(np.concatenate(p, axis=1) for p in zip(*paths, strict=True))), robot)
 
 
+@ONCE_MORE
 def test_the_track_decides_how_far_wheels_turn_a_robot(engine: Engine) -> None:
     # Ten turns on the spot at 3.14 rad/s by the nominal track: 10 * 2 pi / 3.14 = 20.01 s.
     steps, tracks = round(10 * 2 * np.pi / 3.14 / STEP), np.array([0.052, 0.057, 0.055])
@@ -319,6 +331,7 @@ def test_the_track_decides_how_far_wheels_turn_a_robot(engine: Engine) -> None:
     np.testing.assert_allclose(turns, expected, rtol=1e-3)
 
 
+@ONCE_MORE
 def test_another_chassis_drives_as_one_compiled_so(engine: Engine) -> None:
     """Mass, friction, wheels and track set at run time, against a model built with them."""
     robot = dataclasses.replace(
