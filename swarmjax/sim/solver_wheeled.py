@@ -18,10 +18,11 @@ from typing import Any
 import mujoco.mjx.third_party.mujoco_warp as mjw
 import warp as wp
 
-_ITERATIONS = 20  # of Newton's method, at most; two or three do, thirteen were seen
-NUMBER = -1  # what `opt.solver` says; MuJoCo has none of it
 # A sum with nothing, below, is a copy: names in Warp are references, and what is changed in a loop
 # would change what it was called before.
+
+NUMBER = -1  # what `opt.solver` says; MuJoCo has none of it
+_ITERATIONS = 20  # of Newton's method, at most; two or three do, thirteen were seen
 JOINTS = wp.constant(8)  # of a robot: free in space, and two wheels
 # Rows of a robot: 4 of each wheel, 1 of each skid, and contacts of its hull.
 MOST_ROWS = wp.constant(24)
@@ -34,19 +35,19 @@ _SHORT = wp.constant(1e-2)
 _ROUNDING = wp.constant(1e-5)
 # Contacts between robots that are taken as terms of their own. More go into the robots' blocks,
 # which makes for more and shorter steps: five robots have ten pairs, swarms of more get Newton's
-# method (`physics.MOST_WHEELED`).
+# method (`physics.MOST_WHEELED`). As many as a robot's joints: one size of matrix serves both.
 _PAIRS = wp.constant(8)
 
 
-class _Vector(wp.types.vector(length=8, dtype=wp.float32)):
+class _Vector(wp.types.vector(length=JOINTS, dtype=wp.float32)):
     """A number for each joint of a robot."""
 
 
-class _Matrix(wp.types.matrix(shape=(8, 8), dtype=wp.float32)):
+class _Matrix(wp.types.matrix(shape=(JOINTS, JOINTS), dtype=wp.float32)):
     """A number for each two of them."""
 
 
-class _Rows(wp.types.vector(length=24, dtype=wp.float32)):
+class _Rows(wp.types.vector(length=MOST_ROWS, dtype=wp.float32)):
     """A number for each row of a robot."""
 
 
@@ -62,7 +63,7 @@ def step(m: Any, d: Any) -> None:
     mjw.fwd_position(m, d, factorize=False)
     mjw.fwd_velocity(m, d)
     mjw.fwd_actuation(m, d)
-    robots = m.nv // 8
+    robots = m.nv // JOINTS
     problem = _problem(m, d, robots)
     forces = [d.qfrc_applied, d.qfrc_bias, d.qfrc_passive, d.qfrc_actuator, d.qacc_warmstart]
     wp.launch(_begin, dim=(d.nworld, m.nv), inputs=[problem, *forces])
@@ -175,7 +176,7 @@ def _problem(m: Any, d: Any, robots: int) -> Any:
     problem.first = wp.empty((d.nworld, d.njmax), dtype=int)
     problem.second = wp.empty((d.nworld, d.njmax), dtype=int)
     problem.own = wp.empty((d.nworld, robots), dtype=int)
-    problem.row = wp.empty((d.nworld, robots, 24), dtype=int)
+    problem.row = wp.empty((d.nworld, robots, MOST_ROWS), dtype=int)
     problem.touches = wp.empty((d.nworld, robots), dtype=bool)
     return problem
 
@@ -188,9 +189,9 @@ def _together(m: Any, d: Any, robots: int) -> Any:
     together.slope = wp.empty((arenas, d.njmax), dtype=float)
     together.slot = wp.empty((arenas, d.njmax), dtype=int)
     together.taken = wp.empty(arenas, dtype=int)
-    together.pair = wp.empty((arenas, 8), dtype=int)
+    together.pair = wp.empty((arenas, _PAIRS), dtype=int)
     together.factor = wp.empty((arenas, robots), dtype=_Matrix)
-    together.response = wp.empty((arenas, 8, 2), dtype=_Vector)
+    together.response = wp.empty((arenas, _PAIRS, 2), dtype=_Vector)
     return together
 
 
@@ -409,17 +410,23 @@ def _length(
     pull = inertia * now - _of_robot(problem.force, arena, robot)
     first, curve = wp.dot(pull, downhill), wp.dot(downhill, inertia * downhill)
     begin = _tilt(problem, arena, robot, gap, slope, 0.0)[0] + first
-    low, high, length = wp.float32(0.0), wp.float32(1e6), wp.float32(1.0)
+    search = wp.vec3(0.0, 1e6, 1.0)
     for _ in range(_SEARCHES):
-        bend = _tilt(problem, arena, robot, gap, slope, length)
-        tilt = bend[0] + first + length * curve
+        bend = _tilt(problem, arena, robot, gap, slope, search[2])
+        tilt = bend[0] + first + search[2] * curve
         if wp.abs(tilt) <= _FLAT * wp.abs(begin):
             break
-        low = wp.where(tilt < 0.0, length, low)
-        high = wp.where(tilt < 0.0, high, length)
-        there = length - tilt / (bend[1] + curve)
-        length = wp.where(low < there and there < high, there, 0.5 * (low + high))
-    return length
+        search = _narrow(search, tilt, bend[1] + curve)
+    return search[2]
+
+
+@wp.func
+def _narrow(search: wp.vec3, tilt: float, curve: float) -> wp.vec3:
+    """Too short a length, too long a one, and where to look next: by Newton, or halfway."""
+    low = wp.where(tilt < 0.0, search[2], search[0])
+    high = wp.where(tilt < 0.0, search[1], search[2])
+    there = search[2] - tilt / curve
+    return wp.vec3(low, high, wp.where(low < there and there < high, there, 0.5 * (low + high)))
 
 
 @wp.func
@@ -576,17 +583,14 @@ def _length_together(problem: Problem, together: Together, arena: int, robots: i
     for row in range(_count(problem, arena)):
         together.slope[arena, row] = _along(problem, arena, row, together.step)
     begin = _tilt_together(problem, together, arena, 0.0)[0] + first
-    low, high, length = wp.float32(0.0), wp.float32(1e6), wp.float32(1.0)
+    search = wp.vec3(0.0, 1e6, 1.0)
     for _ in range(_SEARCHES):
-        bend = _tilt_together(problem, together, arena, length)
-        tilt = bend[0] + first + length * curve
+        bend = _tilt_together(problem, together, arena, search[2])
+        tilt = bend[0] + first + search[2] * curve
         if wp.abs(tilt) <= _FLAT * wp.abs(begin):
             break
-        low = wp.where(tilt < 0.0, length, low)
-        high = wp.where(tilt < 0.0, high, length)
-        there = length - tilt / (bend[1] + curve)
-        length = wp.where(low < there and there < high, there, 0.5 * (low + high))
-    return length
+        search = _narrow(search, tilt, bend[1] + curve)
+    return search[2]
 
 
 @wp.func
