@@ -18,12 +18,15 @@ from typing import Any
 import mujoco.mjx.third_party.mujoco_warp as mjw
 import warp as wp
 
-# A sum with nothing, below, is a copy: names in Warp are references, and what is changed in a loop
-# would change what it was called before.
+# Loops over joints are unrolled, which Warp does if their ends are constants or the count of a loop
+# around them: only then does a matrix stay in registers. Functions get copies of their arguments.
 
 NUMBER = -1  # what `opt.solver` says; MuJoCo has none of it
 _ITERATIONS = 20  # of Newton's method, at most; two or three do, thirteen were seen
 JOINTS = wp.constant(8)  # of a robot: free in space, and two wheels
+_FREE = wp.constant(6)  # of these, free in space
+_INERTIA = wp.constant(35)  # entries of a robot's M, without that of both wheels, which is 0
+_BLOCK = 64  # threads; each has much to do, and some much more: small blocks wait less
 # Rows of a robot: 4 of each wheel, 1 of each skid, and contacts of its hull.
 MOST_ROWS = wp.constant(24)
 _SEARCHES = wp.constant(12)  # of a step's length
@@ -64,14 +67,16 @@ def step(m: Any, d: Any) -> None:
     mjw.fwd_velocity(m, d)
     mjw.fwd_actuation(m, d)
     robots = m.nv // JOINTS
-    problem = _problem(m, d, robots)
+    problem, together = _problem(m, d, robots), _together(m, d, robots)
     forces = [d.qfrc_applied, d.qfrc_bias, d.qfrc_passive, d.qfrc_actuator, d.qacc_warmstart]
     wp.launch(_begin, dim=(d.nworld, m.nv), inputs=[problem, *forces])
-    wp.launch(_share_out, dim=d.nworld, inputs=[problem, _sides(m, d), robots])
+    together.crowded.zero_()
+    d.solver_niter.zero_()
+    wp.launch(_share_out, dim=(d.nworld, robots), inputs=[problem, together])
     most = min(m.opt.iterations, _ITERATIONS)
-    wp.launch(_relax_each, dim=(d.nworld, robots), inputs=[problem, most])
-    together = _together(m, d, robots)
-    wp.launch(_relax_pairs, dim=d.nworld, inputs=[problem, together, robots, most, d.solver_niter])
+    wp.launch(_relax_each, dim=(d.nworld, robots), inputs=[problem, most], block_dim=_BLOCK)
+    inputs = [problem, together, robots, most, d.solver_niter]
+    wp.launch(_relax_pairs, dim=d.nworld, inputs=inputs, block_dim=_BLOCK)
     mjw.euler(m, d)
 
 
@@ -82,30 +87,24 @@ class Problem:
     Attributes:
       force: [A, V] what acts on the joints but contacts, M a0.
       qacc: [A, V] accelerations.
-      M: [A, C] inertia matrices; a row has `M_count` entries from `M_first` on.
-      M_first: [V].
-      M_count: [V].
-      M_column: [C].
+      M: [A, C] inertia matrices, `_INERTIA` entries a robot.
       count: [A] rows of the Jacobian.
-      J: [A, 1, E] Jacobians; a row has `J_count` entries from `J_first` on.
+      J: [A, 1, E] Jacobians; a row has `J_count` entries from `J_first` on, of joints that go down.
       J_first: [A, N].
       J_count: [A, N].
       J_column: [A, 1, E].
       D: [A, N] weight of a row.
       aref: [A, N] acceleration that it asks for.
-      first: [A, N] a robot of a row; -1: none.
-      second: [A, N] the other.
+      first: [A, N] the robot of a row and its `_entries`; of two, the one with the higher number.
+      second: [A, N] the other; -1: none.
       own: [A, R] rows of a robot.
-      row: [A, R, K] which they are.
+      row: [A, R, K] which they are, and its `_entries` in them.
       touches: [A, R] whether any is of another robot too.
     """
 
     force: wp.array2d[float]
     qacc: wp.array2d[float]
     M: wp.array2d[float]
-    M_first: wp.array[int]
-    M_count: wp.array[int]
-    M_column: wp.array[int]
     count: wp.array[int]
     J: wp.array3d[float]
     J_first: wp.array2d[int]
@@ -113,10 +112,10 @@ class Problem:
     J_column: wp.array3d[int]
     D: wp.array2d[float]
     aref: wp.array2d[float]
-    first: wp.array2d[int]
-    second: wp.array2d[int]
+    first: wp.array2d[wp.vec3i]
+    second: wp.array2d[wp.vec3i]
     own: wp.array2d[int]
-    row: wp.array3d[int]
+    row: wp.array3d[wp.vec3i]
     touches: wp.array2d[bool]
 
 
@@ -125,6 +124,10 @@ class Together:
     """What is worked out for robots that touch each other.
 
     Attributes:
+      crowded: [1] how many arenas have any.
+      arena: [A] which they are.
+      count: [A] rows of such robots.
+      row: [A, N] which they are.
       step: [A, V] Newton's; 0 of all other robots.
       gap: [A, N] J a - aref: a row acts below 0.
       slope: [A, N] J times the step.
@@ -135,6 +138,10 @@ class Together:
       response: [A, P, 2] what a unit of the force of a pair's contact brings about in either robot.
     """
 
+    crowded: wp.array[int]
+    arena: wp.array[int]
+    count: wp.array[int]
+    row: wp.array2d[int]
     step: wp.array2d[float]
     gap: wp.array2d[float]
     slope: wp.array2d[float]
@@ -145,38 +152,18 @@ class Together:
     response: wp.array3d[_Vector]
 
 
-@wp.struct
-class Sides:
-    """What contacts are between.
-
-    Attributes:
-      contact: [A, N] which of all contacts a row is of.
-      geom: [C] the two geoms of each contact of all arenas.
-      body: [G] of a geom.
-      root: [B] the body that carries a body.
-      joint: [B] the first joint of a body; -1 of what stands.
-    """
-
-    contact: wp.array2d[int]
-    geom: wp.array[wp.vec2i]
-    body: wp.array[int]
-    root: wp.array[int]
-    joint: wp.array[int]
-
-
 def _problem(m: Any, d: Any, robots: int) -> Any:
     """Gathers the problem; what it lists is not filled in yet."""
     problem = Problem()
     problem.force = wp.empty((d.nworld, m.nv), dtype=float)
     problem.qacc, problem.M = d.qacc, d.M
-    problem.M_first, problem.M_count, problem.M_column = m.M_rowadr, m.M_rownnz, m.M_colind
     problem.count, problem.J, problem.D, problem.aref = d.nefc, d.efc.J, d.efc.D, d.efc.aref
     problem.J_first, problem.J_count = d.efc.J_rowadr, d.efc.J_rownnz
     problem.J_column = d.efc.J_colind
-    problem.first = wp.empty((d.nworld, d.njmax), dtype=int)
-    problem.second = wp.empty((d.nworld, d.njmax), dtype=int)
+    problem.first = wp.empty((d.nworld, d.njmax), dtype=wp.vec3i)
+    problem.second = wp.empty((d.nworld, d.njmax), dtype=wp.vec3i)
     problem.own = wp.empty((d.nworld, robots), dtype=int)
-    problem.row = wp.empty((d.nworld, robots, MOST_ROWS), dtype=int)
+    problem.row = wp.empty((d.nworld, robots, MOST_ROWS), dtype=wp.vec3i)
     problem.touches = wp.empty((d.nworld, robots), dtype=bool)
     return problem
 
@@ -184,6 +171,10 @@ def _problem(m: Any, d: Any, robots: int) -> Any:
 def _together(m: Any, d: Any, robots: int) -> Any:
     """Makes room for what is worked out for robots that touch each other."""
     arenas, together = d.nworld, Together()
+    together.crowded = wp.empty(1, dtype=int)
+    together.arena = wp.empty(arenas, dtype=int)
+    together.count = wp.empty(arenas, dtype=int)
+    together.row = wp.empty((arenas, d.njmax), dtype=int)
     together.step = wp.empty((arenas, m.nv), dtype=float)
     together.gap = wp.empty((arenas, d.njmax), dtype=float)
     together.slope = wp.empty((arenas, d.njmax), dtype=float)
@@ -193,14 +184,6 @@ def _together(m: Any, d: Any, robots: int) -> Any:
     together.factor = wp.empty((arenas, robots), dtype=_Matrix)
     together.response = wp.empty((arenas, _PAIRS, 2), dtype=_Vector)
     return together
-
-
-def _sides(m: Any, d: Any) -> Any:
-    """Gathers what contacts are between."""
-    sides = Sides()
-    sides.contact, sides.geom = d.efc.id, d.contact.geom
-    sides.body, sides.root, sides.joint = m.geom_bodyid, m.body_rootid, m.body_dofadr
-    return sides
 
 
 @wp.kernel(enable_backward=False)
@@ -220,19 +203,26 @@ def _begin(
 
 
 @wp.kernel(enable_backward=False)
-def _share_out(problem: Problem, sides: Sides, robots: int) -> None:
-    """Lists the rows of each robot of an arena."""
-    arena = wp.tid()
-    for robot in range(robots):
-        problem.own[arena, robot] = 0
-        problem.touches[arena, robot] = False
+def _share_out(problem: Problem, together: Together) -> None:
+    """Lists the rows of a robot, and, by its first robot, an arena in which any touch."""
+    arena, robot = wp.tid()
+    own = wp.int32(0)
+    touches, crowded = wp.bool(False), wp.bool(False)
     for row in range(_count(problem, arena)):
-        geoms = sides.geom[sides.contact[arena, row]]
-        first = _robot(sides, geoms[0])
-        second = _robot(sides, geoms[1])
-        between = first >= 0 and second >= 0
-        problem.first[arena, row] = _list(problem, arena, row, first, between)
-        problem.second[arena, row] = _list(problem, arena, row, second, between)
+        first, second = _sides(problem, arena, row)
+        if robot == first[0]:
+            problem.first[arena, row] = first
+            problem.second[arena, row] = second
+        side = wp.where(robot == first[0], first, second)
+        if robot == side[0] and own < MOST_ROWS:
+            problem.row[arena, robot, own] = wp.vec3i(row, side[1], side[2])
+            own += 1
+            touches = touches or second[0] >= 0
+        crowded = crowded or second[0] >= 0
+    problem.own[arena, robot] = own
+    problem.touches[arena, robot] = touches
+    if crowded and robot == 0:
+        together.arena[wp.atomic_add(together.crowded, 0, 1)] = arena
 
 
 @wp.func
@@ -242,22 +232,20 @@ def _count(problem: Problem, arena: int) -> int:
 
 
 @wp.func
-def _robot(sides: Sides, geom: int) -> int:
-    """Which robot a geom is of; -1: none."""
-    joint = sides.joint[sides.root[sides.body[geom]]]
-    return wp.where(joint < 0, -1, joint / JOINTS)
+def _sides(problem: Problem, arena: int, row: int) -> tuple[wp.vec3i, wp.vec3i]:
+    """The robots of a row and their `_entries` in it; of two, the higher number comes first.
 
-
-@wp.func
-def _list(problem: Problem, arena: int, row: int, robot: int, between: bool) -> int:
-    """Adds a row to those of a robot; -1 if it is none's, or the robot has no room for more."""
-    if robot < 0 or problem.own[arena, robot] >= MOST_ROWS:
-        return -1
-    problem.row[arena, robot, problem.own[arena, robot]] = row
-    problem.own[arena, robot] = problem.own[arena, robot] + 1
-    if between:
-        problem.touches[arena, robot] = True
-    return robot
+    A row begins with the entry of a wheel if there is one; six of a body end it.
+    """
+    first = problem.J_first[arena, row]
+    last = first + problem.J_count[arena, row] - 1
+    joint = problem.J_column[arena, 0, first]
+    higher, lower = joint / JOINTS, problem.J_column[arena, 0, last] / JOINTS
+    wheel = wp.where(joint % JOINTS < _FREE, -1, joint % JOINTS)
+    body = wp.where(wheel < 0, first, first + 1)
+    none = wp.vec3i(-1, -1, -1)
+    other = wp.where(lower == higher, none, wp.vec3i(lower, last - _FREE + 1, -1))
+    return wp.vec3i(higher, body, wheel), other
 
 
 @wp.kernel(enable_backward=False)
@@ -272,15 +260,16 @@ def _relax_each(problem: Problem, iterations: int) -> None:
 def _relax(problem: Problem, arena: int, robot: int, iterations: int) -> None:
     """Newton's method for a robot alone."""
     now = _of_robot(problem.qacc, arena, robot)
-    inertia = _inertia(problem, arena, robot)
     done = wp.int32(0)
     moves = wp.bool(True)
     while moves and done < iterations:
         gap = _gaps(problem, arena, robot, now, 1.0)
-        downhill = _newton(problem, arena, robot, inertia, gap, now)
+        downhill = _newton(problem, arena, robot, gap, now)
         slope = _gaps(problem, arena, robot, downhill, 0.0)
-        length = _length(problem, arena, robot, inertia, gap, slope, now, downhill)
-        moves = _switches(problem.own[arena, robot], gap, slope, length) or length != 1.0
+        length = wp.float32(1.0)
+        moves = _switches(problem.own[arena, robot], gap, slope)
+        if moves:
+            length = _length(problem, arena, robot, gap, slope, now, downhill)
         moves = _goes_on(moves, wp.max(wp.abs(downhill)), wp.max(wp.abs(now)))
         now = now + length * downhill
         done += 1
@@ -311,27 +300,38 @@ def _set(of_joints: wp.array2d[float], arena: int, robot: int, numbers: _Vector)
 
 @wp.func
 def _inertia(problem: Problem, arena: int, robot: int) -> _Matrix:
-    """M of a robot."""
+    """M of a robot, the lower half of it: MuJoCo keeps its rows one after the other."""
     found = _Matrix()
-    for i in range(8):
-        dof = robot * JOINTS + i
-        first = problem.M_first[dof]
-        for entry in range(first, first + problem.M_count[dof]):
-            j = problem.M_column[entry] - robot * JOINTS
+    entry = robot * _INERTIA
+    for i in range(6):
+        for j in range(i):
             found[i, j] = problem.M[arena, entry]
-            found[j, i] = problem.M[arena, entry]
+            entry += 1
+        found[i, i] = problem.M[arena, entry]
+        entry += 1
+    for wheel in range(6, 8):
+        for j in range(6):
+            found[wheel, j] = problem.M[arena, entry]
+            entry += 1
+        found[wheel, wheel] = problem.M[arena, entry]
+        entry += 1
     return found
 
 
 @wp.func
-def _jacobian(problem: Problem, arena: int, row: int, robot: int) -> _Vector:
-    """A row's entries at a robot."""
+def _entries(problem: Problem, arena: int, side: wp.vec3i) -> _Vector:
+    """A row's entries at a robot.
+
+    Args:
+      side: anything; where the body's six entries are, which come from the last joint to the first;
+        and which joint of a wheel has the one before them, -1: none.
+    """
     found = _Vector()
-    first = problem.J_first[arena, row]
-    for entry in range(first, first + problem.J_count[arena, row]):
-        i = problem.J_column[arena, 0, entry] - robot * JOINTS
-        if i >= 0 and i < JOINTS:
-            found[i] = problem.J[arena, 0, entry]
+    for i in range(6):
+        found[i] = problem.J[arena, 0, side[1] + 5 - i]
+    for wheel in range(6, 8):
+        if side[2] == wheel:
+            found[wheel] = problem.J[arena, 0, side[1] - 1]
     return found
 
 
@@ -341,58 +341,73 @@ def _gaps(problem: Problem, arena: int, robot: int, along: _Vector, asked: float
     found = _Rows()
     for k in range(problem.own[arena, robot]):
         row = problem.row[arena, robot, k]
-        slope = _jacobian(problem, arena, row, robot)
-        found[k] = wp.dot(slope, along) - asked * problem.aref[arena, row]
+        slope = _entries(problem, arena, row)
+        found[k] = wp.dot(slope, along) - asked * problem.aref[arena, row[0]]
     return found
 
 
 @wp.func
-def _newton(
-    problem: Problem, arena: int, robot: int, inertia: _Matrix, gap: _Rows, now: _Vector
-) -> _Vector:
+def _newton(problem: Problem, arena: int, robot: int, gap: _Rows, now: _Vector) -> _Vector:
     """Newton's step, of the rows that act now."""
-    hessian = inertia + _Matrix()
-    uphill = inertia * now - _of_robot(problem.force, arena, robot)
+    hessian = _inertia(problem, arena, robot)
+    uphill = _times(hessian, now) - _of_robot(problem.force, arena, robot)
     for k in range(problem.own[arena, robot]):
         if gap[k] < 0.0:
             row = problem.row[arena, robot, k]
-            slope = _jacobian(problem, arena, row, robot)
-            weighted = problem.D[arena, row] * slope
+            slope = _entries(problem, arena, row)
+            weighted = problem.D[arena, row[0]] * slope
             uphill = uphill + gap[k] * weighted
-            hessian = hessian + wp.outer(weighted, slope)
+            hessian = _add(hessian, weighted, slope)
     return _substitute(_factor(hessian), -uphill)
 
 
 @wp.func
-def _factor(matrix: _Matrix) -> _Matrix:
-    """Cholesky's L, of a symmetric positive definite matrix L L'; above it is what was there."""
-    lower = matrix + _Matrix()
+def _times(matrix: _Matrix, vector: _Vector) -> _Vector:
+    """Product with a symmetric matrix of which there is the lower half."""
+    found = _Vector()
     for i in range(8):
-        for j in range(i + 1):
-            entry = lower[i, j]
+        for j in range(i):
+            found[i] = found[i] + matrix[i, j] * vector[j]
+            found[j] = found[j] + matrix[i, j] * vector[i]
+        found[i] = found[i] + matrix[i, i] * vector[i]
+    return found
+
+
+@wp.func
+def _add(matrix: _Matrix, left: _Vector, right: _Vector) -> _Matrix:
+    """The lower half of matrix + left right', which is symmetric."""
+    for i in range(8):
+        for j in range(i):
+            matrix[i, j] = matrix[i, j] + left[i] * right[j]
+        matrix[i, i] = matrix[i, i] + left[i] * right[i]
+    return matrix
+
+
+@wp.func
+def _factor(matrix: _Matrix) -> _Matrix:
+    """Cholesky's L of a positive definite matrix L L' of which there is the lower half."""
+    for i in range(8):
+        for j in range(i):
             for k in range(j):
-                entry = entry - lower[i, k] * lower[j, k]
-            if i == j:
-                lower[i, i] = wp.sqrt(entry)
-            else:
-                lower[i, j] = entry / lower[j, j]
-    return lower
+                matrix[i, j] = matrix[i, j] - matrix[i, k] * matrix[j, k]
+            matrix[i, j] = matrix[i, j] / matrix[j, j]
+            matrix[i, i] = matrix[i, i] - matrix[i, j] * matrix[i, j]
+        matrix[i, i] = wp.sqrt(matrix[i, i])
+    return matrix
 
 
 @wp.func
 def _substitute(lower: _Matrix, right: _Vector) -> _Vector:
     """Solves L L' x = right."""
-    found = right + _Vector()
     for i in range(8):
-        for k in range(i):
-            found[i] = found[i] - lower[i, k] * found[k]
-        found[i] = found[i] / lower[i, i]
-    for back in range(8):
-        i = 7 - back
-        for k in range(i + 1, 8):
-            found[i] = found[i] - lower[k, i] * found[k]
-        found[i] = found[i] / lower[i, i]
-    return found
+        for j in range(i):
+            right[i] = right[i] - lower[i, j] * right[j]
+        right[i] = right[i] / lower[i, i]
+    for i in range(7, -1, -1):
+        right[i] = right[i] / lower[i, i]
+        for j in range(i):
+            right[j] = right[j] - lower[i, j] * right[i]
+    return right
 
 
 @wp.func
@@ -400,15 +415,15 @@ def _length(
     problem: Problem,
     arena: int,
     robot: int,
-    inertia: _Matrix,
     gap: _Rows,
     slope: _Rows,
     now: _Vector,
     downhill: _Vector,
 ) -> float:
     """How far to go along a step: where the cost, which is convex along it, is least."""
-    pull = inertia * now - _of_robot(problem.force, arena, robot)
-    first, curve = wp.dot(pull, downhill), wp.dot(downhill, inertia * downhill)
+    inertia = _inertia(problem, arena, robot)
+    pull = _times(inertia, now) - _of_robot(problem.force, arena, robot)
+    first, curve = wp.dot(pull, downhill), wp.dot(downhill, _times(inertia, downhill))
     begin = _tilt(problem, arena, robot, gap, slope, 0.0)[0] + first
     search = wp.vec3(0.0, 1e6, 1.0)
     for _ in range(_SEARCHES):
@@ -438,17 +453,20 @@ def _tilt(
     for k in range(problem.own[arena, robot]):
         there = gap[k] + length * slope[k]
         if there < 0.0:
-            weighted = problem.D[arena, problem.row[arena, robot, k]] * slope[k]
+            weighted = problem.D[arena, problem.row[arena, robot, k][0]] * slope[k]
             tilt = tilt + weighted * wp.vec2(there, slope[k])
     return tilt
 
 
 @wp.func
-def _switches(count: int, gap: _Rows, slope: _Rows, length: float) -> bool:
-    """Whether any row acts before a step and not after it, or the other way round."""
+def _switches(count: int, gap: _Rows, slope: _Rows) -> bool:
+    """Whether a row acts before a whole step and not after it, or the other way round.
+
+    If none does, the cost is quadratic along the step, and its whole length the best.
+    """
     switches = wp.bool(False)
     for k in range(count):
-        if (gap[k] < 0.0) != (gap[k] + length * slope[k] < 0.0):
+        if (gap[k] < 0.0) != (gap[k] + slope[k] < 0.0):
             switches = True
     return switches
 
@@ -458,29 +476,40 @@ def _relax_pairs(
     problem: Problem, together: Together, robots: int, iterations: int, niter: wp.array[int]
 ) -> None:
     """Newton's method for the robots of an arena that touch each other."""
-    arena = wp.tid()
-    done = wp.int32(0)
-    moves = wp.bool(False)
-    for robot in range(robots):
-        moves = moves or problem.touches[arena, robot]
-    while moves and done < iterations:
-        _pick(problem, together, arena)
-        for robot in range(robots):
-            _descend(problem, together, arena, robot)
-        _couple(problem, together, arena)
-        length = _length_together(problem, together, arena, robots)
-        moves = _moves(problem, together, arena, length)
-        done += 1
-    niter[arena] = done
+    if wp.tid() < together.crowded[0]:
+        arena = together.arena[wp.tid()]
+        _collect(problem, together, arena)
+        done = wp.int32(0)
+        moves = wp.bool(True)
+        while moves and done < iterations:
+            _pick(problem, together, arena)
+            for robot in range(robots):
+                _descend(problem, together, arena, robot)
+            _couple(problem, together, arena)
+            moves = _take(problem, together, arena, robots)
+            done += 1
+        niter[arena] = done
+
+
+@wp.func
+def _collect(problem: Problem, together: Together, arena: int) -> None:
+    """Lists the rows of robots that touch each other."""
+    count = wp.int32(0)
+    for row in range(_count(problem, arena)):
+        if problem.touches[arena, problem.first[arena, row][0]]:
+            together.row[arena, count] = row
+            count += 1
+    together.count[arena] = count
 
 
 @wp.func
 def _along(problem: Problem, arena: int, row: int, of_joints: wp.array2d[float]) -> float:
     """A row of J times what all joints of its arena have."""
-    found = wp.float32(0.0)
-    first = problem.J_first[arena, row]
-    for entry in range(first, first + problem.J_count[arena, row]):
-        found += problem.J[arena, 0, entry] * of_joints[arena, problem.J_column[arena, 0, entry]]
+    side = problem.first[arena, row]
+    found = wp.dot(_entries(problem, arena, side), _of_robot(of_joints, arena, side[0]))
+    side = problem.second[arena, row]
+    if side[0] >= 0:
+        found += wp.dot(_entries(problem, arena, side), _of_robot(of_joints, arena, side[0]))
     return found
 
 
@@ -488,12 +517,12 @@ def _along(problem: Problem, arena: int, row: int, of_joints: wp.array2d[float])
 def _pick(problem: Problem, together: Together, arena: int) -> None:
     """Finds out which rows act, and which of those between robots become terms of their own."""
     taken = wp.int32(0)
-    for row in range(_count(problem, arena)):
+    for k in range(together.count[arena]):
+        row = together.row[arena, k]
         gap = _along(problem, arena, row, problem.qacc) - problem.aref[arena, row]
         together.gap[arena, row] = gap
         together.slot[arena, row] = -1
-        between = problem.first[arena, row] >= 0 and problem.second[arena, row] >= 0
-        if between and gap < 0.0 and taken < _PAIRS:
+        if problem.second[arena, row][0] >= 0 and gap < 0.0 and taken < _PAIRS:
             together.slot[arena, row] = taken
             together.pair[arena, taken] = row
             taken += 1
@@ -505,19 +534,19 @@ def _descend(problem: Problem, together: Together, arena: int, robot: int) -> No
     """Works out a robot's step as if its pairs' terms were not there, and its block's factor."""
     _set(together.step, arena, robot, _Vector())
     if problem.touches[arena, robot]:
-        inertia = _inertia(problem, arena, robot)
+        hessian = _inertia(problem, arena, robot)
         now = _of_robot(problem.qacc, arena, robot)
-        uphill = inertia * now - _of_robot(problem.force, arena, robot)
+        uphill = _times(hessian, now) - _of_robot(problem.force, arena, robot)
         for k in range(problem.own[arena, robot]):
             row = problem.row[arena, robot, k]
-            gap = together.gap[arena, row]
+            gap = together.gap[arena, row[0]]
             if gap < 0.0:
-                slope = _jacobian(problem, arena, row, robot)
-                weighted = problem.D[arena, row] * slope
+                slope = _entries(problem, arena, row)
+                weighted = problem.D[arena, row[0]] * slope
                 uphill = uphill + gap * weighted
-                if together.slot[arena, row] < 0:
-                    inertia = inertia + wp.outer(weighted, slope)
-        factor = _factor(inertia)
+                if together.slot[arena, row[0]] < 0:
+                    hessian = _add(hessian, weighted, slope)
+        factor = _factor(hessian)
         together.factor[arena, robot] = factor
         _set(together.step, arena, robot, _substitute(factor, -uphill))
 
@@ -532,28 +561,28 @@ def _couple(problem: Problem, together: Together, arena: int) -> None:
         row = together.pair[arena, i]
         right[i] = _along(problem, arena, row, together.step)
         for side in range(2):
-            robot = _side(problem, arena, row, side)
-            slope = _jacobian(problem, arena, row, robot)
-            factor = together.factor[arena, robot]
+            mine = _side(problem, arena, row, side)
+            factor = together.factor[arena, mine[0]]
+            slope = _entries(problem, arena, mine)
             together.response[arena, i, side] = _substitute(factor, slope)
         matrix[i, i] = 1.0 / problem.D[arena, row]
     for i in range(taken):
-        for j in range(taken):
+        for j in range(i + 1):
             for sides in range(4):
                 push = _overlap(problem, together, arena, i, j, sides)
                 matrix[i, j] = matrix[i, j] + push
     force = _substitute(_factor(matrix), right)
     for i in range(taken):
         for side in range(2):
-            robot = _side(problem, arena, together.pair[arena, i], side)
+            robot = _side(problem, arena, together.pair[arena, i], side)[0]
             step = _of_robot(together.step, arena, robot)
             response = together.response[arena, i, side]
             _set(together.step, arena, robot, step - force[i] * response)
 
 
 @wp.func
-def _side(problem: Problem, arena: int, row: int, side: int) -> int:
-    """The first or the second robot of a row."""
+def _side(problem: Problem, arena: int, row: int, side: int) -> wp.vec3i:
+    """The first or the second robot of a row, and its `_entries` there."""
     return wp.where(side == 0, problem.first[arena, row], problem.second[arena, row])
 
 
@@ -563,10 +592,32 @@ def _overlap(problem: Problem, together: Together, arena: int, i: int, j: int, s
     row = together.pair[arena, i]
     mine = _side(problem, arena, row, sides % 2)
     theirs = _side(problem, arena, together.pair[arena, j], sides // 2)
-    if mine != theirs:
+    if mine[0] != theirs[0]:
         return 0.0
-    slope = _jacobian(problem, arena, row, mine)
-    return wp.dot(slope, together.response[arena, j, sides // 2])
+    return wp.dot(_entries(problem, arena, mine), together.response[arena, j, sides // 2])
+
+
+@wp.func
+def _take(problem: Problem, together: Together, arena: int, robots: int) -> bool:
+    """Takes the step; says whether another is needed."""
+    switches = wp.bool(False)
+    for k in range(together.count[arena]):
+        row = together.row[arena, k]
+        gap, slope = together.gap[arena, row], _along(problem, arena, row, together.step)
+        together.slope[arena, row] = slope
+        switches = switches or (gap < 0.0) != (gap + slope < 0.0)
+    length = wp.float32(1.0)
+    if switches:
+        length = _length_together(problem, together, arena, robots)
+    largest, longest = wp.float32(0.0), wp.float32(0.0)
+    for robot in range(robots):
+        if problem.touches[arena, robot]:
+            now = _of_robot(problem.qacc, arena, robot)
+            step = _of_robot(together.step, arena, robot)
+            largest = wp.max(largest, wp.max(wp.abs(now)))
+            longest = wp.max(longest, wp.max(wp.abs(step)))
+            _set(problem.qacc, arena, robot, now + length * step)
+    return _goes_on(switches, longest, largest)
 
 
 @wp.func
@@ -578,10 +629,9 @@ def _length_together(problem: Problem, together: Together, arena: int, robots: i
             inertia = _inertia(problem, arena, robot)
             step = _of_robot(together.step, arena, robot)
             now = _of_robot(problem.qacc, arena, robot)
-            first += wp.dot(inertia * now - _of_robot(problem.force, arena, robot), step)
-            curve += wp.dot(inertia * step, step)
-    for row in range(_count(problem, arena)):
-        together.slope[arena, row] = _along(problem, arena, row, together.step)
+            pull = _times(inertia, now) - _of_robot(problem.force, arena, robot)
+            first += wp.dot(pull, step)
+            curve += wp.dot(_times(inertia, step), step)
     begin = _tilt_together(problem, together, arena, 0.0)[0] + first
     search = wp.vec3(0.0, 1e6, 1.0)
     for _ in range(_SEARCHES):
@@ -595,29 +645,12 @@ def _length_together(problem: Problem, together: Together, arena: int, robots: i
 
 @wp.func
 def _tilt_together(problem: Problem, together: Together, arena: int, length: float) -> wp.vec2:
-    """First and second derivative of all rows' cost along the step."""
+    """First and second derivative of those rows' cost along the step."""
     tilt = wp.vec2()
-    for row in range(_count(problem, arena)):
+    for k in range(together.count[arena]):
+        row = together.row[arena, k]
         slope = together.slope[arena, row]
         there = together.gap[arena, row] + length * slope
         if there < 0.0:
             tilt = tilt + problem.D[arena, row] * slope * wp.vec2(there, slope)
     return tilt
-
-
-@wp.func
-def _moves(problem: Problem, together: Together, arena: int, length: float) -> bool:
-    """Takes the step; says whether another is needed."""
-    moves = length != 1.0
-    for row in range(_count(problem, arena)):
-        gap = together.gap[arena, row]
-        if (gap < 0.0) != (gap + length * together.slope[arena, row] < 0.0):
-            moves = wp.bool(True)
-    largest, longest = wp.float32(0.0), wp.float32(0.0)
-    for dof in range(problem.qacc.shape[1]):
-        step = together.step[arena, dof]
-        if step != 0.0:
-            largest = wp.max(largest, wp.abs(problem.qacc[arena, dof]))
-            longest = wp.max(longest, wp.abs(step))
-            problem.qacc[arena, dof] = problem.qacc[arena, dof] + length * step
-    return _goes_on(moves, longest, largest)
