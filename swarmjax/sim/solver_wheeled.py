@@ -26,6 +26,13 @@ _ITERATIONS = 20  # of Newton's method, at most; two or three do, thirteen were 
 JOINTS = wp.constant(8)  # of a robot: free in space, and two wheels
 _FREE = wp.constant(6)  # of these, free in space
 _INERTIA = wp.constant(35)  # entries of a robot's M, without that of both wheels, which is 0
+_SHARED = wp.constant(-2)  # instead of a wheel, in a row of two robots
+# What `Problem.scaled` has after a row's entries.
+_AREF = wp.constant(8)
+_GAP = wp.constant(9)
+_SLOPE = wp.constant(10)
+# Threads of which one takes an arena: what 32 read each from its own place takes 32 turns.
+_SPREAD = wp.constant(4)
 _BLOCK = 64  # threads; each has much to do, and some much more: small blocks wait less
 # Rows of a robot: 4 of each wheel, 1 of each skid, and contacts of its hull.
 MOST_ROWS = wp.constant(24)
@@ -50,10 +57,6 @@ class _Matrix(wp.types.matrix(shape=(JOINTS, JOINTS), dtype=wp.float32)):
     """A number for each two of them."""
 
 
-class _Rows(wp.types.vector(length=MOST_ROWS, dtype=wp.float32)):
-    """A number for each row of a robot."""
-
-
 def step(m: Any, d: Any) -> None:
     """Moves all arenas of wheeled robots on by one physics step (MuJoCo's semi-implicit Euler).
 
@@ -76,7 +79,7 @@ def step(m: Any, d: Any) -> None:
     most = min(m.opt.iterations, _ITERATIONS)
     wp.launch(_relax_each, dim=(d.nworld, robots), inputs=[problem, most], block_dim=_BLOCK)
     inputs = [problem, together, robots, most, d.solver_niter]
-    wp.launch(_relax_pairs, dim=d.nworld, inputs=inputs, block_dim=_BLOCK)
+    wp.launch(_relax_pairs, dim=d.nworld * _SPREAD, inputs=inputs, block_dim=_BLOCK)
     mjw.euler(m, d)
 
 
@@ -100,6 +103,8 @@ class Problem:
       own: [A, R] rows of a robot.
       row: [A, R, K] which they are, and its `_entries` in them.
       touches: [A, R] whether any is of another robot too.
+      scaled: [K, 11, A R] times the root of D: its `_entries` in them and aref, and, as `_relax`
+        goes, J a - aref and J times the step. What threads read at once lies side by side.
     """
 
     force: wp.array2d[float]
@@ -117,6 +122,7 @@ class Problem:
     own: wp.array2d[int]
     row: wp.array3d[wp.vec3i]
     touches: wp.array2d[bool]
+    scaled: wp.array3d[float]
 
 
 @wp.struct
@@ -126,7 +132,7 @@ class Together:
     Attributes:
       crowded: [1] how many arenas have any.
       arena: [A] which they are.
-      count: [A] rows of such robots.
+      count: [A] rows between two robots.
       row: [A, N] which they are.
       step: [A, V] Newton's; 0 of all other robots.
       gap: [A, N] J a - aref: a row acts below 0.
@@ -165,6 +171,7 @@ def _problem(m: Any, d: Any, robots: int) -> Any:
     problem.own = wp.empty((d.nworld, robots), dtype=int)
     problem.row = wp.empty((d.nworld, robots, MOST_ROWS), dtype=wp.vec3i)
     problem.touches = wp.empty((d.nworld, robots), dtype=bool)
+    problem.scaled = wp.empty((MOST_ROWS, _SLOPE + 1, d.nworld * robots), dtype=float)
     return problem
 
 
@@ -216,6 +223,7 @@ def _share_out(problem: Problem, together: Together) -> None:
         side = wp.where(robot == first[0], first, second)
         if robot == side[0] and own < MOST_ROWS:
             problem.row[arena, robot, own] = wp.vec3i(row, side[1], side[2])
+            _scale(problem, arena, robot, own)
             own += 1
             touches = touches or second[0] >= 0
         crowded = crowded or second[0] >= 0
@@ -235,17 +243,30 @@ def _count(problem: Problem, arena: int) -> int:
 def _sides(problem: Problem, arena: int, row: int) -> tuple[wp.vec3i, wp.vec3i]:
     """The robots of a row and their `_entries` in it; of two, the higher number comes first.
 
-    A row begins with the entry of a wheel if there is one; six of a body end it.
+    A row has the six entries of a body, after that of a wheel if it is a wheel's; or twelve.
     """
     first = problem.J_first[arena, row]
-    last = first + problem.J_count[arena, row] - 1
     joint = problem.J_column[arena, 0, first]
-    higher, lower = joint / JOINTS, problem.J_column[arena, 0, last] / JOINTS
-    wheel = wp.where(joint % JOINTS < _FREE, -1, joint % JOINTS)
-    body = wp.where(wheel < 0, first, first + 1)
-    none = wp.vec3i(-1, -1, -1)
-    other = wp.where(lower == higher, none, wp.vec3i(lower, last - _FREE + 1, -1))
-    return wp.vec3i(higher, body, wheel), other
+    robot, wheel = joint / JOINTS, wp.where(joint % JOINTS < _FREE, -1, joint % JOINTS)
+    mine = wp.vec3i(robot, wp.where(wheel < 0, first, first + 1), wheel)
+    other = wp.vec3i(-1, -1, -1)
+    if problem.J_count[arena, row] > JOINTS:
+        mine = wp.vec3i(robot, first, _SHARED)
+        body = first + _FREE
+        other = wp.vec3i(problem.J_column[arena, 0, body] / JOINTS, body, _SHARED)
+    return mine, other
+
+
+@wp.func
+def _scale(problem: Problem, arena: int, robot: int, k: int) -> None:
+    """Copies a robot's row to where `_relax` reads it."""
+    side = problem.row[arena, robot, k]
+    root = wp.sqrt(problem.D[arena, side[0]])
+    entries = root * _entries(problem, arena, side)
+    lane = arena * problem.own.shape[1] + robot
+    for i in range(8):
+        problem.scaled[k, i, lane] = entries[i]
+    problem.scaled[k, _AREF, lane] = root * problem.aref[arena, side[0]]
 
 
 @wp.kernel(enable_backward=False)
@@ -259,21 +280,58 @@ def _relax_each(problem: Problem, iterations: int) -> None:
 @wp.func
 def _relax(problem: Problem, arena: int, robot: int, iterations: int) -> None:
     """Newton's method for a robot alone."""
+    lane, own = arena * problem.own.shape[1] + robot, problem.own[arena, robot]
     now = _of_robot(problem.qacc, arena, robot)
     done = wp.int32(0)
     moves = wp.bool(True)
     while moves and done < iterations:
-        gap = _gaps(problem, arena, robot, now, 1.0)
-        downhill = _newton(problem, arena, robot, gap, now)
-        slope = _gaps(problem, arena, robot, downhill, 0.0)
+        downhill = _newton(problem, arena, robot, now)
+        moves = wp.bool(False)
+        for k in range(own):
+            slope = wp.dot(_scaled(problem, k, lane), downhill)
+            problem.scaled[k, _SLOPE, lane] = slope
+            moves = moves or _switches(problem.scaled[k, _GAP, lane], slope)
         length = wp.float32(1.0)
-        moves = _switches(problem.own[arena, robot], gap, slope)
         if moves:
-            length = _length(problem, arena, robot, gap, slope, now, downhill)
+            length = _length(problem, arena, robot, now, downhill)
         moves = _goes_on(moves, wp.max(wp.abs(downhill)), wp.max(wp.abs(now)))
         now = now + length * downhill
         done += 1
     _set(problem.qacc, arena, robot, now)
+
+
+@wp.func
+def _newton(problem: Problem, arena: int, robot: int, now: _Vector) -> _Vector:
+    """Newton's step, of the rows that act now."""
+    lane = arena * problem.own.shape[1] + robot
+    hessian = _inertia(problem, arena, robot)
+    uphill = _times(hessian, now) - _of_robot(problem.force, arena, robot)
+    for k in range(problem.own[arena, robot]):
+        row = _scaled(problem, k, lane)
+        gap = wp.dot(row, now) - problem.scaled[k, _AREF, lane]
+        problem.scaled[k, _GAP, lane] = gap
+        if gap < 0.0:
+            uphill = uphill + gap * row
+            hessian = _add(hessian, row, row)
+    return _substitute(_factor(hessian), -uphill)
+
+
+@wp.func
+def _scaled(problem: Problem, k: int, lane: int) -> _Vector:
+    """A robot's entries in a row of its own, times the root of D."""
+    found = _Vector()
+    for i in range(8):
+        found[i] = problem.scaled[k, i, lane]
+    return found
+
+
+@wp.func
+def _switches(gap: float, slope: float) -> bool:
+    """Whether a row acts before a whole step and not after it, or the other way round.
+
+    If none does, the cost is quadratic along the step, and its whole length the best.
+    """
+    return (gap < 0.0) != (gap + slope < 0.0)
 
 
 @wp.func
@@ -336,32 +394,6 @@ def _entries(problem: Problem, arena: int, side: wp.vec3i) -> _Vector:
 
 
 @wp.func
-def _gaps(problem: Problem, arena: int, robot: int, along: _Vector, asked: float) -> _Rows:
-    """J a of a robot's rows, less what is `asked` of aref; with all of it, below 0 a row acts."""
-    found = _Rows()
-    for k in range(problem.own[arena, robot]):
-        row = problem.row[arena, robot, k]
-        slope = _entries(problem, arena, row)
-        found[k] = wp.dot(slope, along) - asked * problem.aref[arena, row[0]]
-    return found
-
-
-@wp.func
-def _newton(problem: Problem, arena: int, robot: int, gap: _Rows, now: _Vector) -> _Vector:
-    """Newton's step, of the rows that act now."""
-    hessian = _inertia(problem, arena, robot)
-    uphill = _times(hessian, now) - _of_robot(problem.force, arena, robot)
-    for k in range(problem.own[arena, robot]):
-        if gap[k] < 0.0:
-            row = problem.row[arena, robot, k]
-            slope = _entries(problem, arena, row)
-            weighted = problem.D[arena, row[0]] * slope
-            uphill = uphill + gap[k] * weighted
-            hessian = _add(hessian, weighted, slope)
-    return _substitute(_factor(hessian), -uphill)
-
-
-@wp.func
 def _times(matrix: _Matrix, vector: _Vector) -> _Vector:
     """Product with a symmetric matrix of which there is the lower half."""
     found = _Vector()
@@ -411,23 +443,15 @@ def _substitute(lower: _Matrix, right: _Vector) -> _Vector:
 
 
 @wp.func
-def _length(
-    problem: Problem,
-    arena: int,
-    robot: int,
-    gap: _Rows,
-    slope: _Rows,
-    now: _Vector,
-    downhill: _Vector,
-) -> float:
+def _length(problem: Problem, arena: int, robot: int, now: _Vector, downhill: _Vector) -> float:
     """How far to go along a step: where the cost, which is convex along it, is least."""
     inertia = _inertia(problem, arena, robot)
     pull = _times(inertia, now) - _of_robot(problem.force, arena, robot)
     first, curve = wp.dot(pull, downhill), wp.dot(downhill, _times(inertia, downhill))
-    begin = _tilt(problem, arena, robot, gap, slope, 0.0)[0] + first
+    begin = _tilt(problem, arena, robot, 0.0)[0] + first
     search = wp.vec3(0.0, 1e6, 1.0)
     for _ in range(_SEARCHES):
-        bend = _tilt(problem, arena, robot, gap, slope, search[2])
+        bend = _tilt(problem, arena, robot, search[2])
         tilt = bend[0] + first + search[2] * curve
         if wp.abs(tilt) <= _FLAT * wp.abs(begin):
             break
@@ -445,30 +469,16 @@ def _narrow(search: wp.vec3, tilt: float, curve: float) -> wp.vec3:
 
 
 @wp.func
-def _tilt(
-    problem: Problem, arena: int, robot: int, gap: _Rows, slope: _Rows, length: float
-) -> wp.vec2:
+def _tilt(problem: Problem, arena: int, robot: int, length: float) -> wp.vec2:
     """First and second derivative of the rows' cost along a step."""
+    lane = arena * problem.own.shape[1] + robot
     tilt = wp.vec2()
     for k in range(problem.own[arena, robot]):
-        there = gap[k] + length * slope[k]
+        slope = problem.scaled[k, _SLOPE, lane]
+        there = problem.scaled[k, _GAP, lane] + length * slope
         if there < 0.0:
-            weighted = problem.D[arena, problem.row[arena, robot, k][0]] * slope[k]
-            tilt = tilt + weighted * wp.vec2(there, slope[k])
+            tilt = tilt + slope * wp.vec2(there, slope)
     return tilt
-
-
-@wp.func
-def _switches(count: int, gap: _Rows, slope: _Rows) -> bool:
-    """Whether a row acts before a whole step and not after it, or the other way round.
-
-    If none does, the cost is quadratic along the step, and its whole length the best.
-    """
-    switches = wp.bool(False)
-    for k in range(count):
-        if (gap[k] < 0.0) != (gap[k] + slope[k] < 0.0):
-            switches = True
-    return switches
 
 
 @wp.kernel(enable_backward=False)
@@ -476,8 +486,9 @@ def _relax_pairs(
     problem: Problem, together: Together, robots: int, iterations: int, niter: wp.array[int]
 ) -> None:
     """Newton's method for the robots of an arena that touch each other."""
-    if wp.tid() < together.crowded[0]:
-        arena = together.arena[wp.tid()]
+    turn = wp.tid() / _SPREAD
+    if wp.tid() % _SPREAD == 0 and turn < together.crowded[0]:
+        arena = together.arena[turn]
         _collect(problem, together, arena)
         done = wp.int32(0)
         moves = wp.bool(True)
@@ -493,10 +504,10 @@ def _relax_pairs(
 
 @wp.func
 def _collect(problem: Problem, together: Together, arena: int) -> None:
-    """Lists the rows of robots that touch each other."""
+    """Lists the rows between two robots."""
     count = wp.int32(0)
     for row in range(_count(problem, arena)):
-        if problem.touches[arena, problem.first[arena, row][0]]:
+        if problem.second[arena, row][0] >= 0:
             together.row[arena, count] = row
             count += 1
     together.count[arena] = count
@@ -515,14 +526,14 @@ def _along(problem: Problem, arena: int, row: int, of_joints: wp.array2d[float])
 
 @wp.func
 def _pick(problem: Problem, together: Together, arena: int) -> None:
-    """Finds out which rows act, and which of those between robots become terms of their own."""
+    """Finds out which rows between robots act, and which of those become terms of their own."""
     taken = wp.int32(0)
     for k in range(together.count[arena]):
         row = together.row[arena, k]
         gap = _along(problem, arena, row, problem.qacc) - problem.aref[arena, row]
         together.gap[arena, row] = gap
         together.slot[arena, row] = -1
-        if problem.second[arena, row][0] >= 0 and gap < 0.0 and taken < _PAIRS:
+        if gap < 0.0 and taken < _PAIRS:
             together.slot[arena, row] = taken
             together.pair[arena, taken] = row
             taken += 1
@@ -538,13 +549,16 @@ def _descend(problem: Problem, together: Together, arena: int, robot: int) -> No
         now = _of_robot(problem.qacc, arena, robot)
         uphill = _times(hessian, now) - _of_robot(problem.force, arena, robot)
         for k in range(problem.own[arena, robot]):
-            row = problem.row[arena, robot, k]
-            gap = together.gap[arena, row[0]]
-            if gap < 0.0:
-                slope = _entries(problem, arena, row)
-                weighted = problem.D[arena, row[0]] * slope
-                uphill = uphill + gap * weighted
-                if together.slot[arena, row[0]] < 0:
+            side = problem.row[arena, robot, k]
+            slope = _entries(problem, arena, side)
+            if side[2] != _SHARED:
+                gap = wp.dot(slope, now) - problem.aref[arena, side[0]]
+                together.gap[arena, side[0]] = gap
+                together.slot[arena, side[0]] = -1
+            if together.gap[arena, side[0]] < 0.0:
+                weighted = problem.D[arena, side[0]] * slope
+                uphill = uphill + together.gap[arena, side[0]] * weighted
+                if together.slot[arena, side[0]] < 0:
                     hessian = _add(hessian, weighted, slope)
         factor = _factor(hessian)
         together.factor[arena, robot] = factor
@@ -603,9 +617,12 @@ def _take(problem: Problem, together: Together, arena: int, robots: int) -> bool
     switches = wp.bool(False)
     for k in range(together.count[arena]):
         row = together.row[arena, k]
-        gap, slope = together.gap[arena, row], _along(problem, arena, row, together.step)
+        slope = _along(problem, arena, row, together.step)
         together.slope[arena, row] = slope
-        switches = switches or (gap < 0.0) != (gap + slope < 0.0)
+        switches = switches or _switches(together.gap[arena, row], slope)
+    for robot in range(robots):
+        if problem.touches[arena, robot]:
+            switches = _slopes(problem, together, arena, robot) or switches
     length = wp.float32(1.0)
     if switches:
         length = _length_together(problem, together, arena, robots)
@@ -621,6 +638,20 @@ def _take(problem: Problem, together: Together, arena: int, robots: int) -> bool
 
 
 @wp.func
+def _slopes(problem: Problem, together: Together, arena: int, robot: int) -> bool:
+    """Works out J times the step for the rows of a robot alone; says whether any switches."""
+    switches = wp.bool(False)
+    step = _of_robot(together.step, arena, robot)
+    for k in range(problem.own[arena, robot]):
+        side = problem.row[arena, robot, k]
+        if side[2] != _SHARED:
+            slope = wp.dot(_entries(problem, arena, side), step)
+            together.slope[arena, side[0]] = slope
+            switches = switches or _switches(together.gap[arena, side[0]], slope)
+    return switches
+
+
+@wp.func
 def _length_together(problem: Problem, together: Together, arena: int, robots: int) -> float:
     """How far to go along the step of all, as `_length` says of one."""
     first, curve = wp.float32(0.0), wp.float32(0.0)
@@ -632,10 +663,10 @@ def _length_together(problem: Problem, together: Together, arena: int, robots: i
             pull = _times(inertia, now) - _of_robot(problem.force, arena, robot)
             first += wp.dot(pull, step)
             curve += wp.dot(_times(inertia, step), step)
-    begin = _tilt_together(problem, together, arena, 0.0)[0] + first
+    begin = _tilt_together(problem, together, arena, robots, 0.0)[0] + first
     search = wp.vec3(0.0, 1e6, 1.0)
     for _ in range(_SEARCHES):
-        bend = _tilt_together(problem, together, arena, search[2])
+        bend = _tilt_together(problem, together, arena, robots, search[2])
         tilt = bend[0] + first + search[2] * curve
         if wp.abs(tilt) <= _FLAT * wp.abs(begin):
             break
@@ -644,13 +675,26 @@ def _length_together(problem: Problem, together: Together, arena: int, robots: i
 
 
 @wp.func
-def _tilt_together(problem: Problem, together: Together, arena: int, length: float) -> wp.vec2:
-    """First and second derivative of those rows' cost along the step."""
+def _tilt_together(
+    problem: Problem, together: Together, arena: int, robots: int, length: float
+) -> wp.vec2:
+    """First and second derivative of those robots' rows' cost along the step."""
     tilt = wp.vec2()
     for k in range(together.count[arena]):
-        row = together.row[arena, k]
-        slope = together.slope[arena, row]
-        there = together.gap[arena, row] + length * slope
-        if there < 0.0:
-            tilt = tilt + problem.D[arena, row] * slope * wp.vec2(there, slope)
+        tilt = tilt + _tilt_of(problem, together, arena, together.row[arena, k], length)
+    for robot in range(robots):
+        if problem.touches[arena, robot]:
+            for k in range(problem.own[arena, robot]):
+                side = problem.row[arena, robot, k]
+                if side[2] != _SHARED:
+                    tilt = tilt + _tilt_of(problem, together, arena, side[0], length)
     return tilt
+
+
+@wp.func
+def _tilt_of(problem: Problem, together: Together, arena: int, row: int, length: float) -> wp.vec2:
+    """First and second derivative of a row's cost along the step."""
+    slope = together.slope[arena, row]
+    push = wp.min(0.0, together.gap[arena, row] + length * slope)
+    weight = wp.where(push < 0.0, problem.D[arena, row] * slope, 0.0)
+    return weight * wp.vec2(push, slope)
