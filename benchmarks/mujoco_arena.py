@@ -54,9 +54,10 @@ class Arena:
         Raises:
           ConfigError: if the reward has a term that `rewards` does not know.
         """
-        arrival = settings.task.reward.arrival
-        if arrival:
-            raise ConfigError(f"task.reward.arrival is {arrival}: give 0.")
+        for name in ("arrival", "robot_contact"):
+            weight = getattr(settings.task.reward, name)
+            if weight:
+                raise ConfigError(f"task.reward.{name} is {weight}: give 0.")
         robots = settings.stage.robots
         told = replace(settings, action="mean")  # what it is told, and nothing drawn beside it
         self.judge = evaluate_c.load(told, _puppet(told, np.zeros((robots, ACTION_SIZE))))

@@ -9,15 +9,18 @@ axis of seeds.
 
 import logging
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import orbax.checkpoint as ocp
 from absl import logging as absl_logging
 
 from swarmjax.policy import digest
+
+# Orbax takes half a second to import, which a run spends while it compiles (`trainer`).
+if TYPE_CHECKING:
+    import orbax.checkpoint as ocp
 
 Leaves = dict[str, np.ndarray]
 
@@ -35,6 +38,8 @@ class Checkpoints:
         With `update`, where the run goes on, checkpoints after it are removed: they were passed
         over as damaged, and Orbax would save nothing before them.
         """
+        import orbax.checkpoint as ocp
+
         absl_logging.set_verbosity(absl_logging.ERROR)  # Orbax tells every step of its own
         logging.getLogger("absl").setLevel(logging.ERROR)
         options = ocp.CheckpointManagerOptions(max_to_keep=keep, create=True)
@@ -45,6 +50,8 @@ class Checkpoints:
 
     def save(self, state: Any, update: int) -> None:
         """Writes a state; an update that is there already is left as it is."""
+        import orbax.checkpoint as ocp
+
         if update in self._manager.all_steps():
             return
         leaves = to_leaves(state)
@@ -144,6 +151,8 @@ def restore(run: Path, update: int | None = None) -> tuple[Leaves, int, list[str
     Raises:
       CheckpointError: if there is none that is sound.
     """
+    import orbax.checkpoint as ocp
+
     folder = (run / "checkpoints").resolve()
     if not folder.is_dir():
         raise CheckpointError(f"{run} holds no checkpoints: give a run directory that has some.")
@@ -162,8 +171,10 @@ def restore(run: Path, update: int | None = None) -> tuple[Leaves, int, list[str
     raise CheckpointError(f"{run} has no sound checkpoint: {found}.")
 
 
-def _read(manager: ocp.CheckpointManager, step: int) -> Leaves:
+def _read(manager: "ocp.CheckpointManager", step: int) -> Leaves:
     """Reads one step and checks its digest."""
+    import orbax.checkpoint as ocp
+
     found = manager.restore(
         step,
         args=ocp.args.Composite(state=ocp.args.StandardRestore(), meta=ocp.args.JsonRestore()),

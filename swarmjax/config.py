@@ -281,7 +281,10 @@ class RewardConfig(Section):
         default=0.0, metadata=about("per control step with something in infrared range")
     )
     arrival: float = field(default=0.0, metadata=about("once, on arrival"))
-    contact: float = field(default=-0.02, metadata=about("per contact event"))
+    contact: float = field(default=-0.02, metadata=about("per contact event, of whatever kind"))
+    robot_contact: float = field(
+        default=0.0, metadata=about("besides, per contact event with another robot")
+    )
     time: float = field(default=-0.002, metadata=about("per control step until arrival"))
 
 

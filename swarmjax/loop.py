@@ -5,6 +5,7 @@ chunk size gives the same run.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -123,11 +124,13 @@ def train_chunk(
       The state after, and metrics with a leading axis of `program.rows`: the first n rows hold
       an update each.
     """
-    one = jax.eval_shape(lambda s: update(program, schedule, s)[1], state)
+    # Traced once, for the shapes and for the loop.
+    step = jax.jit(partial(update, program), inline=True)
+    one = step.eval_shape(schedule, state)[1]
     blank = jax.tree.map(lambda x: jnp.zeros((program.rows, *x.shape), x.dtype), one)
 
     def body(i: Array, carry: tuple[TrainState, Metrics]) -> tuple[TrainState, Metrics]:
-        state, metrics = update(program, schedule, carry[0])
+        state, metrics = step(schedule, carry[0])
         return state, jax.tree.map(lambda rows, x: rows.at[i].set(x), carry[1], metrics)
 
     return jax.lax.fori_loop(0, n, body, (state, blank))

@@ -4,12 +4,14 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from tensorboardX import SummaryWriter
 
 from swarmjax.sim import gaps
+
+if TYPE_CHECKING:
+    from tensorboardX import SummaryWriter
 
 METRICS, DECISIONS, EPISODES = "metrics.jsonl", "curriculum.jsonl", "episodes.jsonl"
 BOARDS = 16  # seeds that TensorBoard is written for: a board holds three files open
@@ -107,11 +109,7 @@ class Recorder:
         purge = arena_steps + 1 if update else None  # TensorBoard hides what it has from here on
         folder = run / "tensorboard"
         folders = {k: folder / f"seed{k}" if len(seeds) > 1 else folder for k in seeds[:BOARDS]}
-        self._boards = {
-            seed: SummaryWriter(str(path), purge_step=purge)
-            for seed, path in folders.items()
-            if tensorboard
-        }
+        self._boards = {seed: _board(path, purge) for seed, path in folders.items() if tensorboard}
 
     def write(self, found: Sequence[Row], decisions: Iterable[Row], speeds: Row) -> None:
         """Writes the rows of a call; the speeds, of all seeds together, to TensorBoard's first.
@@ -150,7 +148,14 @@ class Recorder:
             board.close()
 
 
-def _add_scalars(board: SummaryWriter, row: Row, arena_steps: int) -> None:
+def _board(folder: Path, purge: int | None) -> "SummaryWriter":
+    """Opens a folder of TensorBoard."""
+    from tensorboardX import SummaryWriter  # brings PyTorch along, where there is any
+
+    return SummaryWriter(str(folder), purge_step=purge)
+
+
+def _add_scalars(board: "SummaryWriter", row: Row, arena_steps: int) -> None:
     """Writes the numbers of a row to TensorBoard."""
     for name, value in row.items():
         if isinstance(value, int | float):

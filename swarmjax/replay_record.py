@@ -10,7 +10,7 @@ from swarmjax import config, evaluate_c
 from swarmjax.config import RewardConfig
 from swarmjax.evaluate_c import Arenas, Judge
 from swarmjax.policy import Policy, PolicyError
-from swarmjax.sim import infrared
+from swarmjax.sim import gaps, infrared
 from swarmjax.task import senses
 from swarmjax.task.level import Level
 
@@ -127,6 +127,7 @@ def terms(steps: Steps, weights: RewardConfig) -> dict[str, np.ndarray]:
         "proximity": (steps.infrared < steps.sensor_range).any(axis=-1),
         "arrival": steps.arrives,
         "contact": steps.contact_begins.sum(axis=-1),
+        "robot_contact": steps.contact_begins[..., gaps.KINDS.index("robot")],
         "time": np.ones_like(steps.distance),
     }
     weighted = {name: getattr(weights, name) * term for name, term in found.items()}

@@ -7,11 +7,12 @@ import json
 import math
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -95,8 +96,8 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
       TrainingError: if a loss is no longer finite.
     """
     source = start.read(settings)
-    program, schedule, template = _load(settings)
-    state, skipped = _first_state(program, schedule, template, source)
+    program, schedule, init, template = _load(settings)
+    state, skipped = _first_state(program, lambda: init(schedule), template, source)
     for sentence in skipped:
         display.say(f"{sentence}: it was passed over.")
     if source is not None:
@@ -111,12 +112,13 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
     return tally
 
 
-def _load(settings: TrainConfig) -> tuple[Program, Schedule, TrainState]:
-    """Builds the program, the curriculum's numbers and the shapes of the state."""
+def _load(settings: TrainConfig) -> tuple[Program, Schedule, Any, TrainState]:
+    """Builds the program, the curriculum's numbers, what starts a run, and its state's shapes."""
     program, schedule = loop.load(settings)
-    template = jax.eval_shape(partial(seeds.init, program), schedule)
+    init = jax.jit(partial(seeds.init, program))  # traced once, for the shapes and for the state
+    template = init.eval_shape(schedule)
     memory.check_state(settings, memory.size(template), memory.limit())
-    return program, schedule, template
+    return program, schedule, init, template
 
 
 def _settings(arguments: Sequence[str]) -> tuple[TrainConfig, bool]:
@@ -137,7 +139,7 @@ def _settings(arguments: Sequence[str]) -> tuple[TrainConfig, bool]:
 
 
 def _first_state(
-    program: Program, schedule: Schedule, template: TrainState, source: Source | None
+    program: Program, init: Callable[[], TrainState], template: TrainState, source: Source | None
 ) -> tuple[TrainState, list[str]]:
     """Starts from the seed, or from the newest sound checkpoint of the run that is resumed.
 
@@ -145,7 +147,7 @@ def _first_state(
     """
     settings = program.config
     if settings.resume is None:
-        state = jax.jit(partial(seeds.init, program))(schedule)
+        state = init()
         if source is None:
             return state, []
         return start.carry(source, state, settings), source.skipped
@@ -195,7 +197,7 @@ def _unwritable(run: Path, error: OSError) -> ConfigError:
 def _dry_run(settings: TrainConfig) -> int:
     """Compiles, says what it took and what a run needs, and stops."""
     start.read(settings)
-    program, schedule, template = _load(settings)
+    program, schedule, _, template = _load(settings)
     compiled = compile_chunk(program, schedule, template)
     memory.check(settings, compiled.total_bytes, memory.limit())
     state, work = compiled.state_bytes / 2**20, compiled.work_bytes / 2**20

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from swarmjax.config import RewardConfig
+from swarmjax.sim.gaps import KINDS
 from swarmjax.sim.pieces import least, pieces
 
 
@@ -57,6 +58,11 @@ def contact(step: Step) -> Array:
     return jnp.sum(step.contact_begins, axis=-1).astype(jnp.float32)
 
 
+def robot_contact(step: Step) -> Array:
+    """1 where a contact with another robot began in this step."""
+    return step.contact_begins[..., KINDS.index("robot")].astype(jnp.float32)
+
+
 def time(step: Step) -> Array:
     """1 for every control step."""
     return jnp.ones_like(step.distance)
@@ -67,6 +73,7 @@ TERMS: dict[str, Callable[[Step], Array]] = {
     "proximity": proximity,
     "arrival": arrival,
     "contact": contact,
+    "robot_contact": robot_contact,
     "time": time,
 }
 

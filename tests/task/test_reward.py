@@ -38,6 +38,7 @@ def step() -> reward.Step:
         ("proximity", [0, 1, 1, 0]),  # once, however many rays; a full ray sees nothing
         ("arrival", [0, 0, 1, 0]),
         ("contact", [0, 1, 2, 0]),
+        ("robot_contact", [0, 1, 1, 0]),  # robots are the first of the three kinds
         ("time", [1, 1, 1, 1]),
     ],
 )
