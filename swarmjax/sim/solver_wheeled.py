@@ -223,7 +223,6 @@ def _share_out(problem: Problem, together: Together) -> None:
         side = wp.where(robot == first[0], first, second)
         if robot == side[0] and own < MOST_ROWS:
             problem.row[arena, robot, own] = wp.vec3i(row, side[1], side[2])
-            _scale(problem, arena, robot, own)
             own += 1
             touches = touches or second[0] >= 0
         crowded = crowded or second[0] >= 0
@@ -259,7 +258,7 @@ def _sides(problem: Problem, arena: int, row: int) -> tuple[wp.vec3i, wp.vec3i]:
 
 @wp.func
 def _scale(problem: Problem, arena: int, robot: int, k: int) -> None:
-    """Copies a robot's row to where `_relax` reads it."""
+    """Copies a robot's row to where neighbouring threads read it at once."""
     side = problem.row[arena, robot, k]
     root = wp.sqrt(problem.D[arena, side[0]])
     entries = root * _entries(problem, arena, side)
@@ -281,6 +280,9 @@ def _relax_each(problem: Problem, iterations: int) -> None:
 def _relax(problem: Problem, arena: int, robot: int, iterations: int) -> None:
     """Newton's method for a robot alone."""
     lane, own = arena * problem.own.shape[1] + robot, problem.own[arena, robot]
+    # Not where rows are listed: there, neighbouring threads come to theirs one after the other.
+    for k in range(own):
+        _scale(problem, arena, robot, k)
     now = _of_robot(problem.qacc, arena, robot)
     done = wp.int32(0)
     moves = wp.bool(True)
