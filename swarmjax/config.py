@@ -401,6 +401,18 @@ class AlgoConfig(Section):
             "how the gradient is computed; auto: fused on an NVIDIA GPU where the layers fit it"
         ),
     )
+    contact_limit: float | None = field(
+        default=None,
+        metadata=about(
+            "contacts with other robots, per robot and episode, that a price on them is to lead "
+            "to, besides task.reward; null: no such price",
+            above=0.0,
+        ),
+    )
+    contact_price_rate: float = field(
+        default=2e-5,
+        metadata=about("by which that price rises or falls in a control step, at most, m", 0.0),
+    )
     exploration: Literal["learned", "scheduled"] = field(
         default="learned",
         metadata=about("deviation of the action: learned, or falling in steps whatever is learned"),

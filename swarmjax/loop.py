@@ -156,8 +156,9 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     arenas, trajectory, ended = rollout.collect(
         world, state.learners, state.arenas, starts, rollout_key
     )
+    charged, trajectory = rollout.charge(state.learners, trajectory, config.algo)
     batch = rollout.batch(trajectory, config.algo)
-    explored = rollout.explore(world, state.learners, config.algo.rollout)
+    explored = rollout.explore(world, charged, config.algo.rollout)
     learners, learned = jax.vmap(
         lambda learner, b, k: ppo.update(learner, config.algo, b, k, config.updates)
     )(explored, batch, jax.random.split(learn_key, config.learners))
@@ -168,6 +169,8 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     learners = promotion.carry_over(
         learners, config, state.curriculum.met, curriculum.met, decision.promoted
     )
+    if charged.price is not None:
+        learned["contact_price"] = charged.price.height
     metrics = {
         "update": state.update,
         "stage": state.curriculum.stage,

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from swarmjax.config import AlgoConfig
-from swarmjax.ppo import gae, monte_carlo
+from swarmjax.ppo import contact_price, gae, monte_carlo
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.sim import physics
@@ -44,6 +44,7 @@ class Trajectory(NamedTuple):
       terminated: the robot arrived in this step.
       truncated: the time ran out for the robot.
       valid: a transition to learn from.
+      robot_contact: 1 where a contact with another robot began; None without a limit on them.
     """
 
     observation: Array
@@ -55,6 +56,7 @@ class Trajectory(NamedTuple):
     terminated: Array
     truncated: Array
     valid: Array
+    robot_contact: Array | None = None
 
 
 class Robots(NamedTuple):
@@ -206,6 +208,32 @@ def explore(world: World, learners: LearnerState, steps: Array | int) -> Learner
     return jax.vmap(lambda learner: ppo.explore(learner, config, steps * arenas))(learners)
 
 
+def charge(
+    learners: LearnerState, trajectory: Trajectory, config: AlgoConfig
+) -> tuple[LearnerState, Trajectory]:
+    """Takes the price of contacts with other robots off the reward, and moves it on.
+
+    Args:
+      learners: [L].
+      trajectory: [T, L, A, N, ...].
+      config: of the learners.
+
+    Returns:
+      The learners with the price of the next update, and the trajectory; both as they are if there
+      is no limit on such contacts.
+    """
+    contact, price = trajectory.robot_contact, learners.price
+    if contact is None or price is None:
+        return learners, trajectory
+    contact = jnp.where(trajectory.valid, contact, 0.0)
+    over = trajectory.valid & (trajectory.terminated | trajectory.truncated)
+    contacts, episodes = jnp.sum(contact, axis=(0, 2, 3)), jnp.sum(over, axis=(0, 2, 3))
+    move = functools.partial(contact_price.update, config=config, steps=contact.shape[0])
+    moved = jax.vmap(lambda p, c, e: move(p, contacts=c, episodes=e))(price, contacts, episodes)
+    due = price.height[:, None, None] * contact
+    return replace(learners, price=moved), trajectory._replace(reward=trajectory.reward - due)
+
+
 def batch(trajectory: Trajectory, config: AlgoConfig) -> Batch:
     """Turns a rollout into what the learners learn from.
 
@@ -313,6 +341,7 @@ def _step(
         terminated=to_learners(came.terminated, count),
         truncated=to_learners(came.truncated, count),
         valid=to_learners(came.valid, count),
+        robot_contact=to_learners(came.robot_contact, count) if config.contact_limit else None,
     )
     carry = (arenas, jnp.where(over, start_value, next_value), begun + came.done)
     return carry, (transition, ended)

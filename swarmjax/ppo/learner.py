@@ -16,7 +16,7 @@ import optax
 from flax import struct
 
 from swarmjax.config import AlgoConfig
-from swarmjax.ppo import exploration, full_batch, fused, losses, networks, normalizer
+from swarmjax.ppo import contact_price, exploration, full_batch, fused, losses, networks, normalizer
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
 from swarmjax.ppo.normalizer import Normalizer
@@ -40,12 +40,14 @@ class LearnerState:
             that does not normalise stay 0 and 1.
         explored: [], int32, control steps that the schedule of exploration has counted; None if
             exploration is learned.
+        price: Of contacts with other robots; None without a limit on them.
     """
 
     params: Params
     optimizer_state: optax.OptState
     normalizer: Normalizer
     explored: jax.Array | None = None
+    price: contact_price.Price | None = None
 
 
 @struct.dataclass(kw_only=True)
@@ -91,6 +93,7 @@ def init(
         optimizer_state=_optimizer(config, updates).init(params),
         normalizer=normalizer.init(observation_size),
         explored=jnp.zeros((), jnp.int32) if config.exploration == "scheduled" else None,
+        price=None if config.contact_limit is None else contact_price.init(),
     )
 
 

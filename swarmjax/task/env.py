@@ -103,6 +103,7 @@ class TimeStep(NamedTuple):
       terminated: [R] the robot arrived in this step.
       truncated: [R] the time ran out for the robot.
       valid: [R] the robot was on its way, and the physics sound: a transition to learn from.
+      robot_contact: [R] a contact with another robot began, before arrival.
       done: [] the arena's episode is over.
       sound: [] the physics is finite.
     """
@@ -112,6 +113,7 @@ class TimeStep(NamedTuple):
     terminated: Array
     truncated: Array
     valid: Array
+    robot_contact: Array
     done: Array
     sound: Array
 
@@ -261,6 +263,7 @@ def step(world: World, state: EnvState, action: Array) -> tuple[EnvState, TimeSt
         terminated=arrives,
         truncated=active & ~arrives & (timeout | ~sound),
         valid=valid,
+        robot_contact=reward.robot_contact(earned),
         done=jnp.all(arrived | ~state.level.present) | timeout | ~sound,
         sound=sound,
     )

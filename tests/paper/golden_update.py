@@ -84,7 +84,7 @@ def trajectory(state: LearnerState, config: AlgoConfig, idle: int = 0) -> Trajec
         valid=jnp.ones(inputs.STEPS, bool),
     )
     if idle:
-        columns = Trajectory(*(_insert(x, idle) for x in columns))
+        columns = jax.tree.map(lambda x: _insert(x, idle), columns)
     return jax.tree.map(lambda x: x[:, None, None, None], columns)
 
 
