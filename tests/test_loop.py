@@ -124,6 +124,7 @@ def test_the_curriculum_visits_every_stage_within_one_trace(tiny_config: TrainCo
     assert int(state.curriculum.met) == 5
 
 
+@pytest.mark.slow
 def test_mixed_keeps_arenas_on_earlier_stages_within_one_trace(tiny_config: TrainConfig) -> None:
     options = CurriculumConfig(mode="mixed", threshold=1.0, earlier_share=0.5)
     program, schedule = loop.load(_six(tiny_config, options))

@@ -115,6 +115,7 @@ def test_a_seed_begins_alike_wherever_it_stands(
         _assert_same(_lane((later, {}), lane), _lane((start, {}), lane + 1))
 
 
+@pytest.mark.slow
 def test_in_turn_a_seed_is_the_run_that_it_is_alone(
     tiny_config: TrainConfig, tiny_world: World
 ) -> None:

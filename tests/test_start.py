@@ -229,6 +229,7 @@ def test_a_damaged_checkpoint_is_passed_over_and_said(
         np.testing.assert_array_equal(found[name], before[name], err_msg=name, strict=True)
 
 
+@pytest.mark.slow
 def test_a_started_run_resumes_without_the_run_it_started_from(
     trained: Path, tmp_path: Path
 ) -> None:

@@ -166,6 +166,7 @@ def test_the_summary_of_several_seeds_has_a_list_for_each_figure(several: Path) 
     assert [json.loads(line) for line in lines] == logged
 
 
+@pytest.mark.slow
 def test_several_seeds_resume_exactly(several: Path, tmp_path: Path) -> None:
     assert _train(*SEVERAL, f"run.dir={tmp_path}", "run.stop_after=4") == 0
     assert train.main([f"resume={tmp_path}"]) == 0
