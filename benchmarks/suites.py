@@ -99,14 +99,12 @@ TRAINERS = (
         name="race-swarmjax",
         module="race",
         words=("trainer=swarmjax", *_TRAINED),
-        environment=HIGHEST,
     ),
     Entry(
         name="race-brax",
         module="race",
         words=("trainer=brax", *_TRAINED),
         seconds=400.0,
-        environment=HIGHEST,
     ),
     Entry(
         name="peer_jaxmarl_ippo",

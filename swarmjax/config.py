@@ -413,6 +413,10 @@ class AlgoConfig(Section):
         default=2e-5,
         metadata=about("by which that price rises or falls in a control step, at most, m", 0.0),
     )
+    contact_price_arrivals: float = field(
+        default=0.97,
+        metadata=about("share of the robots below whose arrival that price falls", 0.0, 1.0),
+    )
     exploration: Literal["learned", "scheduled"] = field(
         default="learned",
         metadata=about("deviation of the action: learned, or falling in steps whatever is learned"),

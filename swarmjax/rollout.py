@@ -226,10 +226,12 @@ def charge(
     if contact is None or price is None:
         return learners, trajectory
     contact = jnp.where(trajectory.valid, contact, 0.0)
-    over = trajectory.valid & (trajectory.terminated | trajectory.truncated)
-    contacts, episodes = jnp.sum(contact, axis=(0, 2, 3)), jnp.sum(over, axis=(0, 2, 3))
-    move = functools.partial(contact_price.update, config=config, steps=contact.shape[0])
-    moved = jax.vmap(lambda p, c, e: move(p, contacts=c, episodes=e))(price, contacts, episodes)
+    arrivals = trajectory.valid & trajectory.terminated
+    over = arrivals | (trajectory.valid & trajectory.truncated)
+    seen = contact_price.Seen(
+        *(jnp.sum(each, axis=(0, 2, 3), dtype=float) for each in (contact, over, arrivals))
+    )
+    moved = jax.vmap(lambda p, s: contact_price.update(p, config, s, contact.shape[0]))(price, seen)
     due = price.height[:, None, None] * contact
     return replace(learners, price=moved), trajectory._replace(reward=trajectory.reward - due)
 

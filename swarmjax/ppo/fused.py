@@ -36,6 +36,9 @@ _MEMORY = {"8.0": 163 * 1024, "9.0": 227 * 1024, "10.0": 227 * 1024}
 # XLA takes Triton's kernels from this generation on (Ampere, compute capability 8).
 _LEAST_GENERATION = 8
 
+# Names that JAX has for products without tensor cores (`jax.default_matmul_precision`).
+_FULL = ("highest", "float32")
+
 _Run = functools.partial[fused_kernel.Sums]
 
 
@@ -43,6 +46,9 @@ def resolve(
     config: AlgoConfig, observation_size: int, action_size: int
 ) -> Literal["autodiff", "fused"]:
     """Turns `auto` into `fused` on an NVIDIA GPU where the layers fit it, `autodiff` elsewhere.
+
+    So it does where JAX's matrix products are to be in full precision: without tensor cores the
+    kernels are slower than what XLA makes.
 
     Args:
         config: Of the learner.
@@ -67,6 +73,8 @@ def resolve(
             f"algo.gradient is fused, but algo.hidden is {show(config.hidden)}, which does not fit "
             "the chip: give two layers of 16, 32 or 64, or algo.gradient=auto."
         )
+    if config.gradient == "auto" and jax.config.jax_default_matmul_precision in _FULL:
+        return "autodiff"
     return "fused" if config.gradient != "autodiff" and possible and fitting else "autodiff"
 
 

@@ -15,50 +15,57 @@ from swarmjax.ppo import contact_price
 from swarmjax.ppo import learner as ppo
 from swarmjax.rollout import Trajectory
 
-CONFIG = AlgoConfig(contact_limit=0.1, contact_price_rate=1e-3)
+CONFIG = AlgoConfig(contact_limit=0.1, contact_price_rate=1e-3, contact_price_arrivals=0.9)
 
 
-def _at(height: float, contacts: float, episodes: float) -> contact_price.Price:
-    numbers = (jnp.float32(x) for x in (height, contacts, episodes))
+def _at(height: float, contacts: float, episodes: float, arrivals: float) -> contact_price.Price:
     return contact_price.Price(
-        **dict(zip(("height", "contacts", "episodes"), numbers, strict=True))
+        height=jnp.float32(height),
+        contacts=jnp.float32(contacts),
+        episodes=jnp.float32(episodes),
+        arrivals=jnp.float32(arrivals),
     )
 
 
+def _seen(contacts: float, episodes: float, arrivals: float) -> contact_price.Seen:
+    return contact_price.Seen(*(jnp.float32(x) for x in (contacts, episodes, arrivals)))
+
+
 @pytest.mark.parametrize(
-    ("contacts", "episodes", "pace"),
+    ("seen", "pace"),
     [
-        (4.0, 20.0, 1.0),  # 0.2 an episode: twice the limit, as fast as it goes
-        (40.0, 20.0, 1.0),  # and no faster
-        (3.0, 20.0, 0.5),  # 0.15 an episode: half a limit too many
-        (2.0, 20.0, 0.0),
-        (1.0, 20.0, -0.5),
-        (0.0, 20.0, -1.0),
-        (5.0, 0.0, 0.0),  # before anything has ended
+        ((4.0, 20.0, 20.0), 1.0),  # 0.2 an episode: twice the limit, as fast as it goes
+        ((40.0, 20.0, 20.0), 1.0),  # and no faster
+        ((3.0, 20.0, 20.0), 0.5),  # 0.15 an episode: half a limit too many
+        ((2.0, 20.0, 20.0), 0.0),
+        ((1.0, 20.0, 18.0), -0.5),
+        ((0.0, 20.0, 20.0), -1.0),
+        ((40.0, 20.0, 17.0), -1.0),  # less than 0.9 arrive
+        ((5.0, 0.0, 0.0), 0.0),  # before anything has ended
     ],
 )
-def test_it_moves_by_what_is_too_many(contacts: float, episodes: float, pace: float) -> None:
+def test_it_moves_by_what_is_too_many(seen: tuple[float, float, float], pace: float) -> None:
     # Remembered as they come now, so that the means stay what they are.
-    before = _at(0.5, contacts, episodes)
-    after = contact_price.update(before, CONFIG, before.contacts, before.episodes, 32)
+    after = contact_price.update(_at(0.5, *seen), CONFIG, _seen(*seen), 32)
     # 1e-6: float32, the height of 0.5 to 6e-8 and the pace to 1e-5 of 0.032.
     np.testing.assert_allclose(after.height, 0.5 + 32 * 1e-3 * pace, atol=1e-6)
 
 
 def test_it_remembers_twenty_updates() -> None:
-    after = contact_price.update(_at(0.0, 2.0, 10.0), CONFIG, jnp.float32(4), jnp.float32(0), 32)
-    # 1 / 20 of what is new: 2 + 0.05 (4 - 2), 10 + 0.05 (0 - 10).
-    np.testing.assert_allclose([after.contacts, after.episodes], [2.1, 9.5], rtol=1e-6)
+    after = contact_price.update(_at(0.0, 2.0, 10.0, 9.0), CONFIG, _seen(4.0, 0.0, 0.0), 32)
+    # 1 / 20 of what is new: 2 + 0.05 (4 - 2), 10 + 0.05 (0 - 10), 9 + 0.05 (0 - 9).
+    found = [after.contacts, after.episodes, after.arrivals]
+    np.testing.assert_allclose(found, [2.1, 9.5, 8.55], rtol=1e-6)
     # 2.1 / 9.5 is 2.2 times the limit of 0.1: more than twice.
     np.testing.assert_allclose(after.height, 0.032, rtol=1e-6)
 
 
 @given(contacts=st.lists(st.integers(0, 50), min_size=1, max_size=30), height=st.floats(0.0, 0.1))
 def test_it_is_never_below_nothing_and_no_faster_than_it_may(contacts, height):
-    price = _at(height, 0.0, 0.0)
+    price = _at(height, 0.0, 0.0, 0.0)
     for each in contacts:
         before = float(price.height)
-        price = contact_price.update(price, CONFIG, jnp.float32(each), jnp.float32(3), 32)
+        price = contact_price.update(price, CONFIG, _seen(each, 3.0, 3.0), 32)
         assert price.height >= 0.0
         assert abs(float(price.height) - before) <= 0.032 * (1 + 1e-5)  # float32
 

@@ -304,6 +304,15 @@ def test_tiles_are_as_large_as_the_chip_takes(
     assert found == expected
 
 
+def test_full_precision_is_left_to_autodiff(monkeypatch: pytest.MonkeyPatch) -> None:
+    _on(monkeypatch, compute_capability="9.0")
+    with jax.default_matmul_precision("highest"):
+        assert fused.resolve(AlgoConfig(), OBSERVATION, ACTION) == "autodiff"
+        assert fused.resolve(AlgoConfig(gradient="fused"), OBSERVATION, ACTION) == "fused"
+    with jax.default_matmul_precision("tensorfloat32"):
+        assert fused.resolve(AlgoConfig(), OBSERVATION, ACTION) == "fused"
+
+
 def test_fused_is_refused_where_it_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigError) as no_gpu:
         fused.resolve(AlgoConfig(gradient="fused"), OBSERVATION, ACTION)
