@@ -18,6 +18,8 @@ from swarmjax.settings import ConfigError
 # Of a run's summary, what a line about it says of where it was made.
 MADE_WITH = ("device", "versions", "commit")
 _PAUSE = 0.01  # s between two looks at what the run has written
+# Many containers forbid Python to keep what it compiles, which makes every start seconds longer.
+_AS_EVERYWHERE = {"PYTHONDONTWRITEBYTECODE": ""}
 
 
 class Watched:
@@ -45,7 +47,7 @@ class Watched:
             [sys.executable, "-m", "swarmjax.train", *words, f"run.dir={directory}"],
             stdout=subprocess.DEVNULL,
             stderr=self._errors,
-            env=os.environ | environment,
+            env=os.environ | _AS_EVERYWHERE | environment,
         )
 
     def rows(self) -> Iterator[tuple[float, dict[str, Any]]]:
