@@ -47,7 +47,7 @@ class Watched:
             [sys.executable, "-m", "swarmjax.train", *words, f"run.dir={directory}"],
             stdout=subprocess.DEVNULL,
             stderr=self._errors,
-            env=os.environ | _AS_EVERYWHERE | environment,
+            env={**os.environ, **_AS_EVERYWHERE, **environment},
         )
 
     def rows(self) -> Iterator[tuple[float, dict[str, Any]]]:

@@ -222,10 +222,11 @@ def charge(
       The learners with the price of the next update, and the trajectory; both as they are if there
       is no limit on such contacts.
     """
-    contact, price = trajectory.robot_contact, learners.price
-    if contact is None or price is None:
+    price = learners.price
+    if price is None:
         return learners, trajectory
-    contact = jnp.where(trajectory.valid, contact, 0.0)
+    assert trajectory.robot_contact is not None
+    contact = jnp.where(trajectory.valid, trajectory.robot_contact, 0.0)
     arrivals = trajectory.valid & trajectory.terminated
     over = arrivals | (trajectory.valid & trajectory.truncated)
     seen = contact_price.Seen(

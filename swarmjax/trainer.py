@@ -1,5 +1,6 @@
 """The host side of a run: calls the compiled chunk, records, shows, saves, and stops when asked."""
 
+import contextlib
 import importlib
 import math
 import signal
@@ -111,13 +112,19 @@ class Stop:
         sys.stderr.write("stopping after this call, to save; once more stops at once\n")
 
 
-def compile_chunk(program: Program, schedule: Schedule, state: Any) -> Compiled:
+def compile_chunk(
+    program: Program,
+    schedule: Schedule,
+    state: Any,
+    meanwhile: Callable[[], None] | None = None,
+) -> Compiled:
     """Compiles `seeds.train_chunk` ahead of time.
 
     Args:
       program: the compiled side.
       schedule: the curriculum's numbers.
       state: [N] a state, or what `jax.eval_shape` gives of one.
+      meanwhile: is called in a thread when Python has traced the program and XLA compiles it.
 
     Returns:
       The program to call.
@@ -127,7 +134,8 @@ def compile_chunk(program: Program, schedule: Schedule, state: Any) -> Compiled:
     chunk = jax.jit(partial(seeds.train_chunk, program), donate_argnums=1)
     part = jax.eval_shape(partial(seeds.split, parts=groups), state)[0]
     lowered = chunk.lower(schedule, part, np.int32(1))
-    threading.Thread(target=_import_ahead, daemon=True).start()
+    if meanwhile is not None:
+        threading.Thread(target=meanwhile, daemon=True).start()
     call = lowered.compile()
     found = call.memory_analysis()
     assert found is not None  # both CPU and GPU tell
@@ -140,10 +148,12 @@ def compile_chunk(program: Program, schedule: Schedule, state: Any) -> Compiled:
     return Compiled(call, seconds, groups * found.argument_size_in_bytes, work)
 
 
-def _import_ahead() -> None:
+def _import_ahead(settings: TrainConfig) -> None:
     """Imports what a run needs when it has compiled, which leaves Python idle: a second or two."""
-    for name in ("orbax.checkpoint", "tensorboardX"):
-        importlib.import_module(name)
+    with contextlib.suppress(ImportError):  # whoever needs it says so
+        importlib.import_module("orbax.checkpoint")
+        if settings.run.tensorboard:
+            importlib.import_module("tensorboardX")
 
 
 def _call_at_once(
@@ -176,7 +186,7 @@ def prepare(
     Raises:
       ConfigError: if it needs more than there is.
     """
-    compiled = compile_chunk(program, schedule, state)
+    compiled = compile_chunk(program, schedule, state, partial(_import_ahead, program.config))
     memory.check(program.config, compiled.total_bytes, available)
     seconds = compiled.seconds + _build_kernels(program, state)
     # A call of no updates changes nothing, but takes what the program works with.

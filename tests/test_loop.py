@@ -215,7 +215,9 @@ def independent(tiny_config: TrainConfig, tiny_world: World) -> Independent:
     """Robots with a learner each; the third joins at the deadline of the first stage."""
     config = replace(
         tiny_config,
-        algo=replace(tiny_config.algo, policy="independent"),
+        algo=replace(
+            tiny_config.algo, policy="independent", contact_limit=0.5, contact_price_arrivals=0.0
+        ),
         curriculum=CurriculumConfig(threshold=1.0),
     )
     program = Program(config, replace(tiny_world, config=config))
@@ -233,6 +235,16 @@ def test_independent_robots_learn_apart(independent: Independent) -> None:
     assert (moved[:2] > 1e-4).all()
     assert moved[2] == 0.0
     assert not np.array_equal(to_leaves(after)[name][0], to_leaves(after)[name][1])
+
+
+def test_the_price_of_contacts_follows_the_episodes_of_each_robot(independent: Independent) -> None:
+    start, train = independent
+    after, metrics = train(start(), np.int32(3))
+    price = after.learners.price
+    assert price is not None
+    assert (np.asarray(price.episodes)[:2] > 0.0).all()
+    assert float(price.episodes[2]) == 0.0  # absent
+    np.testing.assert_array_equal(metrics["contact_price"][2], np.mean(price.height[:2]))
 
 
 def test_newcomers_start_from_what_the_others_learned(independent: Independent) -> None:

@@ -71,8 +71,8 @@ def update(price: Price, config: AlgoConfig, seen: Seen, steps: int) -> Price:
     Returns:
         The price after: higher by at most `contact_price_rate` for each of the steps if there are
         more contacts an episode than the limit, lower if there are less, or if less than
-        `contact_price_arrivals` of the robots arrive; but never below 0. Before the first episode
-        has ended it stays.
+        `contact_price_arrivals` of the robots arrive; never below 0. Where nothing was seen, and
+        before the first episode has ended, it stays.
     """
     assert config.contact_limit is not None
     before = Seen(price.contacts, price.episodes, price.arrivals)
@@ -82,4 +82,6 @@ def update(price: Price, config: AlgoConfig, seen: Seen, steps: int) -> Price:
     pace = jnp.where(arrive, jnp.clip(excess, -1.0, 1.0), -1.0)
     rise = steps * config.contact_price_rate * jnp.where(episodes > 0.0, pace, 0.0)
     height = jnp.maximum(price.height + rise, 0.0)
-    return Price(height=height, contacts=contacts, episodes=episodes, arrivals=arrivals)
+    after = Price(height=height, contacts=contacts, episodes=episodes, arrivals=arrivals)
+    any_seen = seen.contacts + seen.episodes > 0.0
+    return jax.tree.map(lambda new, old: jnp.where(any_seen, new, old), after, price)

@@ -37,7 +37,7 @@ _MEMORY = {"8.0": 163 * 1024, "9.0": 227 * 1024, "10.0": 227 * 1024}
 _LEAST_GENERATION = 8
 
 # Names that JAX has for products without tensor cores (`jax.default_matmul_precision`).
-_FULL = ("highest", "float32")
+_FULL = ("highest", "float32", "F32_F32_F32")
 
 _Run = functools.partial[fused_kernel.Sums]
 

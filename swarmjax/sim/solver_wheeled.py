@@ -34,8 +34,7 @@ _SLOPE = wp.constant(10)
 # Threads of which one takes an arena: what 32 read each from its own place takes 32 turns.
 _SPREAD = wp.constant(4)
 _BLOCK = 64  # threads; each has much to do, and some much more: small blocks wait less
-# Rows of a robot: 4 of each wheel, 1 of each skid, and contacts of its hull.
-MOST_ROWS = wp.constant(24)
+_GEOMS = 5  # of a robot: hull, two wheels, two skids
 _SEARCHES = wp.constant(12)  # of a step's length
 # Share of the slope at a step's beginning that counts for nothing: float32 rounds at 1e-7, and the
 # grips of a robot are 1e3 times as stiff as its mass.
@@ -98,8 +97,8 @@ class Problem:
       J_column: [A, 1, E].
       D: [A, N] weight of a row.
       aref: [A, N] acceleration that it asks for.
-      first: [A, N] the robot of a row and its `_entries`; of two, the one with the higher number.
-      second: [A, N] the other; -1: none.
+      first: [A, N] of a row of two robots, the one with the higher number, and its `_entries`.
+      second: [A, N] the other.
       own: [A, R] rows of a robot.
       row: [A, R, K] which they are, and its `_entries` in them.
       touches: [A, R] whether any is of another robot too.
@@ -169,10 +168,17 @@ def _problem(m: Any, d: Any, robots: int) -> Any:
     problem.first = wp.empty((d.nworld, d.njmax), dtype=wp.vec3i)
     problem.second = wp.empty((d.nworld, d.njmax), dtype=wp.vec3i)
     problem.own = wp.empty((d.nworld, robots), dtype=int)
-    problem.row = wp.empty((d.nworld, robots, MOST_ROWS), dtype=wp.vec3i)
+    most = _most_rows(m, robots)
+    problem.row = wp.empty((d.nworld, robots, most), dtype=wp.vec3i)
     problem.touches = wp.empty((d.nworld, robots), dtype=bool)
-    problem.scaled = wp.empty((MOST_ROWS, _SLOPE + 1, d.nworld * robots), dtype=float)
+    problem.scaled = wp.empty((most, _SLOPE + 1, d.nworld * robots), dtype=float)
     return problem
+
+
+def _most_rows(m: Any, robots: int) -> int:
+    """Rows that a robot can have: 4 of each wheel, 1 of each skid, 1 of its hull with all else."""
+    others = m.ngeom - 1 - _GEOMS * robots  # but the floor
+    return 2 * 4 + 2 + robots - 1 + others
 
 
 def _together(m: Any, d: Any, robots: int) -> Any:
@@ -217,11 +223,11 @@ def _share_out(problem: Problem, together: Together) -> None:
     touches, crowded = wp.bool(False), wp.bool(False)
     for row in range(_count(problem, arena)):
         first, second = _sides(problem, arena, row)
-        if robot == first[0]:
+        if robot == first[0] and second[0] >= 0:
             problem.first[arena, row] = first
             problem.second[arena, row] = second
         side = wp.where(robot == first[0], first, second)
-        if robot == side[0] and own < MOST_ROWS:
+        if robot == side[0]:
             problem.row[arena, robot, own] = wp.vec3i(row, side[1], side[2])
             own += 1
             touches = touches or second[0] >= 0
@@ -491,7 +497,7 @@ def _relax_pairs(
     turn = wp.tid() / _SPREAD
     if wp.tid() % _SPREAD == 0 and turn < together.crowded[0]:
         arena = together.arena[turn]
-        _collect(problem, together, arena)
+        _collect(problem, together, arena, robots)
         done = wp.int32(0)
         moves = wp.bool(True)
         while moves and done < iterations:
@@ -505,25 +511,25 @@ def _relax_pairs(
 
 
 @wp.func
-def _collect(problem: Problem, together: Together, arena: int) -> None:
+def _collect(problem: Problem, together: Together, arena: int, robots: int) -> None:
     """Lists the rows between two robots."""
     count = wp.int32(0)
-    for row in range(_count(problem, arena)):
-        if problem.second[arena, row][0] >= 0:
-            together.row[arena, count] = row
-            count += 1
+    for robot in range(robots):
+        if problem.touches[arena, robot]:
+            for k in range(problem.own[arena, robot]):
+                side = problem.row[arena, robot, k]
+                if side[2] == _SHARED and problem.first[arena, side[0]][0] == robot:
+                    together.row[arena, count] = side[0]
+                    count += 1
     together.count[arena] = count
 
 
 @wp.func
 def _along(problem: Problem, arena: int, row: int, of_joints: wp.array2d[float]) -> float:
-    """A row of J times what all joints of its arena have."""
-    side = problem.first[arena, row]
-    found = wp.dot(_entries(problem, arena, side), _of_robot(of_joints, arena, side[0]))
-    side = problem.second[arena, row]
-    if side[0] >= 0:
-        found += wp.dot(_entries(problem, arena, side), _of_robot(of_joints, arena, side[0]))
-    return found
+    """A row of J between two robots times what their joints have."""
+    first, second = problem.first[arena, row], problem.second[arena, row]
+    found = wp.dot(_entries(problem, arena, first), _of_robot(of_joints, arena, first[0]))
+    return found + wp.dot(_entries(problem, arena, second), _of_robot(of_joints, arena, second[0]))
 
 
 @wp.func

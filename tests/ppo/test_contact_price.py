@@ -52,12 +52,15 @@ def test_it_moves_by_what_is_too_many(seen: tuple[float, float, float], pace: fl
 
 
 def test_it_remembers_twenty_updates() -> None:
-    after = contact_price.update(_at(0.0, 2.0, 10.0, 9.0), CONFIG, _seen(4.0, 0.0, 0.0), 32)
+    before = _at(0.0, 2.0, 10.0, 9.0)
+    after = contact_price.update(before, CONFIG, _seen(4.0, 0.0, 0.0), 32)
     # 1 / 20 of what is new: 2 + 0.05 (4 - 2), 10 + 0.05 (0 - 10), 9 + 0.05 (0 - 9).
     found = [after.contacts, after.episodes, after.arrivals]
     np.testing.assert_allclose(found, [2.1, 9.5, 8.55], rtol=1e-6)
     # 2.1 / 9.5 is 2.2 times the limit of 0.1: more than twice.
     np.testing.assert_allclose(after.height, 0.032, rtol=1e-6)
+    # A learner whose robot is away keeps what it has.
+    assert contact_price.update(before, CONFIG, _seen(0.0, 0.0, 0.0), 32) == before
 
 
 @given(contacts=st.lists(st.integers(0, 50), min_size=1, max_size=30), height=st.floats(0.0, 0.1))
@@ -103,8 +106,5 @@ def test_contacts_are_charged_to_whoever_had_them() -> None:
     # Two contacts and one, in one episode each: far above 0.1, both rise by 2 steps of 0.01.
     np.testing.assert_allclose(charged.price.height, [0.52, 0.27], rtol=1e-6)
     np.testing.assert_allclose(charged.price.contacts, [0.1, 0.05], rtol=1e-6)
-
-
-def test_without_a_limit_nothing_is_charged() -> None:
-    learner = ppo.init(jax.random.key(0), AlgoConfig(), 10, 2, 5)
-    assert learner.price is None
+    free = replace(learners, price=None)  # without a limit
+    assert rollout.charge(free, trajectory, AlgoConfig()) == (free, trajectory)

@@ -306,6 +306,8 @@ def test_contacts_are_counted_by_kind(episode: Episode) -> None:
     assert counts[BUMPING].tolist() == [[0, 0, 1], [0, 1, 0], [0, 0, 0]]
     # A contact of two robots is one of each, arrived or not.
     assert counts[PUSHING].tolist() == [[1, 0, 0], [1, 0, 0], [0, 0, 0]]
+    # Charged is the one that is still on its way.
+    assert episode.came.robot_contact[:, PUSHING].sum(axis=0).tolist() == [0.0, 1.0, 0.0]
     assert not counts[STANDING].any()
     # All of them again, from the poses.
     apart = np.full((ARENAS, ROBOTS, 3), gaps.CONTACT_PAUSE)
