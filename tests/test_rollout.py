@@ -215,7 +215,7 @@ def test_monte_carlo_returns_are_targets_and_advantages(time_out: str) -> None:
     trajectory = _random_trajectory(shape)
     config = AlgoConfig(discount=0.9, returns="monte_carlo", time_out=time_out)
     found = rollout.batch(trajectory, config)
-    reward, terminated, truncated, valid = (np.asarray(x) for x in trajectory[5:])
+    reward, terminated, truncated, valid = (np.asarray(x) for x in trajectory[5:9])
     following, returns = np.zeros(shape[1:]), np.zeros(shape)
     for t in reversed(range(shape[0])):
         # A step limit that leaks is no end; physics that broke always is.

@@ -48,14 +48,14 @@ def test_the_help_names_the_rows_of_the_algorithm() -> None:
 
 def test_the_preset_leaves_no_number_of_the_learner_to_a_default() -> None:
     given = compose.read_preset("algo", "paper")
-    # One has no meaning, the other says how numbers come about, not which.
-    others = {"gae_lambda", "gradient"}
+    # One has no meaning, one says how numbers come about, not which, two belong to the limit.
+    others = {"gae_lambda", "gradient", "contact_price_rate", "contact_price_arrivals"}
     assert set(given["algo"]) | others == {f.name for f in dataclasses.fields(AlgoConfig)}
     assert PAPER.algo.gae_lambda is None
     rewards = {f.name for f in dataclasses.fields(RewardConfig)}
     assert set(given["task"]["reward"]) == rewards
     # Equation 3.
-    assert dataclasses.astuple(PAPER.task.reward) == (1.0, -0.001, 0.0, 0.0, 0.0)
+    assert dataclasses.astuple(PAPER.task.reward) == (1.0, -0.001, 0.0, 0.0, 0.0, 0.0)
 
 
 def test_the_preset_chooses_the_files_that_are_not_given() -> None:
