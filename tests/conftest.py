@@ -4,8 +4,7 @@ import os
 
 os.environ["JAX_PLATFORMS"] = "cpu"  # before anything imports JAX
 # Most of the time is compiling, which takes two thirds as long so; proofs with `-m slow` as well.
-FLAG = "--xla_backend_optimization_level=1"
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FLAG}".strip()
+os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_backend_optimization_level=1"
 
 import functools
 from collections.abc import Callable
