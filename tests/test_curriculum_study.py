@@ -150,6 +150,7 @@ def _count(learners: LearnerState) -> dict[str, dict[str, np.ndarray]]:
     return {"goal": {"targets_reached": np.asarray(learners.normalizer.count[:, 0])}}
 
 
+@pytest.mark.slow
 def test_an_arm_is_judged_at_its_points(trained: TrainConfig) -> None:
     at = np.array([1, 2, 5])
     curves = curriculum.measure(trained, at, _count)

@@ -151,6 +151,7 @@ def test_mixed_keeps_arenas_on_earlier_stages_within_one_trace(tiny_config: Trai
     chunk(other, init(other), np.int32(20))
 
 
+@pytest.mark.slow
 def test_adaptive_trains_on_all_stages_within_one_trace(tiny_config: TrainConfig) -> None:
     options = CurriculumConfig(mode="adaptive")
     program, schedule = loop.load(_six(tiny_config, options))
@@ -196,6 +197,7 @@ def test_metrics_by_stage_are_the_record(
     assert moved == [0, 1]
 
 
+@pytest.mark.slow
 def test_a_seed_may_be_given(program: Program, start: Callable[[], TrainState]) -> None:
     schedule = curriculum.schedule(program.config)
     init = jax.jit(partial(loop.init, program))

@@ -125,6 +125,7 @@ def test_in_turn_a_seed_is_the_run_that_it_is_alone(
     _assert_same(_lane(found, 1), _lane(_run(alone)(_start(alone), UPDATES), 0))
 
 
+@pytest.mark.slow
 def test_one_seed_is_what_the_loop_makes(
     tiny_config: TrainConfig, tiny_world: World, start: TrainState, run: Run
 ) -> None:

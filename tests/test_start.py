@@ -190,6 +190,7 @@ def test_several_seeds_begin_with_as_many_lane_by_lane(trained: Path, pair: Path
         np.testing.assert_array_equal(found[name], expected, err_msg=name, strict=True)
 
 
+@pytest.mark.slow
 def test_several_seeds_may_all_begin_with_the_same_one(trained: Path) -> None:
     source, state, settings = _load([f"start={trained}", "seeds=3"])
     found = checkpoint.to_leaves(start.carry(source, state, settings))

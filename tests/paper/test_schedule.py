@@ -136,6 +136,7 @@ def _config(scale: int) -> TrainConfig:
     )
 
 
+@pytest.mark.slow
 def test_a_run_of_a_twentieth_of_the_steps() -> None:
     _check_run(_config(20), 166)
 

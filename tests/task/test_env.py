@@ -417,6 +417,7 @@ def real() -> Drawn:
     return Drawn(world, dataclasses.replace(starts[0], sim=sim), jax.jit(step), traces)
 
 
+@pytest.mark.slow
 def test_real_robots_drive_for_many_episodes(real: Drawn) -> None:
     random, state, ended, cohorts = np.random.default_rng(0), real.start, [], []
     before = jax.tree.structure(state)
