@@ -22,7 +22,7 @@ import warp as wp
 # around them: only then does a matrix stay in registers. Functions get copies of their arguments.
 
 NUMBER = -1  # what `opt.solver` says; MuJoCo has none of it
-_ITERATIONS = 20  # of Newton's method, at most; two or three do, thirteen were seen
+_ITERATIONS = 20  # of Newton's method, at most; six do where robots touch, 18 were seen
 JOINTS = wp.constant(8)  # of a robot: free in space, and two wheels
 _FREE = wp.constant(6)  # of these, free in space
 _INERTIA = wp.constant(35)  # entries of a robot's M, without that of both wheels, which is 0
