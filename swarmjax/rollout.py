@@ -228,7 +228,7 @@ def charge(
     assert trajectory.robot_contact is not None
     contact = jnp.where(trajectory.valid, trajectory.robot_contact, 0.0)
     arrivals = trajectory.valid & trajectory.terminated
-    over = arrivals | (trajectory.valid & trajectory.truncated)
+    over = arrivals | _timed_out(trajectory)
     seen = contact_price.Seen(
         *(jnp.sum(each, axis=(0, 2, 3), dtype=float) for each in (contact, over, arrivals))
     )

@@ -389,8 +389,8 @@ def _entries(problem: Problem, arena: int, side: wp.vec3i) -> _Vector:
     """A row's entries at a robot.
 
     Args:
-      side: anything; where the body's six entries are, which come from the last joint to the first;
-        and which joint of a wheel has the one before them, -1: none.
+      side: the robot or the row, which is not looked at; where the body's six entries are, which
+        come from the last joint to the first; and which wheel's joint has the one before them.
     """
     found = _Vector()
     for i in range(6):
