@@ -395,6 +395,10 @@ class AlgoConfig(Section):
         default=0.5, metadata=about("weight of the value loss, half the mean squared error", 0.0)
     )
     entropy_cost: float = field(default=0.0, metadata=about("weight of the entropy", 0.0))
+    bound_cost: float = field(
+        default=1.0,
+        metadata=about("weight of the squared distance of the mean action from -1..1", 0.0),
+    )
     gradient: Literal["auto", "autodiff", "fused"] = field(
         default="auto",
         metadata=about(

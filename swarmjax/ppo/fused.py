@@ -3,7 +3,10 @@
 It is that of `losses.ppo_loss`, written out. With s over the valid samples, n = max(expected_valid,
 1), ratio r_s = exp(log pi(a_s) - log pi_old(a_s)) and V the critic, that loss is
 
-    1/n sum_s [-min(r_s A_s, clip(r_s) A_s) + value_cost (V_s - R_s)^2 / 2 - entropy_cost H].
+    1/n sum_s [-min(r_s A_s, clip(r_s) A_s) + value_cost (V_s - R_s)^2 / 2 - entropy_cost H
+               + bound_cost |b_s|^2],
+
+b_s being how far the mean action lies beyond -1..1.
 
 Its kernels sum over samples; what is the same for all of them, 1/n among it, comes after.
 """
@@ -228,12 +231,14 @@ def _surrogate(
     gain = ratio * advantage
     clipped = jnp.minimum(jnp.maximum(ratio, 1.0 - config.clip), 1.0 + config.clip) * advantage
     by_density = jnp.where(valid & (gain <= clipped), -gain, 0.0)[:, None]
-    slope = by_density * standardised * jnp.exp(-log_std)
+    beyond = jnp.where(valid[:, None], mean - jnp.minimum(jnp.maximum(mean, -1.0), 1.0), 0.0)
+    slope = by_density * standardised * jnp.exp(-log_std) + 2.0 * config.bound_cost * beyond
     if config.output == "tanh":
         slope *= 1.0 - mean * mean
     return slope, {
         "log_std": by_density * (standardised * standardised - 1.0),
         "policy_loss": jnp.where(valid, -jnp.minimum(gain, clipped), 0.0),
+        "bound_loss": jnp.sum(beyond * beyond, axis=1),
         "approx_kl": ratio - 1.0 - log_ratio,  # 0 where not valid
         "clip_fraction": jnp.where(jnp.abs(ratio - 1.0) > config.clip, 1.0, 0.0),  # likewise
     }

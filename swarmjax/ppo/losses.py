@@ -36,15 +36,19 @@ class Minibatch:
 def ppo_loss(
     params: Params, minibatch: Minibatch, config: AlgoConfig, expected_valid: jax.Array
 ) -> tuple[jax.Array, Metrics]:
-    """Computes the loss to minimise: policy + value_cost * value - entropy_cost * entropy.
+    """Computes the loss to minimise.
+
+    It is policy + value_cost * value - entropy_cost * entropy + bound_cost * bound.
 
     Policy: the clipped surrogate of Schulman et al. 2017, "Proximal Policy Optimization
     Algorithms", equation 7, negated. Value: half the squared error against the return, not
     clipped (Andrychowicz et al. 2021, "What Matters in On-Policy Reinforcement Learning?", section
-    3.4: clipping it hurts). Each term is a
-    sum over the valid samples divided by `expected_valid`, so that every valid sample of a batch
-    weighs the same however unevenly its minibatches are filled, and the mean over the minibatches
-    is exactly the mean over the batch.
+    3.4: clipping it hurts). Bound: the squared distance of the mean action from -1..1, summed over
+    the action, as `bounds_loss` of rl_games: from a mean that lies deviations beyond, all that is
+    drawn does the same, so that nothing is learned there. Each term is a sum over the valid samples
+    divided by `expected_valid`, so that every valid sample of a batch weighs the same however
+    unevenly its minibatches are filled, and the mean over the minibatches is exactly the mean over
+    the batch.
 
     Args:
         params: Of actor and critic.
@@ -55,7 +59,8 @@ def ppo_loss(
 
     Returns:
         The loss [] and its parts, each [] and weighted in the same way: `policy_loss`,
-        `value_loss`, `entropy` (nats), `approx_kl` (nats, at least 0) and `clip_fraction` (0..1).
+        `value_loss`, `bound_loss`, `entropy` (nats), `approx_kl` (nats, at least 0) and
+        `clip_fraction` (0..1).
     """
     chex.assert_rank([minibatch.observation, minibatch.action], 2)
     chex.assert_rank(
@@ -75,6 +80,7 @@ def ppo_loss(
     metrics = {
         "policy_loss": -mean(_clipped_surrogate(ratio, minibatch.advantage, config.clip)),
         "value_loss": mean(0.5 * (value - minibatch.return_) ** 2),
+        "bound_loss": mean(jnp.sum(networks.beyond_range(action_mean) ** 2, axis=-1)),
         "entropy": mean(networks.entropy(std)),
         # Unbiased and never negative: Schulman 2020, "Approximating KL Divergence", estimator k3.
         "approx_kl": mean(ratio - 1.0 - log_ratio),
@@ -84,6 +90,7 @@ def ppo_loss(
         metrics["policy_loss"]
         + config.value_cost * metrics["value_loss"]
         - config.entropy_cost * metrics["entropy"]
+        + config.bound_cost * metrics["bound_loss"]
     )
     return loss, metrics
 

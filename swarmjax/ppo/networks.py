@@ -145,6 +145,18 @@ def value(params: Params, config: AlgoConfig, observation: jax.Array) -> jax.Arr
     return cast("jax.Array", _Critic(config).apply({"params": params["critic"]}, observation))
 
 
+def beyond_range(mean: jax.Array) -> jax.Array:
+    """Computes how far a mean action lies beyond the range of commands.
+
+    Args:
+        mean: [B, U], -1..1 spans the commands.
+
+    Returns:
+        [B, U]: 0 within the range, below 0 under it, above 0 over it.
+    """
+    return mean - jnp.clip(mean, -1.0, 1.0)
+
+
 def log_prob(mean: jax.Array, std: jax.Array, action: jax.Array) -> jax.Array:
     """Computes the log density of actions under a diagonal Gaussian.
 

@@ -26,12 +26,14 @@ H100 = AbstractDevice(device_kind="NVIDIA H100 80GB HBM3", num_cores=132, platfo
 
 
 def _params(config: AlgoConfig, seed: int = 0) -> Params:
-    """Parameters none of which is 0."""
+    """Parameters none of which is 0; mean actions lie within -1..1 and beyond."""
     shapes = jax.eval_shape(
         lambda: networks.init_params(jax.random.key(0), config, OBSERVATION, ACTION)
     )
     random = np.random.default_rng(seed)
-    return jax.tree.map(lambda x: 0.3 * random.normal(size=x.shape).astype(np.float32), shapes)
+    params = jax.tree.map(lambda x: 0.3 * random.normal(size=x.shape).astype(np.float32), shapes)
+    params["actor"]["mean"]["kernel"] *= 3.0
+    return params
 
 
 @functools.partial(jax.jit, static_argnums=1)
@@ -103,6 +105,7 @@ def test_gradient_and_metrics_are_those_of_autodiff(
     minibatch = _minibatch(params, config, size)
     expected = _expected(params, minibatch, config, count)
     assert 0.0 < expected[1]["clip_fraction"] * max(count, 1.0) < np.sum(minibatch.valid)
+    assert (expected[1]["bound_loss"] > 0.0) == (config.output == "linear")
     _assert_close(_fused(params, minibatch, config, count, launch), expected)
 
 

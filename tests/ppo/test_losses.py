@@ -13,8 +13,9 @@ from swarmjax.ppo import networks
 from swarmjax.ppo.losses import Minibatch, ppo_loss
 
 B, OBSERVATION, U = 24, 3, 2
-CONFIG = AlgoConfig(hidden=(8,), clip=0.2, value_cost=0.7, entropy_cost=0.03)
+CONFIG = AlgoConfig(hidden=(8,), clip=0.2, value_cost=0.7, entropy_cost=0.03, bound_cost=0.4)
 PARAMS = networks.init_params(jax.random.key(0), CONFIG, OBSERVATION, U)
+PARAMS["actor"]["mean"]["kernel"] *= 150.0  # so that means lie on both sides of -1 and of 1
 
 
 def _minibatch(valid_share: float = 0.6) -> Minibatch:
@@ -39,18 +40,20 @@ def _expected(minibatch: Minibatch, expected_valid: float) -> dict[str, float]:
     value = np.asarray(networks.value(PARAMS, CONFIG, minibatch.observation), np.float64)
     log_prob = scipy.stats.norm.logpdf(minibatch.action, mean, std).sum(axis=-1)
     total = dict.fromkeys(
-        ("policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction"), 0.0
+        ("policy_loss", "value_loss", "bound_loss", "entropy", "approx_kl", "clip_fraction"), 0.0
     )
     for i in np.flatnonzero(minibatch.valid):
         ratio = np.exp(log_prob[i] - minibatch.log_prob[i])
         advantage = minibatch.advantage[i]
         total["policy_loss"] -= min(ratio * advantage, np.clip(ratio, 0.8, 1.2) * advantage)
         total["value_loss"] += (value[i] - minibatch.return_[i]) ** 2 / 2
+        total["bound_loss"] += sum(max(abs(x) - 1, 0) ** 2 for x in np.asarray(mean[i], np.float64))
         total["entropy"] += scipy.stats.norm.entropy(scale=std).sum()
         total["approx_kl"] += ratio - 1 - np.log(ratio)
         total["clip_fraction"] += abs(ratio - 1) > 0.2
     parts = {name: part / max(expected_valid, 1.0) for name, part in total.items()}
     parts["loss"] = parts["policy_loss"] + 0.7 * parts["value_loss"] - 0.03 * parts["entropy"]
+    parts["loss"] += 0.4 * parts["bound_loss"]
     return parts
 
 
@@ -61,6 +64,7 @@ def test_loss_and_its_parts_equal_numpy(expected_valid: float) -> None:
     loss, metrics = ppo_loss(PARAMS, minibatch, CONFIG, jnp.float32(expected_valid))
     expected = _expected(minibatch, expected_valid)
     assert expected["clip_fraction"] > 0.0
+    assert expected["bound_loss"] > 0.0
     # Sums of 24 float32 terms of order 1 against float64.
     np.testing.assert_allclose(loss, expected.pop("loss"), rtol=1e-5, atol=1e-5)
     assert metrics.keys() == expected.keys()
@@ -72,7 +76,7 @@ def test_a_clipped_ratio_has_no_gradient_and_an_unclipped_one_has() -> None:
     minibatch = _minibatch()
     mean, std = networks.action_distribution(PARAMS, CONFIG, minibatch.observation)
     log_prob = networks.log_prob(mean, std, minibatch.action)
-    config = AlgoConfig(hidden=(8,), clip=0.2, entropy_cost=0.0)
+    config = AlgoConfig(hidden=(8,), clip=0.2, entropy_cost=0.0, bound_cost=0.0)
 
     def slope(ratio: float, advantage: float) -> float:
         samples = replace(

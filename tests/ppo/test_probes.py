@@ -1,4 +1,4 @@
-"""Six worlds so small that value and best action are known: which part of PPO is broken?
+"""Seven worlds so small that value and best action are known: which part of PPO is broken?
 
 In the manner of Andy Jones, "Debugging Reinforcement Learning Systems" (2021), probe environments.
 """
@@ -99,7 +99,8 @@ def _iterate(
     return (state, world), None
 
 
-def _solve(probe: Probe) -> LearnerState:
+def _solve(probe: Probe, first: float = 0.0) -> LearnerState:
+    """Trains from a mean action of about `first`."""
     init_key, world_key, loop_key = jax.random.split(jax.random.key(0), 3)
 
     @jax.jit
@@ -107,6 +108,7 @@ def _solve(probe: Probe) -> LearnerState:
         return jax.lax.scan(functools.partial(_iterate, probe), (state, world), keys)[0][0]
 
     state = learner.init(init_key, CONFIG, 1, 1, UPDATES)
+    state.params["actor"]["mean"]["bias"] = jnp.array([first])
     return run(state, _start(world_key), jax.random.split(loop_key, UPDATES))
 
 
@@ -166,6 +168,16 @@ def test_actor_learns_the_best_action_of_each_observation() -> None:
     )
     # As above, with half the samples for each observation.
     np.testing.assert_allclose(_modes(state, -1.0, 1.0), [-0.5, 0.5], atol=0.02)
+
+
+def test_an_actor_beyond_the_range_of_commands_comes_back() -> None:
+    def reward(draw: jax.Array, action: jax.Array, clock: jax.Array) -> jax.Array:
+        return -((jnp.clip(action, -1.0, 1.0) - 0.5) ** 2)
+
+    state = _solve(Probe(1, lambda draw, clock: 0.0 * draw, reward), first=-4.0)
+    # Five deviations beyond, one draw of three million is within: rewards alone say nothing there.
+    # 0.5 is not quite the best mean, since what is drawn above 1 does as 1 does.
+    np.testing.assert_allclose(_modes(state, 0.0), [0.5], atol=0.05)
 
 
 def test_the_kernels_teach_the_actor_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
