@@ -603,7 +603,9 @@ class SimConfig(Section):
     )
     solver: Literal["auto", "newton", "swarm"] = field(
         default="auto",
-        metadata=about("of contacts; swarm: made for the body, warp alone; auto: swarm there"),
+        metadata=about(
+            "of contacts; swarm: made for the body, of wheels by warp; auto: swarm there"
+        ),
     )
     max_robots: int = field(default=5, metadata=about("robots compiled in", 1, 100))
     max_obstacles: int = field(default=4, metadata=about("obstacles compiled in", 0, 32))

@@ -22,18 +22,16 @@ from jax import Array
 
 from swarmjax.config import ConfigError, RobotConfig
 from swarmjax.sim import model as sim_model
+from swarmjax.sim import solver_planar_jax
 from swarmjax.sim.body import AS_BUILT, Body, Chassis
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints twice where Warp is not installed
     from mujoco import mjx
 
-# Newton iterations and line-search steps; see docs/design.md for what was measured.
-SOLVER_STEPS = {
-    ("planar", "jax"): (3, 5),
-    ("wheeled", "jax"): (30, 20),
-    ("planar", "warp"): (100, 50),
-    ("wheeled", "warp"): (100, 50),
-}
+# Iterations and line-search steps; see docs/design.md for what was measured. MJX's Newton method by
+# `jax` takes as many whether it needs them or not; all else stops by itself.
+_NEWTON_STEPS = {"planar": (3, 5), "wheeled": (30, 20)}
+_MOST_STEPS = (100, 50)  # MuJoCo's own
 # Contacts between hulls and what they touch are stored for all arenas together by Warp: an average
 # of this many a robot is far more than a swarm makes; each arena alone may have
 # SOLVER_ROWS_PER_ROBOT. What stands on the floor is counted apart, and whole.
@@ -75,6 +73,7 @@ class Physics:
       ids: rows of the moving bodies.
       robot: the robot's numbers.
       substeps: physics steps per control step.
+      discs: what takes the physics steps in MJX's place; None: MJX does.
     """
 
     model: mjx.Model
@@ -83,6 +82,7 @@ class Physics:
     ids: sim_model.Ids
     robot: RobotConfig
     substeps: int
+    discs: solver_planar_jax.Discs | None = None
 
     @property
     def body(self) -> Body:
@@ -127,9 +127,10 @@ def resolve_solver(solver: str, impl: str, body: str, robots: int) -> str:
     Raises:
       ConfigError: if `swarm` is asked for where it cannot be.
     """
-    if solver == "swarm" and impl != "warp":
+    if solver == "swarm" and body == "wheeled" and impl != "warp":
         raise ConfigError(
-            f"sim.solver is swarm, but sim.impl is {impl}: give newton or auto, or sim.impl=warp."
+            f"sim.solver is swarm, but robot.body is wheeled and sim.impl is {impl}: give newton "
+            "or auto, or sim.impl=warp."
         )
     if solver == "swarm" and body == "wheeled" and robots > MOST_WHEELED:
         raise ConfigError(
@@ -138,8 +139,13 @@ def resolve_solver(solver: str, impl: str, body: str, robots: int) -> str:
         )
     if solver != "auto":
         return solver
-    possible = impl == "warp" and (body == "planar" or robots <= MOST_WHEELED)
+    possible = body == "planar" or (impl == "warp" and robots <= MOST_WHEELED)
     return "swarm" if possible else "newton"
+
+
+def solver_steps(solver: str, impl: str, body: str) -> tuple[int, int]:
+    """Says how many iterations, and steps of their line search, a solver takes at most."""
+    return _NEWTON_STEPS[body] if (solver, impl) == ("newton", "jax") else _MOST_STEPS
 
 
 def load(
@@ -170,14 +176,17 @@ def load(
     if impl == "warp":
         _quiet_warp()
         limits = _limits(model, len(ids.hull_body), arenas)
-    if solver == "swarm":
+    discs = None
+    if solver == "swarm" and impl == "jax":
+        discs = solver_planar_jax.load(model, ids, robot.hull_radius)
+    elif solver == "swarm":
         model = copy.copy(model)
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE  # as solver_wheeled reads it
     template = mjx.make_data(model, impl=impl, **limits)
     device_model = mjx.put_model(model, impl=impl)
-    if solver == "swarm":
+    if solver == "swarm" and impl == "warp":
         device_model = _with_swarm_solver(device_model, robot.body)
-    return Physics(device_model, model, template, ids, robot, substeps)
+    return Physics(device_model, model, template, ids, robot, substeps, discs)
 
 
 def _with_swarm_solver(model: mjx.Model, body: str) -> mjx.Model:
@@ -277,7 +286,10 @@ def step(
     data = data.replace(**of_data)
 
     def once(_: int, data: mjx.Data) -> mjx.Data:
-        return mjx.step(model, _drive(physics, data, ctrl, chassis))
+        driven = _drive(physics, data, ctrl, chassis)
+        if physics.discs is not None:
+            return solver_planar_jax.step(physics.discs, model, driven, side, obstacle)
+        return mjx.step(model, driven)
 
     if physics.substeps == 1:
         return once(0, data)

@@ -136,7 +136,8 @@ def load(config: TrainConfig) -> World:
     size = model.ArenaSize(sim.max_robots, sim.max_obstacles, largest)
     robot = task_factors.largest(config.robot, config.realism)
     spec = model.build(robot, size, config.task.control_step / count, fixtures="world")
-    iterations, ls_iterations = physics.SOLVER_STEPS[config.robot.body, impl]
+    solver = resolve_solver(config)
+    iterations, ls_iterations = physics.solver_steps(solver, impl, config.robot.body)
     spec.option.iterations = sim.iterations or iterations
     spec.option.ls_iterations = sim.ls_iterations or ls_iterations
     compiled = spec.compile()
@@ -145,7 +146,7 @@ def load(config: TrainConfig) -> World:
         model.ids(compiled, size),
         config.robot,
         impl=impl,
-        solver=resolve_solver(config),
+        solver=solver,
         arenas=config.arenas * (config.seeds if config.seeds_by == "vmap" else 1),
         substeps=count,
     )

@@ -14,14 +14,16 @@ from swarmjax.sim import drive, model, physics
 from swarmjax.sim.body import AS_BUILT
 from swarmjax.task import env
 
+Impl = Literal["jax", "warp"]
+Solver = Literal["newton", "swarm"]
 ROBOTS, ARENAS, STEP = 5, 24, 0.032
 SIZE = model.ArenaSize(ROBOTS, 1, 0.05)
 BOX = np.array([[0.05, 0.02, 0.4, 0.05, 0.05]], np.float32)
 
 
-def _load(body: BodyName, solver: Literal["newton", "swarm"]) -> physics.Physics:
+def _load(impl: Impl, body: BodyName, solver: Solver) -> physics.Physics:
     stage = StageConfig(name="box", robots=ROBOTS, side=1.3, obstacles=1, obstacle_size=0.1)
-    sim = SimConfig(impl="warp", solver=solver, max_robots=ROBOTS, max_obstacles=1)
+    sim = SimConfig(impl=impl, solver=solver, max_robots=ROBOTS, max_obstacles=1)
     robot = RobotConfig(body=body)
     settings = TrainConfig(stage=(stage,), robot=robot, sim=sim, arenas=ARENAS, budget=10_000)
     return env.load(settings).physics
@@ -78,25 +80,29 @@ def _in_c(
 # times as stiff as its robot. Off by these shares of the fastest joint and of the fastest robot
 # were the velocities seen; twice that is allowed.
 @pytest.mark.parametrize(
-    ("body", "solver", "side", "most", "seen"),
+    ("impl", "body", "solver", "side", "most", "seen"),
     [
-        ("planar", "swarm", 0.16, 9, (2.0e-4, 1.2e-3)),
-        ("wheeled", "swarm", 0.16, 9, (1.4e-5, 2.9e-6)),
-        ("planar", "swarm", 0.5, 2, (1.7e-6, 1.3e-5)),
-        ("wheeled", "swarm", 0.5, 2, (6.7e-6, 8.0e-7)),
-        ("planar", "newton", 0.5, 2, (1.7e-6, 2.1e-6)),
-        ("wheeled", "newton", 0.5, 2, (2.1e-5, 1.7e-5)),
+        ("warp", "planar", "swarm", 0.16, 9, (2.0e-4, 1.2e-3)),
+        ("jax", "planar", "swarm", 0.16, 9, (1.2e-4, 7.1e-4)),
+        ("warp", "wheeled", "swarm", 0.16, 9, (1.4e-5, 2.9e-6)),
+        ("warp", "planar", "swarm", 0.5, 2, (1.7e-6, 1.3e-5)),
+        ("jax", "planar", "swarm", 0.5, 2, (4.0e-7, 2.7e-6)),
+        ("warp", "wheeled", "swarm", 0.5, 2, (6.7e-6, 8.0e-7)),
+        ("warp", "planar", "newton", 0.5, 2, (1.7e-6, 2.1e-6)),
+        ("warp", "wheeled", "newton", 0.5, 2, (2.1e-5, 1.7e-5)),
+        ("jax", "planar", "newton", 0.5, 2, (4.2e-6, 1.6e-6)),
     ],
 )
 def test_crowds_push_each_other_apart_as_in_c(
+    impl: Impl,
     body: BodyName,
-    solver: Literal["newton", "swarm"],
+    solver: Solver,
     side: float,
     most: int,
     seen: tuple[float, float],
 ) -> None:
     pose, wheels = _crowds(side)
-    found = _by_mjx(_load(body, solver), side, pose, wheels)
+    found = _by_mjx(_load(impl, body, solver), side, pose, wheels)
     each = [_in_c(RobotConfig(body=body), side, p, w) for p, w in zip(pose, wheels, strict=True)]
     expected, pairs = np.array([one[0] for one in each]), [one[1] for one in each]
     assert max(pairs) >= most
@@ -120,12 +126,13 @@ def test_the_solver_is_chosen() -> None:
     assert resolve("auto", "warp", "planar", 50) == "swarm"
     assert resolve("auto", "warp", "wheeled", 5) == "swarm"
     assert resolve("auto", "warp", "wheeled", 6) == "newton"
-    assert resolve("auto", "jax", "planar", 5) == "newton"
+    assert resolve("auto", "jax", "planar", 50) == "swarm"
+    assert resolve("auto", "jax", "wheeled", 5) == "newton"
     assert resolve("newton", "warp", "planar", 5) == "newton"
     with pytest.raises(
-        ConfigError, match=r"sim\.solver is swarm, but sim\.impl is jax: give newton"
+        ConfigError, match=r"robot\.body is wheeled and sim\.impl is jax: give newton"
     ):
-        resolve("swarm", "jax", "planar", 5)
+        resolve("swarm", "jax", "wheeled", 5)
     with pytest.raises(
         ConfigError, match=r"sim\.max_robots is 6: give newton or auto, or 5 robots"
     ):
