@@ -281,7 +281,7 @@ class RewardConfig(Section):
         default=0.0, metadata=about("per control step with something in infrared range")
     )
     arrival: float = field(default=0.0, metadata=about("once, on arrival"))
-    contact: float = field(default=-0.02, metadata=about("per contact event, of whatever kind"))
+    contact: float = field(default=-0.2, metadata=about("per contact event, of whatever kind"))
     robot_contact: float = field(
         default=0.0, metadata=about("besides, per contact event with another robot")
     )
@@ -615,7 +615,7 @@ class SimConfig(Section):
     )
     iterations: int | None = field(
         default=None,
-        metadata=about("of the solver, of swarm on wheels 20 at most; null: measured", 1, 1000),
+        metadata=about("of the solver, at most; on wheels by swarm 20; null: measured", 1, 1000),
     )
     ls_iterations: int | None = field(
         default=None,

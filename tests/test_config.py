@@ -76,7 +76,7 @@ def test_train_defaults_to_the_whole_curriculum():
 
 
 def test_defaults_of_the_reward_are_equation_3_and_two_prices():
-    assert dataclasses.astuple(RewardConfig()) == (1.0, 0.0, 0.0, -0.02, 0.0, -0.002)
+    assert dataclasses.astuple(RewardConfig()) == (1.0, 0.0, 0.0, -0.2, 0.0, -0.002)
 
 
 def test_robot_defaults_are_the_epuck():

@@ -115,6 +115,25 @@ def ids(model: mujoco.MjModel, size: ArenaSize) -> Ids:
     )
 
 
+def fixture_rectangles(side: Any, obstacle: Any, xp: Any) -> Any:
+    """Outlines the obstacles, and the walls east, north, west and south of the arena.
+
+    Args:
+      side: [] of the arena, m.
+      obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [M + 4, 5] likewise.
+    """
+    bearing = np.arange(WALLS, dtype=np.float32) * np.float32(np.pi / 2)
+    away = 0.5 * side + WALL_HALF_THICKNESS
+    middle = xp.stack([away * np.cos(bearing), away * np.sin(bearing)], axis=-1)
+    halves = np.tile(np.float32([WALL_HALF_THICKNESS, WALL_HALF_LENGTH]), (WALLS, 1))
+    wall = xp.concatenate([middle, bearing[:, None], halves], axis=-1)
+    return xp.concatenate([obstacle, wall])
+
+
 def fixture_poses(side: Any, obstacle: Any, xp: Any) -> tuple[Any, Any]:
     """Places the obstacles, and the walls east, north, west and south of the arena.
 
@@ -126,13 +145,10 @@ def fixture_poses(side: Any, obstacle: Any, xp: Any) -> tuple[Any, Any]:
     Returns:
       Positions [M + 4, 3] on the floor (m) and unit quaternions [M + 4, 4] (w, x, y, z).
     """
-    bearing = np.arange(WALLS, dtype=np.float32) * np.float32(np.pi / 2)
-    away = 0.5 * side + WALL_HALF_THICKNESS
-    wall = xp.stack([away * np.cos(bearing), away * np.sin(bearing)], axis=-1)
-    flat = xp.concatenate([obstacle[:, :2], wall])
-    half_yaw = 0.5 * xp.concatenate([obstacle[:, 2], xp.asarray(bearing)])
+    rectangle = fixture_rectangles(side, obstacle, xp)
+    half_yaw = 0.5 * rectangle[:, 2]
     zero = xp.zeros_like(half_yaw)
-    place = xp.concatenate([flat, zero[:, None]], axis=-1)
+    place = xp.concatenate([rectangle[:, :2], zero[:, None]], axis=-1)
     return place, xp.stack([xp.cos(half_yaw), zero, zero, xp.sin(half_yaw)], axis=-1)
 
 

@@ -120,7 +120,8 @@ def step(discs: Discs, model: mjx.Model, data: mjx.Data, side: Array, obstacle: 
     free = Motion(force[:, 0] / mass, force[:, 1] / mass, 1.0 / mass)
     place, rate = data.qpos.reshape(-1, 3), data.qvel.reshape(-1, 3)
     weight = model.body_invweight0[discs.body, 0]
-    contacts = _contacts(discs, place, rate, _fixtures(side, obstacle), weight, free.mobility)
+    fixture = sim_model.fixture_rectangles(side, obstacle, jnp)
+    contacts = _contacts(discs, place, rate, fixture, weight, free.mobility)
     before = data.qacc_warmstart.reshape(-1, 3)
     moved = _push_apart(discs, contacts, free, free._replace(x=before[:, 0], y=before[:, 1]))
     acceleration = jnp.stack([moved.x, moved.y, force[:, 2] / turn], axis=-1).reshape(-1)
@@ -148,17 +149,6 @@ def _rounds(robots: int) -> np.ndarray:
     left = player * (rounds + 1) // 2 % rounds
     opponent[player, left] = rounds
     return np.concatenate([opponent, left[:, None]], axis=1)
-
-
-def _fixtures(side: Array, obstacle: Array) -> Array:
-    """Rectangles [M + 4, 5], as obstacles: these, then the walls, whose insides face the arena."""
-    bearing = np.arange(sim_model.WALLS, dtype=np.float32) * np.float32(np.pi / 2)
-    away = 0.5 * side + sim_model.WALL_HALF_THICKNESS
-    halves = np.array([sim_model.WALL_HALF_THICKNESS, sim_model.WALL_HALF_LENGTH], np.float32)
-    ends = np.tile(np.append(0.0, halves).astype(np.float32), (sim_model.WALLS, 1))
-    ends[:, 0] = bearing
-    middle = away * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
-    return jnp.concatenate([obstacle, jnp.concatenate([middle, ends], axis=-1)])
 
 
 def _contacts(
@@ -195,7 +185,9 @@ def _from_fixtures(place: Array, fixture: Array, radius: float) -> tuple[Array, 
     along_x = jnp.where(within, over_x > over_y, jnp.maximum(over_x, 0.0))
     along_y = jnp.where(within, over_x <= over_y, jnp.maximum(over_y, 0.0))
     length = jnp.sqrt(along_x * along_x + along_y * along_y)
-    along_x, along_y = jnp.sign(x) * along_x / length, jnp.sign(y) * along_y / length
+    # In the middle between two faces a centre is pushed out of the one at the negative end.
+    along_x = jnp.where(x > 0.0, along_x, -along_x) / length
+    along_y = jnp.where(y > 0.0, along_y, -along_y) / length
     depth = -jnp.maximum(over_x, over_y)
     away = jnp.where(within, jnp.where(depth > _DEEPEST, jnp.inf, -depth), length)
     world_x = box.cos * along_x - box.sin * along_y

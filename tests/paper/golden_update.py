@@ -117,7 +117,7 @@ def _learn(
 def _loss(metrics: dict[str, jax.Array], config: AlgoConfig) -> float:
     """The loss of the metrics, a mean over the epochs."""
     parts = metrics["policy_loss"] + config.value_cost * metrics["value_loss"]
-    assert config.bound_cost == 0.0
+    parts += config.bound_cost * metrics["bound_loss"]  # 0: a tanh stays within
     return float((parts - config.entropy_cost * metrics["entropy"])[0])
 
 

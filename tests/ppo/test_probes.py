@@ -174,8 +174,9 @@ def test_an_actor_beyond_the_range_of_commands_comes_back() -> None:
     def reward(draw: jax.Array, action: jax.Array, clock: jax.Array) -> jax.Array:
         return -((jnp.clip(action, -1.0, 1.0) - 0.5) ** 2)
 
-    state = _solve(Probe(1, lambda draw, clock: 0.0 * draw, reward), first=-4.0)
-    # Five deviations beyond, one draw of three million is within: rewards alone say nothing there.
+    state = _solve(Probe(1, lambda draw, clock: 0.0 * draw, reward), first=-6.0)
+    # Eight deviations beyond, no draw is within: rewards say nothing there. (From -4 the noise of
+    # advantages that are all alike, normalised, leads some seeds back.)
     # 0.5 is not quite the best mean, since what is drawn above 1 does as 1 does.
     np.testing.assert_allclose(_modes(state, 0.0), [0.5], atol=0.05)
 

@@ -45,11 +45,14 @@ SIDE = 0.6  # m
 GRIP = 9.81  # m/s^2; friction 1
 
 
-# What compiles a program of its own, by `jax` half a minute each, is done by `warp` alone unless
-# slow proofs are asked for.
+# What compiles a program of its own, on wheels by `jax` half a minute each, is done by the others
+# alone unless slow proofs are asked for.
 ONCE_MORE = pytest.mark.parametrize(
     "engine",
-    [pytest.param(each, marks=[pytest.mark.slow] * (each[0] == "jax")) for each in ENGINES],
+    [
+        pytest.param(each, marks=[pytest.mark.slow] * (each == ("jax", "wheeled")))
+        for each in ENGINES
+    ],
     indirect=True,
     ids="-".join,
 )

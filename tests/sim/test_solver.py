@@ -1,5 +1,6 @@
 """The solvers made for swarms, on arenas so crowded that all robots push each other, against C."""
 
+import itertools
 from typing import Any, Literal
 
 import jax
@@ -10,7 +11,7 @@ import pytest
 from engines import BodyName
 
 from swarmjax.config import ConfigError, RobotConfig, SimConfig, StageConfig, TrainConfig, substeps
-from swarmjax.sim import drive, model, physics
+from swarmjax.sim import drive, model, physics, solver_planar_jax
 from swarmjax.sim.body import AS_BUILT
 from swarmjax.task import env
 
@@ -109,6 +110,34 @@ def test_crowds_push_each_other_apart_as_in_c(
     assert np.abs(expected).max(axis=1).min() > 1.0  # they do fly apart
     assert _off(found, expected) <= 2.0 * seen[0]
     assert _off(_places(found), _places(expected)) <= 2.0 * seen[1]
+
+
+def test_what_lies_in_one_place_is_pushed_apart_as_in_c() -> None:
+    # Two hulls in one place; one in the middle of the box (half edges 0.05), where its bottom is
+    # nearest; one just within one of its faces; one in a corner of the arena.
+    box = BOX[0]
+    turn = np.array([[np.cos(box[2]), -np.sin(box[2])], [np.sin(box[2]), np.cos(box[2])]])
+    within = box[:2] + turn @ [0.04, 0.0]
+    places = [(-0.4, 0.3), (-0.4, 0.3), box[:2], within, (0.63, 0.63)]
+    pose = np.zeros((1, ROBOTS, 3), np.float32)
+    pose[0, :, :2] = places
+    wheels = np.zeros((1, ROBOTS, 2), np.float32)
+    found = _by_mjx(_load("jax", "planar", "swarm"), 1.3, pose, wheels)[0].reshape(ROBOTS, 3)
+    expected = _in_c(RobotConfig(), 1.3, pose[0], wheels[0])[0].reshape(ROBOTS, 3)
+    assert np.abs(expected[[0, 1, 3, 4], :2]).max(axis=1).min() > 0.1
+    # Float32: 1e-7 of numbers about 1, times a contact's stiffness of 10 or so.
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("robots", [1, 2, 3, 4, 5, 6, 9, 10])
+def test_every_pair_of_robots_meets_once(robots: int) -> None:
+    size = model.ArenaSize(robots, 1, 0.05)
+    built = model.build(RobotConfig(), size, STEP).compile()
+    rounds = solver_planar_jax.load(built, model.ids(built, size), 0.037).opponent
+    met = [(a, b) for row in rounds for a, b in enumerate(row) if a < b]
+    assert sorted(met) == list(itertools.combinations(range(robots), 2))
+    for row in rounds:
+        np.testing.assert_array_equal(row[row], range(robots))  # whoever I meet meets me
 
 
 def _places(rate: np.ndarray) -> np.ndarray:

@@ -59,8 +59,8 @@ def test_without_its_prices_the_default_is_equation_3(step: reward.Step) -> None
 
 
 def test_default_adds_prices_of_contacts_and_time(step: reward.Step) -> None:
-    # 0.02 m a contact that begins, 0.002 m a control step; nothing for a short ray.
-    expected = np.float32([0.123, -0.022, 0.03125 - 0.042, -0.252])
+    # 0.2 m a contact that begins, 0.002 m a control step; nothing for a short ray.
+    expected = np.float32([0.123, -0.202, 0.03125 - 0.402, -0.252])
     # 1e-8: float32, a few roundings of numbers below 0.3.
     np.testing.assert_allclose(reward.total(step, RewardConfig()), expected, atol=2e-8)
 
