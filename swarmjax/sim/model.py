@@ -129,7 +129,7 @@ def fixture_rectangles(side: Any, obstacle: Any, xp: Any) -> Any:
     bearing = np.arange(WALLS, dtype=np.float32) * np.float32(np.pi / 2)
     away = 0.5 * side + WALL_HALF_THICKNESS
     middle = xp.stack([away * np.cos(bearing), away * np.sin(bearing)], axis=-1)
-    halves = np.tile(np.float32([WALL_HALF_THICKNESS, WALL_HALF_LENGTH]), (WALLS, 1))
+    halves = np.full((WALLS, 2), [WALL_HALF_THICKNESS, WALL_HALF_LENGTH], np.float32)
     wall = xp.concatenate([middle, bearing[:, None], halves], axis=-1)
     return xp.concatenate([obstacle, wall])
 
