@@ -44,11 +44,11 @@ def ppo_loss(
     Algorithms", equation 7, negated. Value: half the squared error against the return, not
     clipped (Andrychowicz et al. 2021, "What Matters in On-Policy Reinforcement Learning?", section
     3.4: clipping it hurts). Bound: the squared distance of the mean action from -1..1, summed over
-    the action, after `bounds_loss` of rl_games, which begins at 1.1: from a mean that lies deviations beyond, all that is
-    drawn does the same, so that nothing is learned there. Each term is a sum over the valid samples
-    divided by `expected_valid`, so that every valid sample of a batch weighs the same however
-    unevenly its minibatches are filled, and the mean over the minibatches is exactly the mean over
-    the batch.
+    the action, after `bounds_loss` of rl_games, which begins at 1.1: from a mean that lies
+    deviations beyond, all that is drawn does the same, so that nothing is learned there. Each term
+    is a sum over the valid samples divided by `expected_valid`, so that every valid sample of a
+    batch weighs the same however unevenly its minibatches are filled, and the mean over the
+    minibatches is exactly the mean over the batch.
 
     Args:
         params: Of actor and critic.
