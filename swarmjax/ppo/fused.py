@@ -231,7 +231,7 @@ def _surrogate(
     gain = ratio * advantage
     clipped = jnp.minimum(jnp.maximum(ratio, 1.0 - config.clip), 1.0 + config.clip) * advantage
     by_density = jnp.where(valid & (gain <= clipped), -gain, 0.0)[:, None]
-    beyond = jnp.where(valid[:, None], mean - jnp.minimum(jnp.maximum(mean, -1.0), 1.0), 0.0)
+    beyond = jnp.where(valid[:, None], networks.beyond_range(mean), 0.0)
     slope = by_density * standardised * jnp.exp(-log_std) + 2.0 * config.bound_cost * beyond
     if config.output == "tanh":
         slope *= 1.0 - mean * mean

@@ -28,8 +28,8 @@ from swarmjax.sim.body import AS_BUILT, Body, Chassis
 with contextlib.redirect_stdout(io.StringIO()):  # it prints twice where Warp is not installed
     from mujoco import mjx
 
-# Iterations and line-search steps; see docs/design.md for what was measured. MJX's Newton method by
-# `jax` takes as many whether it needs them or not; all else stops by itself.
+# Iterations and line-search steps at most; see docs/design.md for what was measured. MJX's Newton
+# method by `jax` is cut off where it is near enough; all else has room to converge.
 _NEWTON_STEPS = {"planar": (3, 5), "wheeled": (30, 20)}
 _MOST_STEPS = (100, 50)  # MuJoCo's own
 # Contacts between hulls and what they touch are stored for all arenas together by Warp: an average
@@ -320,6 +320,7 @@ def _fixtures(physics: Physics, side: Array, obstacle: Array) -> tuple[Fields, F
 
     `jax` works the poses of all geoms out from the model. `warp` passes over those of the world,
     which stay in the data as they were made, or set here; it overwrites the poses of all others.
+    `discs` are told side and obstacles themselves.
 
     Args:
       physics: the compiled side.
@@ -329,6 +330,8 @@ def _fixtures(physics: Physics, side: Array, obstacle: Array) -> tuple[Fields, F
     Returns:
       Fields of the model, and of the data.
     """
+    if physics.discs is not None:
+        return {}, {}
     model, made = physics.model, physics.template
     first = int(physics.ids.fixture_geom[0])
     put = functools.partial(_with_rows, first=first)
