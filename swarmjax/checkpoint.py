@@ -7,6 +7,7 @@ arrays, so that it can be read without the program that wrote it. Those of a run
 axis of seeds.
 """
 
+import functools
 import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,17 +37,23 @@ class Checkpoints:
         """Opens `run`/checkpoints, keeping the `keep` newest.
 
         With `update`, where the run goes on, checkpoints after it are removed: they were passed
-        over as damaged, and Orbax would save nothing before them.
+        over as damaged, and Orbax would save nothing before them. Otherwise nothing is done until
+        the first is saved, so that a run need not wait for Orbax before it begins.
         """
+        self._folder, self._keep = (run / "checkpoints").resolve(), keep
+        if update:
+            for step in self._manager.all_steps():
+                if step > update:
+                    self._manager.delete(step)
+
+    @functools.cached_property
+    def _manager(self) -> "ocp.CheckpointManager":
         import orbax.checkpoint as ocp
 
         absl_logging.set_verbosity(absl_logging.ERROR)  # Orbax tells every step of its own
         logging.getLogger("absl").setLevel(logging.ERROR)
-        options = ocp.CheckpointManagerOptions(max_to_keep=keep, create=True)
-        self._manager = ocp.CheckpointManager((run / "checkpoints").resolve(), options=options)
-        for step in self._manager.all_steps():
-            if update is not None and step > update:
-                self._manager.delete(step)
+        options = ocp.CheckpointManagerOptions(max_to_keep=self._keep, create=True)
+        return ocp.CheckpointManager(self._folder, options=options)
 
     def save(self, state: Any, update: int) -> None:
         """Writes a state; an update that is there already is left as it is."""
@@ -69,7 +76,8 @@ class Checkpoints:
 
     def __exit__(self, *_: object) -> None:
         """Waits until everything is written."""
-        self._manager.close()
+        if "_manager" in self.__dict__:
+            self._manager.close()
 
 
 def to_leaves(state: Any) -> Leaves:

@@ -2,7 +2,9 @@
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
 
 METRICS, DECISIONS, EPISODES = "metrics.jsonl", "curriculum.jsonl", "episodes.jsonl"
 BOARDS = 16  # seeds that TensorBoard is written for: a board holds three files open
+MOST_PENDING = 100  # calls whose rows TensorBoard may be behind
 
 Row = dict[str, Any]
 
@@ -109,24 +112,16 @@ class Recorder:
         purge = arena_steps + 1 if update else None  # TensorBoard hides what it has from here on
         folder = run / "tensorboard"
         folders = {k: folder / f"seed{k}" if len(seeds) > 1 else folder for k in seeds[:BOARDS]}
-        self._boards = {seed: _board(path, purge) for seed, path in folders.items() if tensorboard}
+        self._boards = Boards(folders, purge) if tensorboard else None
 
     def write(self, found: Sequence[Row], decisions: Iterable[Row], speeds: Row) -> None:
-        """Writes the rows of a call; the speeds, of all seeds together, to TensorBoard's first.
-
-        Of N boards each is given every N-th update, so that they cost no more time than one:
-        a row takes it a millisecond, as much as an update of a few arenas.
-        """
+        """Writes the rows of a call; the speeds, of all seeds together, to TensorBoard's first."""
         self._metrics.writelines(json.dumps(row) + "\n" for row in found)
         self._decisions.writelines(json.dumps(row) + "\n" for row in decisions)
         self._metrics.flush()
         self._decisions.flush()
-        boards = self._boards
-        if boards:
-            for row in found:
-                if row["seed"] in boards and row["update"] % len(boards) == 0:
-                    _add_scalars(boards[row["seed"]], row, row["arena_steps"])
-            _add_scalars(next(iter(boards.values())), speeds, found[-1]["arena_steps"])
+        if self._boards is not None:
+            self._boards.write(found, speeds)
 
     def write_episodes(self, found: Iterable[Row]) -> None:
         """Writes the episodes of a call, where there is a file for them."""
@@ -144,15 +139,54 @@ class Recorder:
         self._decisions.close()
         if self._episodes is not None:
             self._episodes.close()
-        for board in self._boards.values():
+        if self._boards is not None:
+            self._boards.close()
+
+
+class Boards:
+    """Folders of TensorBoard, by seed, which a thread opens and writes.
+
+    TensorBoardX takes seconds to import where there is PyTorch, which it brings along; a run that
+    waits for a GPU meanwhile has them to spare.
+    """
+
+    def __init__(self, folders: Mapping[int, Path], purge: int | None) -> None:
+        """Opens nothing yet; what lies at arena step `purge` and after is to be hidden."""
+        self._folders, self._purge = folders, purge
+        self._open: dict[int, SummaryWriter] = {}
+        self._thread = ThreadPoolExecutor(1)
+        self._pending: deque[Future] = deque()
+
+    def write(self, found: Sequence[Row], speeds: Row) -> None:
+        """Writes rows, and the speeds to the first board.
+
+        Of N boards each is given every N-th update, so that they cost no more time than one:
+        a row takes it a millisecond, as much as an update of a few arenas.
+        """
+        while self._pending and (self._pending[0].done() or len(self._pending) > MOST_PENDING):
+            self._pending.popleft().result()
+        self._pending.append(self._thread.submit(self._write, found, speeds))
+
+    def close(self) -> None:
+        """Waits until everything is written."""
+        self._thread.shutdown()
+        for board in self._open.values():
             board.close()
+        for write in self._pending:
+            write.result()
 
+    def _write(self, found: Sequence[Row], speeds: Row) -> None:
+        from tensorboardX import SummaryWriter
 
-def _board(folder: Path, purge: int | None) -> "SummaryWriter":
-    """Opens a folder of TensorBoard."""
-    from tensorboardX import SummaryWriter  # brings PyTorch along, where there is any
-
-    return SummaryWriter(str(folder), purge_step=purge)
+        if not self._open:
+            self._open = {
+                seed: SummaryWriter(str(folder), purge_step=self._purge)
+                for seed, folder in self._folders.items()
+            }
+        for row in found:
+            if row["seed"] in self._open and row["update"] % len(self._open) == 0:
+                _add_scalars(self._open[row["seed"]], row, row["arena_steps"])
+        _add_scalars(next(iter(self._open.values())), speeds, found[-1]["arena_steps"])
 
 
 def _add_scalars(board: "SummaryWriter", row: Row, arena_steps: int) -> None:

@@ -374,12 +374,12 @@ def restart(arenas: EnvState, starts: EnvState, done: Array) -> EnvState:
     """Puts the waiting episode in the place of one that is over.
 
     Args:
-      arenas: [A], `sim` an `mjx.Data`.
+      arenas: [A], `sim` the physics' data.
       starts: [A], packed.
       done: [A].
 
     Returns:
-      The arenas, `sim` an `mjx.Data`: of that only what is physically the state is replaced.
+      The arenas, `sim` the physics' data: of that only what is physically the state is replaced.
     """
     packed = physics.PhysicsState(arenas.sim.qpos, arenas.sim.qvel, arenas.sim.qacc_warmstart)
     chosen = _pick(done, starts, replace(arenas, sim=packed))

@@ -148,12 +148,10 @@ def compile_chunk(
     return Compiled(call, seconds, groups * found.argument_size_in_bytes, work)
 
 
-def _import_ahead(settings: TrainConfig) -> None:
-    """Imports what a run needs when it has compiled, which leaves Python idle: a second or two."""
+def _import_ahead() -> None:
+    """Imports what a run needs when it saves, while XLA leaves Python idle: half a second."""
     with contextlib.suppress(ImportError):  # whoever needs it says so
         importlib.import_module("orbax.checkpoint")
-        if settings.run.tensorboard:
-            importlib.import_module("tensorboardX")
 
 
 def _call_at_once(
@@ -186,7 +184,7 @@ def prepare(
     Raises:
       ConfigError: if it needs more than there is.
     """
-    compiled = compile_chunk(program, schedule, state, partial(_import_ahead, program.config))
+    compiled = compile_chunk(program, schedule, state, _import_ahead)
     memory.check(program.config, compiled.total_bytes, available)
     seconds = compiled.seconds + _build_kernels(program, state)
     # A call of no updates changes nothing, but takes what the program works with.

@@ -1,7 +1,7 @@
-"""MJX: many arenas' rigid bodies on one device, by `impl=jax` or `impl=warp`.
+"""Many arenas' rigid bodies on one device, by `impl=jax` or `impl=warp`: MJX, or `discs`.
 
 The state of an arena is `PhysicsState`: positions, velocities and the solver's warm start, the
-same for both implementations and all that a step reads. Inside a rollout the whole `mjx.Data` is
+same for all and all that a step reads. Inside a rollout the whole `mjx.Data` (or `discs.Data`) is
 carried instead, because rebuilding it at every control step costs a quarter of the speed.
 """
 
@@ -21,12 +21,9 @@ import numpy as np
 from jax import Array
 
 from swarmjax.config import ConfigError, RobotConfig
+from swarmjax.sim import discs as sim_discs
 from swarmjax.sim import model as sim_model
-from swarmjax.sim import solver_planar_jax
 from swarmjax.sim.body import AS_BUILT, Body, Chassis
-
-with contextlib.redirect_stdout(io.StringIO()):  # it prints twice where Warp is not installed
-    from mujoco import mjx
 
 # Iterations and line-search steps at most; see docs/design.md for what was measured. MJX's Newton
 # method by `jax` is cut off where it is near enough; all else has room to converge.
@@ -46,6 +43,9 @@ _SINES = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], np.float
 _ONES = np.diag([0.0, 0.0, 1.0]).astype(np.float32)
 
 Fields = dict[str, Array]
+# Of MJX, by either implementation, or of discs.
+Model = Any
+Data = Any
 
 
 class PhysicsState(NamedTuple):
@@ -67,22 +67,22 @@ class Physics:
     """The compiled side of the physics: fixed for a program.
 
     Attributes:
-      model: the MJX model.
-      host: the same, compiled by MuJoCo.
-      template: an `mjx.Data` to fill in.
+      model: MJX's, or the discs'.
+      template: an `mjx.Data`, or the discs', to fill in.
+      host: the model as MuJoCo compiled it.
       ids: rows of the moving bodies.
       robot: the robot's numbers.
       substeps: physics steps per control step.
       discs: what takes the physics steps in MJX's place; None: MJX does.
     """
 
-    model: mjx.Model
+    model: Model
+    template: Data
     host: mujoco.MjModel
-    template: mjx.Data
     ids: sim_model.Ids
     robot: RobotConfig
     substeps: int
-    discs: solver_planar_jax.Discs | None = None
+    discs: sim_discs.Discs | None = None
 
     @property
     def body(self) -> Body:
@@ -172,24 +172,42 @@ def load(
     Returns:
       The physics of a program.
     """
-    limits = {}
     if impl == "warp":
         _quiet_warp()
-        limits = _limits(model, len(ids.hull_body), arenas)
-    discs = None
-    if solver == "swarm" and impl == "jax":
-        discs = solver_planar_jax.load(model, ids, robot.hull_radius)
-    elif solver == "swarm":
+    if solver == "swarm" and robot.body == "planar":
+        discs = sim_discs.load(model, ids, robot.hull_radius, _push_apart(impl))
+        return Physics(*sim_discs.put(model), model, ids, robot, substeps, discs)
+    limits = _limits(model, len(ids.hull_body), arenas) if impl == "warp" else {}
+    if solver == "swarm":
         model = copy.copy(model)
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE  # as solver_wheeled reads it
+    mjx = _mjx()
     template = mjx.make_data(model, impl=impl, **limits)
     device_model = mjx.put_model(model, impl=impl)
-    if solver == "swarm" and impl == "warp":
+    if solver == "swarm":
         device_model = _with_swarm_solver(device_model, robot.body)
-    return Physics(device_model, model, template, ids, robot, substeps, discs)
+    return Physics(device_model, template, model, ids, robot, substeps)
 
 
-def _with_swarm_solver(model: mjx.Model, body: str) -> mjx.Model:
+def _mjx() -> Any:
+    """MJX, which takes two to four seconds to import, and is not needed where all are discs."""
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints twice where Warp is not installed
+        from mujoco import mjx
+    return mjx
+
+
+def _push_apart(impl: str) -> sim_discs.Solve:
+    """What solves for the contacts of discs."""
+    if impl == "jax":
+        from swarmjax.sim import solver_planar_jax
+
+        return solver_planar_jax.push_apart
+    from swarmjax.sim import solver_planar  # needs Warp
+
+    return solver_planar.push_apart
+
+
+def _with_swarm_solver(model: Model, body: str) -> Model:
     """Lets a model be stepped by the solver that is made for its robots."""
     from swarmjax.sim import solver  # needs Warp
 
@@ -217,15 +235,19 @@ def _quiet_warp() -> None:
 
 
 def build_kernels(physics: Physics, states: PhysicsState) -> None:
-    """Makes Warp build its kernels, which it does at its first step: half a minute on a new card.
+    """Makes Warp build MJX's kernels, which it does at their first step: half a minute, once.
+
+    Those of discs are one, which was built when the program was traced.
 
     Args:
       physics: the compiled side, `impl` warp.
       states: [A] arenas; as many as the program will step, since contacts are sized for them.
     """
+    if physics.discs is not None:
+        return
 
     def step_once(state: PhysicsState) -> Array:
-        return mjx.step(physics.model, unpack(physics, state)).qpos
+        return _mjx().step(physics.model, unpack(physics, state)).qpos
 
     jax.block_until_ready(jax.jit(jax.vmap(step_once))(states))
 
@@ -236,34 +258,34 @@ def rest(physics: Physics, pose: Array) -> PhysicsState:
     return PhysicsState(physics.body.qpos(pose, jnp), still, still)
 
 
-def unpack(physics: Physics, state: PhysicsState) -> mjx.Data:
-    """Fills an `mjx.Data` of one arena in, to carry through a rollout."""
+def unpack(physics: Physics, state: PhysicsState) -> Data:
+    """Fills the data of one arena in, to carry through a rollout."""
     return physics.template.replace(**state._asdict())
 
 
-def pack(data: mjx.Data) -> PhysicsState:
-    """Keeps of an `mjx.Data` what is physically the state."""
+def pack(data: Data) -> PhysicsState:
+    """Keeps of the data what is physically the state."""
     return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
 
 
-def poses(physics: Physics, data: mjx.Data | PhysicsState) -> Array:
+def poses(physics: Physics, data: Data | PhysicsState) -> Array:
     """Returns [R, 3] x (m), y (m), yaw (rad) of the robots."""
     return physics.body.pose(data.qpos, jnp)
 
 
-def is_finite(data: mjx.Data) -> Array:
+def is_finite(data: Data) -> Array:
     """Returns [] whether the arena's physics is still sound."""
     return jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all()
 
 
 def step(
     physics: Physics,
-    data: mjx.Data,
+    data: Data,
     side: Array,
     obstacle: Array,
     wheels: Array,
     chassis: Chassis = AS_BUILT,
-) -> mjx.Data:
+) -> Data:
     """Moves one arena on by one control step.
 
     Args:
@@ -285,18 +307,18 @@ def step(
     ctrl = physics.body.ctrl(wheels, chassis, physics.robot, jnp)
     data = data.replace(**of_data)
 
-    def once(_: int, data: mjx.Data) -> mjx.Data:
+    def once(_: int, data: Data) -> Data:
         driven = _drive(physics, data, ctrl, chassis)
         if physics.discs is not None:
-            return solver_planar_jax.step(physics.discs, model, driven, side, obstacle)
-        return mjx.step(model, driven)
+            return sim_discs.step(physics.discs, model, driven, side, obstacle)
+        return _mjx().step(model, driven)
 
     if physics.substeps == 1:
         return once(0, data)
     return jax.lax.fori_loop(0, physics.substeps, once, data)
 
 
-def _drive(physics: Physics, data: mjx.Data, ctrl: Array, chassis: Chassis) -> mjx.Data:
+def _drive(physics: Physics, data: Data, ctrl: Array, chassis: Chassis) -> Data:
     """Lets the servos act in the next physics step: as actuators, or as the forces that they are.
 
     Args:
@@ -371,11 +393,12 @@ def _matrices(yaw: Any, xp: Any) -> Any:
     return cos * _COSINES + sin * _SINES + _ONES
 
 
-def _change(physics: Physics, fields: Fields, chassis: Chassis) -> mjx.Model:
+def _change(physics: Physics, fields: Fields, chassis: Chassis) -> Model:
     """Sets what this arena's model has of its own: these fields, and the chassis."""
     model, rows_of = physics.model, physics.ids.robots
     changes = physics.body.changes(chassis, rows_of, physics.robot, physics.host)
-    for name, (rows, values) in changes.items():
+    read = {name: change for name, change in changes.items() if hasattr(model, name)}
+    for name, (rows, values) in read.items():
         now = jnp.asarray(fields.get(name, getattr(model, name)))
         fields = fields | {name: now.at[rows].set(values)}
     return model.replace(**fields)

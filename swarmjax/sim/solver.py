@@ -9,13 +9,10 @@ from typing import Any
 import mujoco.mjx.third_party.mujoco_warp as mjw
 from mujoco.mjx.warp import forward
 
-from swarmjax.sim import solver_planar, solver_wheeled
+from swarmjax.sim import solver_wheeled
 
-NUMBERS = {"planar": solver_planar.NUMBER, "wheeled": solver_wheeled.NUMBER}  # by body
-_STEPS = {
-    solver_planar.NUMBER: solver_planar.step,
-    solver_wheeled.NUMBER: solver_wheeled.step,
-}
+NUMBERS = {"wheeled": solver_wheeled.NUMBER}  # by body
+_STEPS = {solver_wheeled.NUMBER: solver_wheeled.step}
 _newton = mjw.step
 
 

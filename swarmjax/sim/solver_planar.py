@@ -1,291 +1,350 @@
-"""Contacts of the planar body on the GPU: projected Gauss-Seidel, one thread an arena.
+"""Contacts of planar robots by Warp: one kernel, one thread an arena.
 
-A contact of two hulls, or of a hull and a box, only pushes, along one direction (condim 1), and the
-planar body's inertia is diagonal: its centre of mass lies on its yaw axis. MuJoCo's convex problem
-for the forces of contacts in its dual form (MuJoCo's documentation, Computation, "Dual problem"),
+What is solved, says `discs`. A thread looks for the contacts of its arena, writes down those that
+there are, and sweeps through these until no force changes any more. In one kernel that XLA unrolls
+for all contacts that there might be, most of a sweep is for those that there are not.
 
-    minimise over f >= 0:  1/2 f' (J M^-1 J' + R) f + f' (J a0 - aref),
-
-has as many unknowns as there are contacts, mostly none, and MuJoCo's own second solver, PGS, goes
-through them one by one. MJX-Warp has Newton's method alone, which factorises a matrix of 3 R rows
-for every arena at every iteration. Both end at the same forces: there is one minimum.
-
-Nothing else acts on this body but what is applied to it (`qfrc_applied`): no gravity along its
-joints, no spring, damper or actuator, and no Coriolis force, with the centre of mass on the axis.
-So `step` leaves out what MJX-Warp works out for those, and the inertia matrix with it.
+JAX calls the kernel by `warp.jax_kernel`, of which XLA may make part of a CUDA graph.
 """
 
+import functools
 from typing import Any
 
-import mujoco.mjx.third_party.mujoco_warp as mjw
+import jax
+import numpy as np
 import warp as wp
+from jax import Array
+from jax.custom_batching import custom_vmap
 
-NUMBER = 0  # what `opt.solver` says: MuJoCo's own of PGS, which MJX-Warp does not know
-# Share of the largest force by which any may still change; float32 rounds at 1e-7.
-TOLERANCE = wp.constant(1e-6)
+from swarmjax.sim import discs as sim_discs
+from swarmjax.sim import model as sim_model
+from swarmjax.sim.discs import Discs, Robots
+
+BLOCK = 64  # threads of a block: with few arenas, the blocks of 256 would leave most of a card idle
+ROWS_PER_ROBOT = 6  # neighbours that a disc can touch at once
+_TOLERANCE = wp.constant(sim_discs.TOLERANCE)
+_DEEPEST = wp.constant(sim_discs.DEEPEST)
+_WALLS = wp.constant(sim_model.WALLS)
+_THICKNESS = wp.constant(sim_model.WALL_HALF_THICKNESS)
+_LENGTH = wp.constant(sim_model.WALL_HALF_LENGTH)
 
 
-def step(m: Any, d: Any) -> None:
-    """Moves all arenas of planar robots on by one physics step (MuJoCo's semi-implicit Euler).
+def push_apart(discs: Discs, robots: Robots, side: Array, obstacle: Array) -> Array:
+    """Finds how the robots of one arena accelerate with their contacts.
+
+    Axes that `vmap` adds are arenas of one kernel, whichever they are.
 
     Args:
-      m: Warp's model: bodies that slide along x and y and turn about their centre of mass, or
-        stand; contacts of condim 1.
-      d: Warp's data of all arenas, written to.
+      discs: what is fixed.
+      robots: as they are and would move.
+      side: [] of the arena, m.
+      obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
+
+    Returns:
+      [R, 3] of x and y, m/s^2, and of yaw, rad/s^2, which is `robots.free`'s.
     """
-    mjw.fwd_kinematics(m, d)
-    mjw.collision(m, d)
-    mjw.make_constraint(m, d)
-    motion = Motion()
-    motion.mobility = wp.empty((d.nworld, m.nv), dtype=float)
-    motion.smooth, motion.qacc, motion.warmstart = d.qacc_smooth, d.qacc, d.qacc_warmstart
-    motion.qfrc = d.qfrc_constraint
-    wp.launch(
-        _accelerate,
-        dim=(d.nworld, m.nv),
-        inputs=[m.dof_bodyid, m.body_dofadr, m.body_mass, m.body_inertia, d.qfrc_applied, motion],
-    )
-    wp.launch(
-        _push_apart,
-        dim=d.nworld,
-        inputs=[_sides(m, d), _contacts(m, d), motion, m.opt.iterations, d.solver_niter],
-    )
-    mjw.euler(m, d)
+    many = _of_arenas(functools.partial(_solve, discs))
+    return many(*jax.tree.map(lambda x: x[None], (robots, side, obstacle)))[0]
+
+
+def _of_arenas(solve: Any) -> Any:
+    """Lets a function of arrays with a leading axis of arenas take further ones as more arenas."""
+    many = custom_vmap(solve)
+
+    @many.def_vmap
+    def _(size: int, batched: Any, *given: Any) -> tuple[Array, bool]:
+        def widen(x: Array, has: bool) -> Array:
+            return x if has else jax.numpy.broadcast_to(x, (size, *x.shape))
+
+        whole = jax.tree.map(widen, given, tuple(batched))
+        shape = whole[1].shape  # of the sides: [size, arenas]
+        found = many(*jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), whole))
+        return found.reshape(*shape, *found.shape[1:]), True
+
+    return many
+
+
+def _solve(discs: Discs, robots: Robots, side: Array, obstacle: Array) -> Array:
+    """The accelerations [A, R, 3] of arenas."""
+    arenas, count = robots.mobility.shape
+    pairs = count * (obstacle.shape[1] + sim_model.WALLS) + count * (count - 1) // 2
+    rows = min(pairs, ROWS_PER_ROBOT * count), arenas
+    numbers = np.array([discs.radius, *sim_discs.spring(discs), *discs.solimp], np.float32)
+    call = wp.jax_kernel(_push_apart, num_outputs=4, block_dim=BLOCK)
+    shapes = {"row": rows, "soft": rows, "between": rows, "found": (arenas, count)}
+    given = *robots, side, obstacle, jax.numpy.asarray(numbers), discs.sweeps
+    return call(*given, launch_dims=arenas, output_dims=shapes)[-1]
 
 
 @wp.struct
-class Motion:
-    """How the joints of all arenas move, [A, V].
+class Arena:
+    """What a thread reads and writes.
 
     Attributes:
-      mobility: diagonal of M^-1.
-      smooth: acceleration without contacts.
-      warmstart: acceleration of the step before.
-      qacc: acceleration with contacts.
-      qfrc: forces of contacts.
+      place: [A, R] x, y (m), yaw (rad).
+      rate: [A, R] of it, 1/s.
+      before: [A, R] of the rate, 1/s^2, in the step before.
+      mobility: [A, R] 1 / mass.
+      weight: [A, R] inverse weight.
+      numbers: radius (m), stiffness (1/s^2), damping (1/s), and `solimp`.
+      row: [K, A] of each contact x and y of the unit vector along which it pushes, aref, and
+        J M^-1 J' + R.
+      soft: [K, A] R, and the force, N.
+      between: [K, A] the robot that is pushed along, and the one that is pushed back; -1: none.
+      found: [A, R] acceleration of x, y and yaw.
+      index: of the thread, [A].
     """
 
+    place: wp.array2d[wp.vec3]
+    rate: wp.array2d[wp.vec3]
+    before: wp.array2d[wp.vec3]
     mobility: wp.array2d[float]
-    smooth: wp.array2d[float]
-    warmstart: wp.array2d[float]
-    qacc: wp.array2d[float]
-    qfrc: wp.array2d[float]
-
-
-@wp.struct
-class Sides:
-    """What contacts are between.
-
-    Attributes:
-      geom: [C] the two geoms of each contact of all arenas.
-      frame: [C] its axes in rows, the first from one geom to the other.
-      pos: [C] where it is, m.
-      body: [G] of a geom.
-      joint: [B] the first joint of a body; -1 of what stands.
-      xpos: [A, B] of a body, m.
-    """
-
-    geom: wp.array[wp.vec2i]
-    frame: wp.array[wp.mat33]
-    pos: wp.array[wp.vec3]
-    body: wp.array[int]
-    joint: wp.array[int]
-    xpos: wp.array2d[wp.vec3]
-
-
-@wp.struct
-class Row:
-    """A row of the Jacobian J, and what else does not change from sweep to sweep.
-
-    Attributes:
-      first: joint x of the robot that is pushed back; -1: none.
-      second: joint x of the one that is pushed ahead; -1: none.
-      first_slope: entries of J at x, y and yaw of the first.
-      second_slope: likewise.
-      give: entry of R.
-      stiffness: what a unit of force brings about, J M^-1 J' + R.
-    """
-
-    first: int
-    second: int
-    first_slope: wp.vec3
-    second_slope: wp.vec3
-    give: float
-    stiffness: float
-
-
-@wp.struct
-class Contacts:
-    """The contacts of all arenas.
-
-    Attributes:
-      count: [A] how many.
-      id: [A, N] which of all contacts each is.
-      D: [A, N] 1 / R.
-      aref: [A, N] acceleration along the normal that is asked for.
-      row: [A, N] of the Jacobian.
-      force: [A, N] f.
-    """
-
-    count: wp.array[int]
-    id: wp.array2d[int]
-    D: wp.array2d[float]
-    aref: wp.array2d[float]
-    row: wp.array2d[Row]
-    force: wp.array2d[float]
-
-
-def _sides(m: Any, d: Any) -> Any:
-    """Gathers what contacts are between."""
-    sides = Sides()
-    sides.geom, sides.frame, sides.pos = d.contact.geom, d.contact.frame, d.contact.pos
-    sides.body, sides.joint, sides.xpos = m.geom_bodyid, m.body_dofadr, d.xpos
-    return sides
-
-
-def _contacts(m: Any, d: Any) -> Any:
-    """Gathers the contacts."""
-    contacts = Contacts()
-    contacts.count, contacts.id, contacts.force = d.nefc, d.efc.id, d.efc.force
-    contacts.D, contacts.aref = d.efc.D, d.efc.aref
-    contacts.row = wp.empty((d.nworld, d.njmax), dtype=Row)
-    return contacts
+    weight: wp.array2d[float]
+    numbers: wp.array[float]
+    row: wp.array2d[wp.vec4]
+    soft: wp.array2d[wp.vec2]
+    between: wp.array2d[wp.vec2i]
+    found: wp.array2d[wp.vec3]
+    index: int
 
 
 @wp.kernel(enable_backward=False)
-def _accelerate(
-    dof_body: wp.array[int],
-    joint: wp.array[int],
-    mass: wp.array2d[float],
-    inertia: wp.array2d[wp.vec3],
-    applied: wp.array2d[float],
-    motion: Motion,
-) -> None:
-    """Acceleration of a joint by what is applied to it; none of it is by contacts yet."""
-    arena, dof = wp.tid()
-    body = dof_body[dof]
-    mobility = 1.0 / mass[arena % mass.shape[0], body]
-    if dof - joint[body] == 2:  # yaw, after x and y
-        mobility = 1.0 / inertia[arena % inertia.shape[0], body][2]
-    motion.mobility[arena, dof] = mobility
-    motion.smooth[arena, dof] = mobility * applied[arena, dof]
-    motion.qacc[arena, dof] = mobility * applied[arena, dof]
-    motion.qfrc[arena, dof] = 0.0
-
-
-@wp.kernel(enable_backward=False)
-def _push_apart(
-    sides: Sides, contacts: Contacts, motion: Motion, sweeps: int, niter: wp.array[int]
+def _push_apart(  # noqa: PLR0913  # JAX hands arrays over one by one
+    place: wp.array2d[wp.vec3],
+    rate: wp.array2d[wp.vec3],
+    free: wp.array2d[wp.vec3],
+    before: wp.array2d[wp.vec3],
+    mobility: wp.array2d[float],
+    weight: wp.array2d[float],
+    side: wp.array[float],
+    obstacle: wp.array3d[float],
+    numbers: wp.array[float],
+    sweeps: int,
+    row: wp.array2d[wp.vec4],
+    soft: wp.array2d[wp.vec2],
+    between: wp.array2d[wp.vec2i],
+    found: wp.array2d[wp.vec3],
 ) -> None:
     """Finds the forces of an arena's contacts and what comes of them."""
-    arena = wp.tid()
-    count = wp.min(contacts.count[arena], contacts.force.shape[1])
-    for i in range(count):
-        row = _row(sides, motion, arena, contacts.id[arena, i], contacts.D[arena, i])
-        contacts.row[arena, i] = row
-        # The force that the contact would have at the acceleration of the step before.
-        short = contacts.aref[arena, i] - _along(row, motion.warmstart, arena)
-        contacts.force[arena, i] = wp.max(short / row.give, 0.0)
-        _push(row, motion, arena, contacts.force[arena, i])
+    arena = Arena()
+    arena.place = place
+    arena.rate = rate
+    arena.before = before
+    arena.mobility = mobility
+    arena.weight = weight
+    arena.numbers = numbers
+    arena.row = row
+    arena.soft = soft
+    arena.between = between
+    arena.found = found
+    arena.index = wp.tid()
+    _let_go(arena, free)
+    count = wp.int32(0)
+    for m in range(obstacle.shape[1]):
+        count = _touch_box(arena, count, _obstacle(obstacle, arena.index, m))
+    for k in range(_WALLS):
+        count = _touch_box(arena, count, _wall(side[arena.index], k))
+    for i in range(place.shape[1]):
+        count = _touch_robots(arena, count, i)
     done = wp.int32(0)
     moves = count > 0
     while moves and done < sweeps:
-        moves = _sweep(contacts, motion, arena, count)
+        moves = _sweep(arena, count)
         done += 1
-    niter[arena] = done
     if count > 0:
-        _finish(contacts, motion, arena, count)
+        _finish(arena, free, count)
 
 
 @wp.func
-def _row(sides: Sides, motion: Motion, arena: int, contact: int, weight: float) -> Row:
-    """Works out the row of a contact."""
-    row = Row()
-    geoms = sides.geom[contact]
-    first, second = sides.body[geoms[0]], sides.body[geoms[1]]
-    row.first = sides.joint[first]
-    row.second = sides.joint[second]
-    row.first_slope = -_slope(sides, arena, contact, first)
-    row.second_slope = _slope(sides, arena, contact, second)
-    row.give = 1.0 / weight
-    row.stiffness = row.give + _response(motion, arena, row.first, row.first_slope)
-    row.stiffness += _response(motion, arena, row.second, row.second_slope)
-    return row
+def _let_go(arena: Arena, free: wp.array2d[wp.vec3]) -> None:
+    """Sets accelerations to those without contacts."""
+    for i in range(free.shape[1]):
+        arena.found[arena.index, i] = free[arena.index, i]
+
+
+@wp.struct
+class Box:
+    """A rectangle: centre (m), cosine and sine of its yaw, half edges (m)."""
+
+    x: float
+    y: float
+    cos: float
+    sin: float
+    half_x: float
+    half_y: float
 
 
 @wp.func
-def _slope(sides: Sides, arena: int, contact: int, body: int) -> wp.vec3:
-    """Speed of a body along the normal, where it touches, by its speeds along x, y and yaw."""
-    frame = sides.frame[contact]
-    normal = wp.vec3(frame[0, 0], frame[0, 1], frame[0, 2])
-    arm = wp.cross(sides.pos[contact] - sides.xpos[arena, body], normal)
-    return wp.vec3(normal[0], normal[1], arm[2])
+def _obstacle(obstacle: wp.array3d[float], arena: int, m: int) -> Box:
+    """An obstacle of an arena."""
+    box = Box()
+    box.x = obstacle[arena, m, 0]
+    box.y = obstacle[arena, m, 1]
+    box.cos = wp.cos(obstacle[arena, m, 2])
+    box.sin = wp.sin(obstacle[arena, m, 2])
+    box.half_x = obstacle[arena, m, 3]
+    box.half_y = obstacle[arena, m, 4]
+    return box
 
 
 @wp.func
-def _response(motion: Motion, arena: int, joint: int, slope: wp.vec3) -> float:
-    """Acceleration along the normal that a unit of force along it gives a robot."""
-    return wp.dot(slope, wp.cw_mul(_at(motion.mobility, arena, joint), slope))
+def _wall(side: float, k: int) -> Box:
+    """The wall east, north, west or south, as `model.fixture_rectangles` has it."""
+    box = Box()
+    box.cos = wp.where(k % 2 == 1, 0.0, wp.where(k == 0, 1.0, -1.0))
+    box.sin = wp.where(k % 2 == 0, 0.0, wp.where(k == 1, 1.0, -1.0))
+    away = 0.5 * side + _THICKNESS
+    box.x = away * box.cos
+    box.y = away * box.sin
+    box.half_x = _THICKNESS
+    box.half_y = _LENGTH
+    return box
 
 
 @wp.func
-def _at(of_joints: wp.array2d[float], arena: int, joint: int) -> wp.vec3:
-    """What a robot has at its joints x, y and yaw; 0 of what stands."""
-    found = wp.vec3()
-    if joint >= 0:
-        found[0] = of_joints[arena, joint]
-        found[1] = of_joints[arena, joint + 1]
-        found[2] = of_joints[arena, joint + 2]
-    return found
+def _touch_box(arena: Arena, count: int, box: Box) -> int:
+    """Writes the contacts of all robots with a box down; returns how many there are by then."""
+    known = count
+    for i in range(arena.place.shape[1]):
+        gap = _from_box(arena.place[arena.index, i], box, arena.numbers[0])
+        known = _touch(arena, known, gap, i, -1)
+    return known
 
 
 @wp.func
-def _along(row: Row, acceleration: wp.array2d[float], arena: int) -> float:
-    """J a: how fast the two sides accelerate apart."""
-    apart = wp.dot(row.first_slope, _at(acceleration, arena, row.first))
-    return apart + wp.dot(row.second_slope, _at(acceleration, arena, row.second))
+def _touch_robots(arena: Arena, count: int, i: int) -> int:
+    """Writes the contacts of a robot with those after it down; likewise."""
+    known = count
+    for j in range(i + 1, arena.place.shape[1]):
+        apart = arena.place[arena.index, i] - arena.place[arena.index, j]
+        known = _touch(arena, known, _from_disc(apart[0], apart[1], arena.numbers[0]), i, j)
+    return known
 
 
 @wp.func
-def _push(row: Row, motion: Motion, arena: int, force: float) -> None:
+def _from_box(place: wp.vec3, box: Box, radius: float) -> wp.vec3:
+    """The unit vector from a box to a robot, x and y, and the gap between them, m.
+
+    From the nearest point of the box; of a centre within it, from the nearest face, unless that is
+    the top or the bottom (`discs.DEEPEST`).
+    """
+    away_x, away_y = place[0] - box.x, place[1] - box.y
+    x = box.cos * away_x + box.sin * away_y
+    y = box.cos * away_y - box.sin * away_x
+    over_x, over_y = wp.abs(x) - box.half_x, wp.abs(y) - box.half_y
+    along = wp.vec2(wp.max(over_x, 0.0), wp.max(over_y, 0.0))
+    distance = wp.length(along)
+    depth = -wp.max(over_x, over_y)
+    if depth >= 0.0:
+        along = wp.where(over_x > over_y, wp.vec2(1.0, 0.0), wp.vec2(0.0, 1.0))
+        distance = wp.where(depth > _DEEPEST, radius, -depth)
+    along = wp.normalize(along)
+    # In the middle between two faces a centre is pushed out of the one at the negative end.
+    along_x = wp.where(x > 0.0, along[0], -along[0])
+    along_y = wp.where(y > 0.0, along[1], -along[1])
+    world_x = box.cos * along_x - box.sin * along_y
+    world_y = box.sin * along_x + box.cos * along_y
+    return wp.vec3(world_x, world_y, distance - radius)
+
+
+@wp.func
+def _from_disc(x: float, y: float, radius: float) -> wp.vec3:
+    """The unit vector from the second robot to the first, x and y away, m, and their gap, m.
+
+    Two hulls in one place push each other along x, as MuJoCo's do, the first to the negative end.
+    """
+    apart = wp.length(wp.vec2(x, y))
+    along = wp.vec2(-1.0, 0.0)
+    if apart > 0.0:
+        along = wp.vec2(x / apart, y / apart)
+    return wp.vec3(along[0], along[1], apart - 2.0 * radius)
+
+
+@wp.func
+def _touch(arena: Arena, count: int, gap: wp.vec3, first: int, second: int) -> int:
+    """Writes a contact down, if it is one, with a first force; returns how many there are then."""
+    if gap[2] >= 0.0 or count >= arena.row.shape[0]:
+        return count
+    arena.between[count, arena.index] = wp.vec2i(first, second)
+    weight = arena.weight[arena.index, first]
+    mobility = arena.mobility[arena.index, first]
+    if second >= 0:
+        weight += arena.weight[arena.index, second]
+        mobility += arena.mobility[arena.index, second]
+    impedance = _impedance(arena.numbers, -gap[2])
+    give = wp.max(weight * (1.0 - impedance) / impedance, 1.0e-15)  # mjMINVAL
+    speed = _along(arena, arena.rate, gap[0], gap[1], first, second)
+    demand = -arena.numbers[2] * speed - arena.numbers[1] * impedance * gap[2]
+    arena.row[count, arena.index] = wp.vec4(gap[0], gap[1], demand, mobility + give)
+    # The force that the contact would have at the acceleration of the step before.
+    short = demand - _along(arena, arena.before, gap[0], gap[1], first, second)
+    force = wp.max(short / give, 0.0)
+    arena.soft[count, arena.index] = wp.vec2(give, force)
+    _push(arena, count, force)
+    return count + 1
+
+
+@wp.func
+def _impedance(numbers: wp.array[float], depth: float) -> float:
+    """Impedance at a depth, m: MuJoCo's documentation, "Solver parameters", d(r) of `solimp`."""
+    least, most, middle, power = numbers[3], numbers[4], numbers[6], numbers[7]
+    share = wp.min(depth / numbers[5], 1.0)
+    rise = wp.pow(share, power) / wp.pow(middle, power - 1.0)
+    if share >= middle:
+        rise = 1.0 - wp.pow(1.0 - share, power) / wp.pow(1.0 - middle, power - 1.0)
+    return least + rise * (most - least)
+
+
+@wp.func
+def _along(
+    arena: Arena, motion: wp.array2d[wp.vec3], x: float, y: float, first: int, second: int
+) -> float:
+    """J a: how fast the two sides of a contact move apart."""
+    apart = motion[arena.index, first]
+    if second >= 0:
+        apart = apart - motion[arena.index, second]
+    return x * apart[0] + y * apart[1]
+
+
+@wp.func
+def _push(arena: Arena, contact: int, force: float) -> None:
     """Adds what a force brings about, a += M^-1 J' f."""
-    _push_robot(motion, arena, row.first, force * row.first_slope)
-    _push_robot(motion, arena, row.second, force * row.second_slope)
+    row = arena.row[contact, arena.index]
+    between = arena.between[contact, arena.index]
+    push = wp.vec3(force * row[0], force * row[1], 0.0)
+    _push_robot(arena, between[0], push)
+    if between[1] >= 0:
+        _push_robot(arena, between[1], -push)
 
 
 @wp.func
-def _push_robot(motion: Motion, arena: int, joint: int, push: wp.vec3) -> None:
-    """Adds forces along x and y and a torque to those on a robot."""
-    if joint >= 0:
-        for axis in range(3):
-            dof = joint + axis
-            kick = motion.mobility[arena, dof] * push[axis]
-            motion.qacc[arena, dof] = motion.qacc[arena, dof] + kick
-            motion.qfrc[arena, dof] = motion.qfrc[arena, dof] + push[axis]
+def _push_robot(arena: Arena, robot: int, push: wp.vec3) -> None:
+    """Adds what a push brings about."""
+    kick = arena.mobility[arena.index, robot] * push
+    arena.found[arena.index, robot] = arena.found[arena.index, robot] + kick
 
 
 @wp.func
-def _sweep(contacts: Contacts, motion: Motion, arena: int, count: int) -> bool:
+def _sweep(arena: Arena, count: int) -> bool:
     """Sets every force to its best, the others given; says whether that changed any."""
     largest = wp.float32(0.0)
     change = wp.float32(0.0)
-    for i in range(count):
-        row = contacts.row[arena, i]
-        force = contacts.force[arena, i]
-        short = contacts.aref[arena, i] - _along(row, motion.qacc, arena) - row.give * force
-        more = wp.max(short / row.stiffness, -force)
-        contacts.force[arena, i] = force + more
-        _push(row, motion, arena, more)
-        largest = wp.max(largest, force + more)
+    for k in range(count):
+        row = arena.row[k, arena.index]
+        soft = arena.soft[k, arena.index]
+        between = arena.between[k, arena.index]
+        along = _along(arena, arena.found, row[0], row[1], between[0], between[1])
+        more = wp.max((row[2] - along - soft[0] * soft[1]) / row[3], -soft[1])
+        arena.soft[k, arena.index] = wp.vec2(soft[0], soft[1] + more)
+        _push(arena, k, more)
+        largest = wp.max(largest, soft[1] + more)
         change = wp.max(change, wp.abs(more))
-    return change > TOLERANCE * largest
+    return change > _TOLERANCE * largest
 
 
 @wp.func
-def _finish(contacts: Contacts, motion: Motion, arena: int, count: int) -> None:
+def _finish(arena: Arena, free: wp.array2d[wp.vec3], count: int) -> None:
     """Works everything out once more from the forces, without the sweeps' rounding."""
-    for dof in range(motion.qacc.shape[1]):
-        motion.qacc[arena, dof] = motion.smooth[arena, dof]
-        motion.qfrc[arena, dof] = 0.0
-    for i in range(count):
-        _push(contacts.row[arena, i], motion, arena, contacts.force[arena, i])
+    _let_go(arena, free)
+    for k in range(count):
+        _push(arena, k, arena.soft[k, arena.index][1])

@@ -66,7 +66,7 @@ class EnvState:
     """State of one arena, or with a leading axis of many.
 
     Attributes:
-      sim: `PhysicsState` at the edges of a rollout, `mjx.Data` inside.
+      sim: `PhysicsState` at the edges of a rollout, the physics' data inside.
       level: what the episode started from.
       factors: what realism makes of the episode; they follow from the level's seed.
       memory: what the robots' electronics carry along.
@@ -216,7 +216,7 @@ def step(world: World, state: EnvState, action: Array) -> tuple[EnvState, TimeSt
 
     Args:
       world: the compiled environment.
-      state: the arena; `sim` is `mjx.Data`.
+      state: the arena; `sim` is the physics' data.
       action: [R, 2], -1..1 spans the command's range, what is beyond is clipped.
 
     Returns:

@@ -40,6 +40,7 @@ class Engine(NamedTuple):
     data after, and qpos and qvel of every control step.
     """
 
+    config: TrainConfig
     loaded: physics.Physics
     run: Callable[..., Any]
 
@@ -73,7 +74,7 @@ def load_as(config: TrainConfig) -> Engine:
 
         return jax.lax.scan(step, data, wheels)
 
-    return Engine(loaded, jax.jit(run))
+    return Engine(config, loaded, jax.jit(run))
 
 
 def start(engine: Engine, pose: np.ndarray) -> Any:
