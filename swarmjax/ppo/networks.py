@@ -20,10 +20,11 @@ _ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "swish": nn.swish}
 _OUTPUTS = {"linear": lambda mean: mean, "tanh": nn.tanh}
 
 # Gains of the orthogonal initialisation: Huang et al. 2022, "The 37 Implementation Details of
-# Proximal Policy Optimization", core detail 2.
+# Proximal Policy Optimization", core detail 2. Theirs is 1 for the critic, whose rewards are scaled
+# to a return of about 1. Ours are metres: a critic that begins between -1 and 1 is wrong by more
+# than there is to earn, and the policy follows its errors (docs/results.md, "Why seeds were slow").
 _HIDDEN_GAIN = math.sqrt(2.0)
-_ACTOR_GAIN = 0.01
-_CRITIC_GAIN = 1.0
+_HEAD_GAIN = 0.01
 
 
 class _Torso(nn.Module):
@@ -48,7 +49,7 @@ class _Actor(nn.Module):
     @nn.compact
     def __call__(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
         features = _Torso(self.config, name="torso")(observation)
-        layer = _layer(self.config, features, self.action_size, _ACTOR_GAIN, "mean")
+        layer = _layer(self.config, features, self.action_size, _HEAD_GAIN, "mean")
         log_std = self.param(
             "log_std",
             nn.initializers.constant(math.log(self.config.initial_std)),
@@ -66,7 +67,7 @@ class _Critic(nn.Module):
     @nn.compact
     def __call__(self, observation: jax.Array) -> jax.Array:
         features = _Torso(self.config, name="torso")(observation)
-        return _layer(self.config, features, 1, _CRITIC_GAIN, "value")(features)[..., 0]
+        return _layer(self.config, features, 1, _HEAD_GAIN, "value")(features)[..., 0]
 
 
 def _layer(config: AlgoConfig, features: jax.Array, width: int, gain: float, name: str) -> nn.Dense:

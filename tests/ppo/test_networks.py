@@ -43,7 +43,7 @@ def _forward(network: networks.Params, activation: str, head: str, x: np.ndarray
         ("actor", ("mean",), 0.01),
         ("critic", ("torso", "hidden_0"), np.sqrt(2.0)),
         ("critic", ("torso", "hidden_1"), np.sqrt(2.0)),
-        ("critic", ("value",), 1.0),
+        ("critic", ("value",), 0.01),
     ],
 )
 def test_layers_start_orthogonal_with_their_gain_and_no_bias(
