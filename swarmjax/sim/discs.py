@@ -31,6 +31,8 @@ from jax import Array
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.geom import CONTACT_HEIGHT
 
+# Contacts of an arena that a solver has room for: neighbours that a disc can touch at once.
+ROWS_PER_ROBOT = 6
 # Share of the largest force by which any may still change; float32 rounds at 1e-7.
 TOLERANCE = 1e-6
 # A centre that is deeper within a box than it is below its top or above its bottom, m, is pushed

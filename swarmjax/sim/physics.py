@@ -31,9 +31,8 @@ _NEWTON_STEPS = {"planar": (3, 5), "wheeled": (30, 20)}
 _MOST_STEPS = (100, 50)  # MuJoCo's own
 # Contacts between hulls and what they touch are stored for all arenas together by Warp: an average
 # of this many a robot is far more than a swarm makes; each arena alone may have
-# SOLVER_ROWS_PER_ROBOT. What stands on the floor is counted apart, and whole.
+# `discs.ROWS_PER_ROBOT`. What stands on the floor is counted apart, and whole.
 CONTACTS_PER_ROBOT = 3
-SOLVER_ROWS_PER_ROBOT = 6  # neighbours that a disc can touch at once
 # In a jam of more wheeled robots the solver made for them leaves up to 7 mm/s (design.md, 38).
 MOST_WHEELED = 5
 FEW_ARENAS = 64  # in so few, all may be crowded at once: there is room for every pair
@@ -223,7 +222,7 @@ def _limits(model: mujoco.MjModel, robots: int, arenas: int) -> dict[str, int]:
     hulls = max(arenas * CONTACTS_PER_ROBOT * robots, min(arenas, FEW_ARENAS) * pairs)
     return {
         "naconmax": hulls + arenas * floor,
-        "njmax": min(pairs, SOLVER_ROWS_PER_ROBOT * robots) + int(np.sum(rows)),
+        "njmax": min(pairs, sim_discs.ROWS_PER_ROBOT * robots) + int(np.sum(rows)),
     }
 
 

@@ -18,10 +18,9 @@ from jax.custom_batching import custom_vmap
 
 from swarmjax.sim import discs as sim_discs
 from swarmjax.sim import model as sim_model
-from swarmjax.sim.discs import Discs, Robots
+from swarmjax.sim.discs import ROWS_PER_ROBOT, Discs, Robots
 
 BLOCK = 64  # threads of a block: with few arenas, the blocks of 256 would leave most of a card idle
-ROWS_PER_ROBOT = 6  # neighbours that a disc can touch at once
 _TOLERANCE = wp.constant(sim_discs.TOLERANCE)
 _DEEPEST = wp.constant(sim_discs.DEEPEST)
 _WALLS = wp.constant(sim_model.WALLS)
