@@ -3,7 +3,7 @@
 Brax knows one agent an environment, so each robot is one of its environments: what it calls
 `num_envs` is arenas times robots, and `wrap_env=False`, since arenas are mapped and restarted
 here, exactly as in `rollout`: an arena whose episode ends takes the fresh level that waits for it,
-and new ones are drawn once a rollout. `mjx.Data` is carried from step to step.
+and new ones are drawn once a rollout. The physics' data is carried from step to step.
 
 Brax has no mask for transitions that nothing is to be learned from, those of a robot that has
 arrived and waits for the others. They are marked as truncated, which makes Brax give them no
@@ -32,7 +32,7 @@ class Arenas:
     """What Brax carries as `pipeline_state`.
 
     Attributes:
-      now: [A] the arenas, `sim` an `mjx.Data`.
+      now: [A] the arenas, `sim` the physics' data.
       starts: [W A] episodes that wait, packed.
       begun: [A] episodes that each arena has begun since they were drawn.
       key: random key of the next draw.

@@ -41,7 +41,7 @@ class Checkpoints:
         the first is saved, so that a run need not wait for Orbax before it begins.
         """
         self._folder, self._keep = (run / "checkpoints").resolve(), keep
-        if update:
+        if update is not None:
             for step in self._manager.all_steps():
                 if step > update:
                     self._manager.delete(step)

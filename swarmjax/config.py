@@ -599,7 +599,7 @@ class SimConfig(Section):
     """The compiled simulation."""
 
     impl: Literal["auto", "jax", "warp"] = field(
-        default="auto", metadata=about("MJX implementation; auto: warp on an NVIDIA GPU")
+        default="auto", metadata=about("who steps the physics; auto: warp on an NVIDIA GPU")
     )
     solver: Literal["auto", "newton", "swarm"] = field(
         default="auto",
@@ -1321,7 +1321,7 @@ class ReproduceConfig(Section):
         default="paper", metadata=about("range of the commands: printed, or of the hardware")
     )
     impl: Literal["auto", "jax", "warp"] = field(
-        default="auto", metadata=about("MJX implementation, as sim.impl")
+        default="auto", metadata=about("who steps the physics, as sim.impl")
     )
     device: Literal["auto", "cpu", "gpu"] = field(
         default="auto", metadata=about("that trains; auto: a GPU if there is one")

@@ -252,8 +252,8 @@ def outcomes(world: World, learners: LearnerState, levels: Level, steps: int) ->
 
     Pure: `jit` it with `world` and `steps` bound, and `vmap` it over the seeds of `learners`. With
     `impl=warp` the world must be loaded for as many arenas as are judged together (E, or E for
-    every seed), since that is what the memory of contacts is sized for. Its `task.step_limit` is
-    not read.
+    every seed), since that is what MJX-Warp's memory of contacts is sized for. Its
+    `task.step_limit` is not read.
 
     Args:
       world: the compiled environment.

@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -133,21 +134,22 @@ class Recorder:
         """Returns itself."""
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Closes the files."""
         self._metrics.close()
         self._decisions.close()
         if self._episodes is not None:
             self._episodes.close()
         if self._boards is not None:
-            self._boards.close()
+            self._boards.close(at_once=kind is KeyboardInterrupt)
 
 
 class Boards:
     """Folders of TensorBoard, by seed, which a thread opens and writes.
 
     TensorBoardX takes seconds to import where there is PyTorch, which it brings along; a run that
-    waits for a GPU meanwhile has them to spare.
+    waits for a GPU meanwhile has them to spare. Where they cannot be written, a sentence says so
+    and the run goes on: they hold nothing that the metrics do not.
     """
 
     def __init__(self, folders: Mapping[int, Path], purge: int | None) -> None:
@@ -156,6 +158,7 @@ class Boards:
         self._open: dict[int, SummaryWriter] = {}
         self._thread = ThreadPoolExecutor(1)
         self._pending: deque[Future] = deque()
+        self._lost = False
 
     def write(self, found: Sequence[Row], speeds: Row) -> None:
         """Writes rows, and the speeds to the first board.
@@ -167,15 +170,26 @@ class Boards:
             self._pending.popleft().result()
         self._pending.append(self._thread.submit(self._write, found, speeds))
 
-    def close(self) -> None:
-        """Waits until everything is written."""
-        self._thread.shutdown()
+    def close(self, *, at_once: bool = False) -> None:
+        """Waits until everything is written, unless that is to be `at_once`."""
+        self._thread.shutdown(wait=not at_once, cancel_futures=at_once)
+        if at_once:
+            return
         for board in self._open.values():
             board.close()
         for write in self._pending:
             write.result()
 
     def _write(self, found: Sequence[Row], speeds: Row) -> None:
+        if self._lost:
+            return
+        try:
+            self._add(found, speeds)
+        except (ImportError, OSError) as error:
+            self._lost = True
+            sys.stderr.write(f"swarmjax: TensorBoard is not written from here on: {error}.\n")
+
+    def _add(self, found: Sequence[Row], speeds: Row) -> None:
         from tensorboardX import SummaryWriter
 
         if not self._open:

@@ -225,13 +225,13 @@ def train(
     Raises:
       TrainingError: if a loss of any seed is no longer finite; the checkpoint before that is kept.
     """
-    settings = program.config.run
+    settings, resumed = program.config.run, program.config.resume is not None
     done = int(state.update[0])
     tally = _tally(program, done, compiled.seconds)
     saved_at = time.monotonic()
     with (
         _recorder(run, program, done) as record,
-        Checkpoints(run, settings.keep_checkpoints, done) as checkpoints,
+        Checkpoints(run, settings.keep_checkpoints, done if resumed else None) as checkpoints,
     ):
         for n in _calls(program, tally, stop):
             began = time.perf_counter()

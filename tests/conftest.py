@@ -74,5 +74,5 @@ def tiny_world(tiny_config: TrainConfig) -> World:
 
 @pytest.fixture(scope="session")
 def tiny_step(tiny_world: World) -> ArenaStep:
-    """One control step of 8 arenas: state with `mjx.Data`, action [8, 3, 2]."""
+    """One control step of 8 arenas: state with the physics' data, action [8, 3, 2]."""
     return jax.jit(jax.vmap(functools.partial(env.step, tiny_world)))

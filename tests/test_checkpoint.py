@@ -118,11 +118,12 @@ def test_a_seed_is_taken_out_of_a_run() -> None:
         checkpoint.of_seed({"update": np.int32(4)}, 0, seeds=1)
 
 
-def test_going_on_replaces_what_was_damaged(tmp_path: Path) -> None:
+@pytest.mark.parametrize("sound", [0, 1])
+def test_going_on_replaces_what_was_damaged(tmp_path: Path, sound: int) -> None:
     """Orbax saves nothing before its newest step, and never the same one again."""
-    _save(tmp_path, 1, 5)
+    _save(tmp_path, sound, 5)
     _flip_one_bit(tmp_path / "checkpoints" / "5")
-    with Checkpoints(tmp_path, keep=3, update=1) as checkpoints:
+    with Checkpoints(tmp_path, keep=3, update=sound) as checkpoints:
         checkpoints.save(_state(3.0), 3)
         checkpoints.save(_state(5.0), 5)
     assert checkpoint.restore(tmp_path)[1:] == (5, [])

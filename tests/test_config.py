@@ -519,8 +519,9 @@ def test_help_gives_default_meaning_and_allowed_values():
         "run.chunk=auto updates per call of the compiled program "
         "(a whole number 1 to 2147483647, all or auto)" in lines
     )
-    assert "sim.impl=auto MJX implementation; auto: warp on an NVIDIA GPU (auto, jax or warp)" in (
-        lines
+    assert (
+        "sim.impl=auto who steps the physics; auto: warp on an NVIDIA GPU (auto, jax or warp)"
+        in (lines)
     )
 
 

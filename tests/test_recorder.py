@@ -1,6 +1,7 @@
 """What a run writes down."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +89,18 @@ def test_tensorboard_is_written_where_it_is_wanted(tmp_path: Path, wanted: bool)
         content = events[0].read_bytes()
         assert b"return" in content
         assert b"speed" in content
+
+
+def test_a_run_goes_on_where_tensorboard_cannot_be_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)  # as if it were not installed
+    with Recorder(tmp_path, seeds=[0], tensorboard=True, update=0) as record:
+        for update in range(2):
+            record.write([_row(update)], [], {"speed": 2.0})
+    assert len((tmp_path / "metrics.jsonl").read_text().splitlines()) == 2
+    said = capsys.readouterr().err
+    assert said.count("TensorBoard is not written from here on: import of tensorboardX") == 1
 
 
 def test_several_seeds_have_a_folder_each_and_cost_what_one_does(tmp_path: Path) -> None:

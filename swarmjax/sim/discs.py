@@ -31,7 +31,7 @@ from jax import Array
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.geom import CONTACT_HEIGHT
 
-# Contacts of an arena that a solver has room for: neighbours that a disc can touch at once.
+# Contacts that a solver has room for: neighbours of its size that a disc can touch at once.
 ROWS_PER_ROBOT = 6
 # Share of the largest force by which any may still change; float32 rounds at 1e-7.
 TOLERANCE = 1e-6

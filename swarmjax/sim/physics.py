@@ -184,7 +184,7 @@ def load(
     template = mjx.make_data(model, impl=impl, **limits)
     device_model = mjx.put_model(model, impl=impl)
     if solver == "swarm":
-        device_model = _with_swarm_solver(device_model, robot.body)
+        device_model = _with_wheeled_solver(device_model)
     return Physics(device_model, template, model, ids, robot, substeps)
 
 
@@ -206,12 +206,12 @@ def _push_apart(impl: str) -> sim_discs.Solve:
     return solver_planar.push_apart
 
 
-def _with_swarm_solver(model: Model, body: str) -> Model:
-    """Lets a model be stepped by the solver that is made for its robots."""
-    from swarmjax.sim import solver  # needs Warp
+def _with_wheeled_solver(model: Model) -> Model:
+    """Lets a model be stepped by the solver that is made for wheeled robots."""
+    from swarmjax.sim import solver, solver_wheeled  # need Warp
 
     solver.install()
-    return model.tree_replace({"opt.solver": solver.NUMBERS[body]})
+    return model.tree_replace({"opt.solver": solver_wheeled.NUMBER})
 
 
 def _limits(model: mujoco.MjModel, robots: int, arenas: int) -> dict[str, int]:
@@ -396,8 +396,9 @@ def _change(physics: Physics, fields: Fields, chassis: Chassis) -> Model:
     """Sets what this arena's model has of its own: these fields, and the chassis."""
     model, rows_of = physics.model, physics.ids.robots
     changes = physics.body.changes(chassis, rows_of, physics.robot, physics.host)
-    read = {name: change for name, change in changes.items() if hasattr(model, name)}
-    for name, (rows, values) in read.items():
+    if physics.discs is not None:  # which read but a few
+        changes = {name: changes[name] for name in changes if hasattr(model, name)}
+    for name, (rows, values) in changes.items():
         now = jnp.asarray(fields.get(name, getattr(model, name)))
         fields = fields | {name: now.at[rows].set(values)}
     return model.replace(**fields)

@@ -11,8 +11,6 @@ from mujoco.mjx.warp import forward
 
 from swarmjax.sim import solver_wheeled
 
-NUMBERS = {"wheeled": solver_wheeled.NUMBER}  # by body
-_STEPS = {solver_wheeled.NUMBER: solver_wheeled.step}
 _newton = mjw.step
 
 
@@ -28,4 +26,4 @@ def step(m: Any, d: Any) -> None:
       m: Warp's model.
       d: Warp's data of all arenas, written to.
     """
-    _STEPS.get(m.opt.solver, _newton)(m, d)
+    (solver_wheeled.step if m.opt.solver == solver_wheeled.NUMBER else _newton)(m, d)

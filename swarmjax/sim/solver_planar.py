@@ -57,7 +57,8 @@ def _of_arenas(solve: Any) -> Any:
 
         whole = jax.tree.map(widen, given, tuple(batched))
         shape = whole[1].shape  # of the sides: [size, arenas]
-        found = many(*jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), whole))
+        arenas = shape[0] * shape[1]  # not -1: obstacles may be none
+        found = many(*jax.tree.map(lambda x: x.reshape(arenas, *x.shape[2:]), whole))
         return found.reshape(*shape, *found.shape[1:]), True
 
     return many
@@ -66,8 +67,9 @@ def _of_arenas(solve: Any) -> Any:
 def _solve(discs: Discs, robots: Robots, side: Array, obstacle: Array) -> Array:
     """The accelerations [A, R, 3] of arenas."""
     arenas, count = robots.mobility.shape
-    pairs = count * (obstacle.shape[1] + sim_model.WALLS) + count * (count - 1) // 2
-    rows = min(pairs, ROWS_PER_ROBOT * count), arenas
+    fixtures = obstacle.shape[1] + sim_model.WALLS
+    pairs = count * fixtures + count * (count - 1) // 2
+    rows = min(pairs, ROWS_PER_ROBOT * count + fixtures), arenas
     numbers = np.array([discs.radius, *sim_discs.spring(discs), *discs.solimp], np.float32)
     call = wp.jax_kernel(_push_apart, num_outputs=4, block_dim=BLOCK)
     shapes = {"row": rows, "soft": rows, "between": rows, "found": (arenas, count)}
@@ -262,7 +264,7 @@ def _from_disc(x: float, y: float, radius: float) -> wp.vec3:
 @wp.func
 def _touch(arena: Arena, count: int, gap: wp.vec3, first: int, second: int) -> int:
     """Writes a contact down, if it is one, with a first force; returns how many there are then."""
-    if gap[2] >= 0.0 or count >= arena.row.shape[0]:
+    if not (gap[2] < 0.0) or count >= arena.row.shape[0]:
         return count
     arena.between[count, arena.index] = wp.vec2i(first, second)
     weight = arena.weight[arena.index, first]

@@ -22,9 +22,9 @@ SIZE = model.ArenaSize(ROBOTS, 1, 0.05)
 BOX = np.array([[0.05, 0.02, 0.4, 0.05, 0.05]], np.float32)
 
 
-def _load(impl: Impl, body: BodyName, solver: Solver) -> physics.Physics:
-    stage = StageConfig(name="box", robots=ROBOTS, side=1.3, obstacles=1, obstacle_size=0.1)
-    sim = SimConfig(impl=impl, solver=solver, max_robots=ROBOTS, max_obstacles=1)
+def _load(impl: Impl, body: BodyName, solver: Solver, obstacles: int = 1) -> physics.Physics:
+    stage = StageConfig(name="box", robots=ROBOTS, side=1.3, obstacles=obstacles, obstacle_size=0.1)
+    sim = SimConfig(impl=impl, solver=solver, max_robots=ROBOTS, max_obstacles=obstacles)
     robot = RobotConfig(body=body)
     settings = TrainConfig(stage=(stage,), robot=robot, sim=sim, arenas=ARENAS, budget=10_000)
     return env.load(settings).physics
@@ -43,7 +43,7 @@ def _crowds(side: float) -> tuple[np.ndarray, np.ndarray]:
     return pose.astype(np.float32), wheels.astype(np.float32)
 
 
-def _by_mjx(loaded: physics.Physics, side: float, pose: np.ndarray, wheels: np.ndarray) -> Any:
+def _on_device(loaded: physics.Physics, side: float, pose: np.ndarray, wheels: np.ndarray) -> Any:
     """Velocities of the joints [A, V] after a control step from rest."""
 
     def move(pose: Any, wheels: Any) -> Any:
@@ -103,7 +103,7 @@ def test_crowds_push_each_other_apart_as_in_c(
     seen: tuple[float, float],
 ) -> None:
     pose, wheels = _crowds(side)
-    found = _by_mjx(_load(impl, body, solver), side, pose, wheels)
+    found = _on_device(_load(impl, body, solver), side, pose, wheels)
     each = [_in_c(RobotConfig(body=body), side, p, w) for p, w in zip(pose, wheels, strict=True)]
     expected, pairs = np.array([one[0] for one in each]), [one[1] for one in each]
     assert max(pairs) >= most
@@ -123,20 +123,21 @@ def test_what_lies_in_one_place_is_pushed_apart_as_in_c(impl: Impl) -> None:
     pose = np.zeros((1, ROBOTS, 3), np.float32)
     pose[0, :, :2] = places
     wheels = np.zeros((1, ROBOTS, 2), np.float32)
-    found = _by_mjx(_load(impl, "planar", "swarm"), 1.3, pose, wheels)[0].reshape(ROBOTS, 3)
+    found = _on_device(_load(impl, "planar", "swarm"), 1.3, pose, wheels)[0].reshape(ROBOTS, 3)
     expected = _in_c(RobotConfig(), 1.3, pose[0], wheels[0])[0].reshape(ROBOTS, 3)
     assert np.abs(expected[[0, 1, 3, 4], :2]).max(axis=1).min() > 0.1
     # Float32: 1e-7 of numbers about 1, times a contact's stiffness of 10 or so.
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
-def test_arenas_of_several_seeds_are_arenas_of_one_kernel() -> None:
+@pytest.mark.parametrize("obstacles", [0, 1])
+def test_arenas_of_several_seeds_are_arenas_of_one_kernel(obstacles: int) -> None:
     pose, wheels = _crowds(0.16)
-    loaded = _load("warp", "planar", "swarm")
+    loaded, boxes = _load("warp", "planar", "swarm", obstacles), jnp.asarray(BOX[:obstacles])
 
     def move(side: Any, pose: Any, wheels: Any) -> Any:
         data = physics.unpack(loaded, physics.rest(loaded, pose))
-        return physics.step(loaded, data, side, jnp.asarray(BOX), wheels).qvel
+        return physics.step(loaded, data, side, boxes, wheels).qvel
 
     once = jax.jit(jax.vmap(move))
     # Sides differ by seed alone, and the box is one for all.
