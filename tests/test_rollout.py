@@ -308,14 +308,14 @@ def test_value_after_an_episode_is_of_what_it_came_to_not_of_the_next_start(
     next_value = _values(tiny_world, run.learners, replay.came.observation)
     start = _values(tiny_world, run.learners, np.asarray(run.starts.observation))
     present = replay.seen[..., 8] > 0.0  # as above
-    # 1e-3: the drift of a bearing (2e-4) through a network whose slope is about 1.
-    np.testing.assert_allclose(found.value[:, 0][present], value[present], atol=1e-3)
-    np.testing.assert_allclose(found.next_value[:, 0][present], next_value[present], atol=1e-3)
+    # 1e-5: the drift of a bearing (2e-4) through a network whose slope is about 0.01 at first.
+    np.testing.assert_allclose(found.value[:, 0][present], value[present], atol=1e-5)
+    np.testing.assert_allclose(found.next_value[:, 0][present], next_value[present], atol=1e-5)
     for t, arena in zip(*np.nonzero(replay.fresh[:-1]), strict=True):
         there = present[t, arena]
         found_next = found.value[t + 1, 0, arena]
         np.testing.assert_allclose(found_next, start[arena], atol=1e-6)  # float32
-        assert np.abs(found.next_value[t, 0, arena] - found_next)[there].max() > 0.01
+        assert np.abs(found.next_value[t, 0, arena] - found_next)[there].max() > 1e-4
     # In the middle of an episode the two are one and the same.
     going = ~replay.fresh[:-1]
     np.testing.assert_array_equal(found.next_value[:-1, 0][going], found.value[1:, 0][going])
