@@ -141,7 +141,14 @@ def load(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve: Solve)
 
 
 def put(model: mujoco.MjModel) -> tuple[Model, Data]:
-    """Puts what a step reads on the device: the model, and an arena to fill in."""
+    """Puts what a step reads on the device.
+
+    Args:
+      model: compiled, one arena.
+
+    Returns:
+      The model, and an arena at 0 to fill in.
+    """
     fields = model.body_mass, model.body_inertia, model.body_invweight0
     still = jnp.zeros(model.nv)
     return Model(*map(jnp.asarray, fields)), Data(jnp.zeros(model.nq), still, still, still)
@@ -197,10 +204,16 @@ def _robots(discs: Discs, model: Model, data: Data) -> Robots:
 
 
 def spring(discs: Discs) -> tuple[float, float]:
-    """Stiffness (1/s^2) and damping (1/s) of all contacts.
+    """How contacts pull back, all alike.
 
     MuJoCo's documentation, Modeling, "Solver parameters": k and b of `solref`, which is at least
     two physics steps (`refsafe`).
+
+    Args:
+      discs: what is fixed.
+
+    Returns:
+      Stiffness, 1/s^2, and damping, 1/s.
     """
     constant, ratio = max(float(discs.solref[0]), 2.0 * discs.timestep), float(discs.solref[1])
     most = float(discs.solimp[1])
