@@ -4,13 +4,13 @@
 keys of `swarmjax.train` and prints one JSON line. Both train on the same compiled environment, with
 the same networks, initial weights but for the critic's last layer, batch, minibatches, epochs,
 discount, clip, costs and clipped gradients; both are judged by the same policy's mean on the same
-levels, at `points` evenly spaced over the budget. What differs is what is Brax's own: one
-learning rate for actor and critic, which does not fall (`learning_rate`, that of our actor unless
-given), Adam's epsilon, a critic whose last layer begins as large as the others (Brax takes one
-initialisation for all),
-minibatches of robots instead of arenas, no bound on normalised observations, and no mask, so that
-robots that have arrived stay in its batch (benchmarks/brax_env.py). All of its robot steps are
-counted as transitions, of ours those that were learned from.
+levels, at `points` evenly spaced over the budget. What differs is what is Brax's own: one learning
+rate for actor and critic, which does not fall (`learning_rate`, that of our actor unless given),
+Adam's epsilon, a critic whose last layer begins as large as the others (Brax takes one
+initialisation for all), minibatches of robots instead of arenas, no bound on normalised
+observations, and no mask, so that robots that have arrived stay in its batch
+(benchmarks/brax_env.py). All of its robot steps are counted as transitions, of ours those that were
+learned from.
 
 Seconds are of training alone. Brax compiles within its first two calls: these are taken to be as
 long as the median of the others, and the rest is its compile time. Judging is outside the clock of

@@ -293,8 +293,9 @@ def _recorder(run: Path, program: Program, done: int) -> Recorder:
 def _build_kernels(program: Program, state: TrainState) -> float:
     """Builds Warp's kernels before the clock of training starts; returns the seconds it took."""
     began = time.perf_counter()
-    if physics.resolve_impl(program.config.sim.impl) == "warp":
-        physics.build_kernels(program.world.physics, seeds.stepped_together(program, state))
+    engine = program.world.physics
+    if engine.discs is None and physics.resolve_impl(program.config.sim.impl) == "warp":
+        physics.build_kernels(engine, seeds.stepped_together(program, state))
     return time.perf_counter() - began
 
 

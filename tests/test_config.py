@@ -521,7 +521,7 @@ def test_help_gives_default_meaning_and_allowed_values():
     )
     assert (
         "sim.impl=auto who steps the physics; auto: warp on an NVIDIA GPU (auto, jax or warp)"
-        in (lines)
+        in lines
     )
 
 

@@ -23,6 +23,7 @@ from jax import Array
 from swarmjax.config import ConfigError, RobotConfig
 from swarmjax.sim import discs as sim_discs
 from swarmjax.sim import model as sim_model
+from swarmjax.sim import solver_planar_jax
 from swarmjax.sim.body import AS_BUILT, Body, Chassis
 
 # Iterations and line-search steps at most; see docs/design.md for what was measured. MJX's Newton
@@ -198,8 +199,6 @@ def _mjx() -> Any:
 def _push_apart(impl: str) -> sim_discs.Solve:
     """What solves for the contacts of discs."""
     if impl == "jax":
-        from swarmjax.sim import solver_planar_jax
-
         return solver_planar_jax.push_apart
     from swarmjax.sim import solver_planar  # needs Warp
 
@@ -236,14 +235,10 @@ def _quiet_warp() -> None:
 def build_kernels(physics: Physics, states: PhysicsState) -> None:
     """Makes Warp build MJX's kernels, which it does at their first step: half a minute, once.
 
-    Those of discs are one, which was built when the program was traced.
-
     Args:
-      physics: the compiled side, `impl` warp.
+      physics: the compiled side, `impl` warp, no discs: their kernel is built as they are traced.
       states: [A] arenas; as many as the program will step, since contacts are sized for them.
     """
-    if physics.discs is not None:
-        return
 
     def step_once(state: PhysicsState) -> Array:
         return _mjx().step(physics.model, unpack(physics, state)).qpos

@@ -11,6 +11,7 @@ import functools
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import warp as wp
 from jax import Array
@@ -53,7 +54,7 @@ def _of_arenas(solve: Any) -> Any:
     @many.def_vmap
     def _(size: int, batched: Any, *given: Any) -> tuple[Array, bool]:
         def widen(x: Array, has: bool) -> Array:
-            return x if has else jax.numpy.broadcast_to(x, (size, *x.shape))
+            return x if has else jnp.broadcast_to(x, (size, *x.shape))
 
         whole = jax.tree.map(widen, given, tuple(batched))
         shape = whole[1].shape  # of the sides: [size, arenas]
@@ -73,7 +74,7 @@ def _solve(discs: Discs, robots: Robots, side: Array, obstacle: Array) -> Array:
     numbers = np.array([discs.radius, *sim_discs.spring(discs), *discs.solimp], np.float32)
     call = wp.jax_kernel(_push_apart, num_outputs=4, block_dim=BLOCK)
     shapes = {"row": rows, "soft": rows, "between": rows, "found": (arenas, count)}
-    given = *robots, side, obstacle, jax.numpy.asarray(numbers), discs.sweeps
+    given = *robots, side, obstacle, jnp.asarray(numbers), discs.sweeps
     return call(*given, launch_dims=arenas, output_dims=shapes)[-1]
 
 
