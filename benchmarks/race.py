@@ -12,6 +12,9 @@ observations, and no mask, so that robots that have arrived stay in its batch
 (benchmarks/brax_env.py). All of its robot steps are counted as transitions, of ours those that were
 learned from.
 
+`settings=playground` gives Brax rollouts, minibatches, discount, costs and a learning rate as
+MuJoCo Playground sets them for its walking robots, instead of ours; the networks stay.
+
 Seconds are of training alone. Brax compiles within its first two calls: these are taken to be as
 long as the median of the others, and the rest is its compile time. Judging is outside the clock of
 both.
@@ -39,6 +42,25 @@ from swarmjax.settings import Section, about
 from swarmjax.task import env, observation
 
 SHARES = (0.90, 0.95)
+# MuJoCo Playground 0.2.0, `config/locomotion_params.py`, `brax_ppo_config`, of whose 8,192 robots a
+# minibatch holds 256; what it leaves open is the default of Brax 0.14.2.
+PLAYGROUND: dict[str, Any] = {
+    "unroll_length": 20,
+    "num_minibatches": 32,
+    "num_updates_per_batch": 4,
+    "discounting": 0.97,
+    "gae_lambda": 0.95,
+    "clipping_epsilon": 0.3,
+    "entropy_cost": 1e-2,
+    "vf_loss_coefficient": 0.5,
+    "learning_rate": 3e-4,
+    "max_grad_norm": 1.0,
+}
+# Brax's names in tables, by its settings.
+BRAX = {
+    "ours": "Brax PPO, this environment",
+    "playground": "Brax PPO as MuJoCo Playground sets it, this environment",
+}
 _COMPILING = 2  # calls of Brax that may compile: the second finds its own results as arguments
 _ACTIVATIONS = {"tanh": linen.tanh, "relu": linen.relu, "swish": linen.swish}
 
@@ -53,8 +75,11 @@ class RaceConfig(Section):
     points: int = field(default=30, metadata=about("points at which it is judged", 4, 1000))
     levels: int = field(default=256, metadata=about("that it is judged on", 1, 2**20))
     level_seed: int = field(default=2, metadata=about("of these", 0, config.MAX_COUNT))
+    settings: Literal["ours", "playground"] = field(
+        default="ours", metadata=about("of Brax: ours, or those of MuJoCo Playground")
+    )
     learning_rate: float | None = field(
-        default=None, metadata=about("of Brax; null: that of our actor", above=0.0, high=1.0)
+        default=None, metadata=about("of Brax; null: that of its settings", above=0.0, high=1.0)
     )
 
 
@@ -65,12 +90,14 @@ class Course(NamedTuple):
       train_s: [P] seconds of training until each point.
       share: [P] of targets reached there.
       transitions: [P] that were trained on until then.
+      arena_steps: [P] until then.
       compile_s: seconds.
     """
 
     train_s: np.ndarray
     share: np.ndarray
     transitions: np.ndarray
+    arena_steps: np.ndarray
     compile_s: float
 
 
@@ -85,9 +112,13 @@ def load_judge(race: RaceConfig, trained: TrainConfig) -> Judge:
 
 
 def points(race: RaceConfig, trained: TrainConfig) -> np.ndarray:
-    """Updates [P] after which it is judged: whole numbers, as far apart as Brax makes them."""
-    each = max(1, trained.updates // race.points)
-    return each * np.arange(1, race.points + 1)
+    """Updates [P] after which ours is judged: whole numbers, evenly apart."""
+    return _evenly(race, trained.updates)
+
+
+def _evenly(race: RaceConfig, updates: int) -> np.ndarray:
+    """Updates [P], of so many at most."""
+    return max(1, updates // race.points) * np.arange(1, race.points + 1)
 
 
 def run_ours(race: RaceConfig, trained: TrainConfig) -> Course:
@@ -97,11 +128,13 @@ def run_ours(race: RaceConfig, trained: TrainConfig) -> Course:
     def measured(learners: LearnerState) -> dict[str, dict[str, np.ndarray]]:
         return {"goal": {"targets_reached": np.array([judge(learners)])}}
 
-    curves = curriculum.measure(trained, points(race, trained), measured)
+    updates = points(race, trained)
+    curves = curriculum.measure(trained, updates, measured)
     return Course(
         train_s=np.array(curves.train_s),
         share=np.array(curves.judged["goal"]["targets_reached"][0]),
         transitions=np.array(curves.transitions[0]),
+        arena_steps=updates * trained.arenas * trained.algo.rollout,
         compile_s=curves.compile_s,
     )
 
@@ -110,22 +143,37 @@ def run_ours(race: RaceConfig, trained: TrainConfig) -> Course:
 
 
 def brax_settings(race: RaceConfig, trained: TrainConfig) -> dict[str, Any]:
-    """Our numbers under the names that Brax's `ppo.train` has for them.
+    """What Brax's `ppo.train` is given.
 
     Args:
-      race: how often it is judged, and its learning rate.
+      race: how often it is judged, whose settings it has, and its learning rate.
       trained: our config; its advantages are bootstrapped, its gradients clipped.
 
     Returns:
       Plain data.
     """
-    algo, robots = trained.algo, trained.arenas * trained.sim.max_robots
-    updates = int(points(race, trained)[-1])
-    return {
-        "num_timesteps": updates * robots * algo.rollout,
+    robots = trained.arenas * trained.sim.max_robots
+    given = {"ours": _our_settings(trained), "playground": PLAYGROUND}[race.settings]
+    if race.learning_rate is not None:
+        given = given | {"learning_rate": race.learning_rate}
+    unroll = int(given["unroll_length"])
+    updates = _evenly(race, trained.updates * trained.algo.rollout // unroll)
+    return given | {
+        "num_timesteps": int(updates[-1]) * robots * unroll,
         "num_envs": robots,
+        "batch_size": robots // given["num_minibatches"],
+        "normalize_observations": trained.algo.normalize_observations,
+        "seed": trained.seed,
+        "num_evals": race.points + 1,
+        "episode_length": trained.task.step_limit,
+    }
+
+
+def _our_settings(trained: TrainConfig) -> dict[str, Any]:
+    """Our numbers under the names that Brax has for them."""
+    algo = trained.algo
+    return {
         "unroll_length": algo.rollout,
-        "batch_size": robots // algo.minibatches,
         "num_minibatches": algo.minibatches,
         "num_updates_per_batch": algo.epochs,
         "discounting": algo.discount,
@@ -133,12 +181,8 @@ def brax_settings(race: RaceConfig, trained: TrainConfig) -> dict[str, Any]:
         "clipping_epsilon": algo.clip,
         "entropy_cost": algo.entropy_cost,
         "vf_loss_coefficient": algo.value_cost,
-        "learning_rate": race.learning_rate or algo.actor_learning_rate,
+        "learning_rate": algo.actor_learning_rate,
         "max_grad_norm": algo.max_grad_norm,
-        "normalize_observations": algo.normalize_observations,
-        "seed": trained.seed,
-        "num_evals": race.points + 1,
-        "episode_length": trained.task.step_limit,
     }
 
 
@@ -218,11 +262,12 @@ def run_brax(race: RaceConfig, trained: TrainConfig) -> Course:
     usual = np.median(calls[_COMPILING:])
     compile_s = np.sum(calls[:_COMPILING] - usual)
     calls[:_COMPILING] = usual
-    each = given["num_timesteps"] / race.points
+    transitions = given["num_timesteps"] / race.points * np.arange(1, race.points + 1)
     return Course(
         train_s=np.cumsum(calls),
         share=np.array(shares[1:]),
-        transitions=each * np.arange(1, race.points + 1),
+        transitions=transitions,
+        arena_steps=transitions / trained.sim.max_robots,
         compile_s=float(compile_s),
     )
 
@@ -255,20 +300,18 @@ def line(race: RaceConfig, trained: TrainConfig, course: Course) -> dict[str, An
       The JSON line; speeds are medians over the calls but the first.
     """
     calls_s = np.diff(course.train_s)
-    updates = int(points(race, trained)[0])
-    arena_steps = updates * trained.arenas * trained.algo.rollout
     speed = np.median(np.diff(course.transitions) / calls_s)
     ours = race.trainer == "swarmjax"
     return {
         "benchmark": "race",
-        "trainer": {"swarmjax": "swarmjax", "brax": "Brax PPO, this environment"}[race.trainer],
+        "trainer": "swarmjax" if ours else BRAX[race.settings],
         **steps_per_second.about(trained),
-        "arena_steps_per_s": float(arena_steps / np.median(calls_s)),
+        "arena_steps_per_s": float(np.median(np.diff(course.arena_steps) / calls_s)),
         "transitions_per_s": float(speed),
         "compile_s": course.compile_s,
         **seconds_to(course),
         "curve": np.stack([course.train_s, course.share], axis=1).round(4).tolist(),
-        "updates_per_call": updates,
+        "arena_steps_per_call": float(course.arena_steps[0]),
         **timing.spread(calls_s.tolist()),
         "levels": race.levels,
         "settings": config.to_dict(trained.algo) if ours else brax_settings(race, trained),
@@ -290,6 +333,11 @@ def parse(words: Sequence[str]) -> tuple[RaceConfig, TrainConfig]:
     """Tells the words of the race from those of training; raises ConfigError."""
     race, rest = peers.parse(RaceConfig, words)
     trained = config.load_train(["stage=s6", *rest])
+    _check(race, trained)
+    return race, trained
+
+
+def _check(race: RaceConfig, trained: TrainConfig) -> None:
     *others, stage = trained.stage
     if others:
         raise config.ConfigError(f"stage is {trained.stage_name}: give one stage, as in stage=s6.")
@@ -299,12 +347,16 @@ def parse(words: Sequence[str]) -> tuple[RaceConfig, TrainConfig]:
             f"{stage.robots} robots, and Brax has no place for absent ones: give "
             f"sim.max_robots={stage.robots}."
         )
+    least = PLAYGROUND["num_minibatches"]
+    if race.settings == "playground" and trained.arenas % least:
+        raise config.ConfigError(
+            f"arenas is {trained.arenas}: settings=playground takes multiples of {least}."
+        )
     if trained.updates < race.points:
         raise config.ConfigError(
             f"points is {race.points}, but the budget is {trained.updates} updates: give at most "
             "as many."
         )
-    return race, trained
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -1,5 +1,6 @@
 """The adapter to Brax steps, rewards, ends and restarts as the environment itself does."""
 
+import dataclasses
 import warnings
 from functools import partial
 
@@ -74,6 +75,18 @@ def test_brax_is_given_our_numbers(tiny_config: TrainConfig) -> None:
     assert race.points(race.RaceConfig(points=6), tiny_config).tolist() == [3, 6, 9, 12, 15, 18]
 
 
+def test_brax_is_given_playgrounds_numbers(tiny_config: TrainConfig) -> None:
+    words = race.RaceConfig(points=4, settings="playground")
+    larger = dataclasses.replace(tiny_config, arenas=32, budget=32 * 8 * 20)
+    found = race.brax_settings(words, larger)
+    # 20 updates of 8 control steps are 8 of 20, judged every 2; 32 arenas of 3 robots.
+    assert found["num_timesteps"] == 8 * 96 * 20
+    assert (found["num_envs"], found["batch_size"], found["num_minibatches"]) == (96, 3, 32)
+    assert (found["discounting"], found["learning_rate"]) == (0.97, 3e-4)
+    words = dataclasses.replace(words, learning_rate=1e-3)
+    assert race.brax_settings(words, larger)["learning_rate"] == 1e-3
+
+
 def test_the_judge_sees_the_policy_that_brax_trained(tiny_config: TrainConfig) -> None:
     from brax.training.acme import running_statistics
     from brax.training.agents.ppo import networks
@@ -101,6 +114,7 @@ def test_seconds_to_a_share() -> None:
         train_s=np.array([1.0, 2.0, 3.0]),
         share=np.array([0.5, 0.9, 0.94]),
         transitions=np.array([10.0, 20.0, 30.0]),
+        arena_steps=np.array([2.0, 4.0, 6.0]),
         compile_s=0.0,
     )
     assert race.seconds_to(course) == {"seconds_to_0.90": 2.0, "seconds_to_0.95": None}
