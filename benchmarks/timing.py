@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 import jax
 
+from swarmjax import loop
+
 REPEATS = 5
 
 
@@ -37,7 +39,8 @@ def compile_program(call: Callable[[Any, Any], Any], state: Any, argument: Any) 
       The program.
     """
     began = time.perf_counter()
-    compiled = jax.jit(call, donate_argnums=0).lower(state, argument).compile()
+    lowered = jax.jit(call, donate_argnums=0).lower(state, argument)
+    compiled = lowered.compile(loop.compiler_options())
     seconds = time.perf_counter() - began
     memory = compiled.memory_analysis()
     assert memory is not None  # both CPU and GPU tell

@@ -16,7 +16,7 @@ from swarmjax.config import AlgoConfig
 from swarmjax.ppo import contact_price, gae, monte_carlo
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import Batch, LearnerState
-from swarmjax.sim import physics
+from swarmjax.sim import gaps, physics
 from swarmjax.task import env, level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
@@ -197,9 +197,9 @@ def collect(
     carry = (arenas, _values(world, learners, arenas.observation), begun)
     steps = world.config.algo.rollout
     keys = jax.random.split(key, steps)
-    (arenas, *_), (trajectory, ended) = jax.lax.scan(step, carry, (keys, 1 + jnp.arange(steps)))
+    (arenas, *_), (trajectory, counts) = jax.lax.scan(step, carry, (keys, 1 + jnp.arange(steps)))
     packed = jax.vmap(physics.pack)(arenas.sim)
-    return replace(arenas, sim=packed), trajectory, ended
+    return replace(arenas, sim=packed), trajectory, _to_ended(*counts)
 
 
 def explore(world: World, learners: LearnerState, steps: Array | int) -> LearnerState:
@@ -309,6 +309,22 @@ class _Waiting(NamedTuple):
     value: Array
 
 
+# What `Ended` counts, by name, and how many numbers each is.
+_COUNTS = {
+    "episodes": 1,
+    "stage": 1,
+    "cohort": 1,
+    "targets": 1,
+    "reached": 1,
+    "all_reached": 1,
+    "steps": 1,
+    "robot_steps": 1,
+    "sensed": 1,
+    "contacts": len(gaps.KINDS),
+    "broken": 1,
+}
+
+_Counts = tuple[Array, Array, Robots | None]  # counts [A, K], rewards [A], robots
 _Carry = tuple[EnvState, Array, Array]  # arenas, their values, how many episodes each has begun
 
 
@@ -318,7 +334,7 @@ def _step(
     waits: _Waiting,
     carry: _Carry,
     now: tuple[Array, Array],
-) -> tuple[_Carry, tuple[Trajectory, Ended]]:
+) -> tuple[_Carry, tuple[Trajectory, _Counts]]:
     """One control step of all arenas, the first of a rollout being 1."""
     (arenas, value, begun), (key, number) = carry, now
     count = value.shape[0]
@@ -347,7 +363,7 @@ def _step(
         robot_contact=to_learners(came.robot_contact, count) if config.contact_limit else None,
     )
     carry = (arenas, jnp.where(over, start_value, next_value), begun + came.done)
-    return carry, (transition, ended)
+    return carry, (transition, _to_counts(ended))
 
 
 def _next(waits: _Waiting, begun: Array) -> tuple[EnvState, Array]:
@@ -419,6 +435,21 @@ def _ended(arenas: EnvState, came: env.TimeStep, *, by_robot: bool) -> Ended:
         broken=(~came.sound).astype(jnp.int32),
         robots=jax.tree.map(mine, _robots(arenas)) if by_robot else None,
     )
+
+
+def _to_counts(ended: Ended) -> _Counts:
+    """Lays all counts [A, ...] of a step side by side [A, K]: one array to write instead of 12."""
+    columns = [getattr(ended, name).reshape(len(ended.reward), -1) for name in _COUNTS]
+    return jnp.concatenate(columns, axis=1), ended.reward, ended.robots
+
+
+def _to_ended(counts: Array, reward: Array, robots: Robots | None) -> Ended:
+    """Undoes `_to_counts`, [T, A, ...]."""
+    found, first = {}, 0
+    for name, width in _COUNTS.items():
+        found[name] = counts[..., first] if width == 1 else counts[..., first : first + width]
+        first += width
+    return Ended(**found, reward=reward, robots=robots)
 
 
 def _robots(arenas: EnvState) -> Robots:

@@ -7,6 +7,7 @@ learner in every step: learners and seeds take their turns instead.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -42,17 +43,36 @@ def arrange(samples: Minibatch) -> Blocks:
     Returns:
         The blocks; what fills the last one up is not valid.
     """
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
-    order = jnp.argsort(~flat.valid, stable=True)
-    size = min(BLOCK, len(order))
-    missing = -len(order) % size
+    flat = valid_first(samples)
+    size = min(BLOCK, len(flat.valid))
+    missing = -len(flat.valid) % size
 
     def cut(x: jax.Array) -> jax.Array:
-        padded = jnp.pad(x[order], [(0, missing)] + [(0, 0)] * (x.ndim - 1))
+        padded = jnp.pad(x, [(0, missing)] + [(0, 0)] * (x.ndim - 1))
         return padded.reshape(-1, size, *x.shape[1:])
 
     valid = jnp.sum(flat.valid, dtype=jnp.int32)
     return Blocks(jax.tree.map(cut, flat), (valid + size - 1) // size)
+
+
+def valid_first(samples: Minibatch) -> Minibatch:
+    """Lays all samples out along one axis, the valid ones first, in the order that they have.
+
+    Args:
+        samples: [G, N, ...].
+
+    Returns:
+        [G N, ...]; past the valid samples are copies of others, which are not valid.
+    """
+    groups, each = samples.valid.shape
+    within = jnp.cumsum(samples.valid, axis=1, dtype=jnp.int32)
+    before = jnp.cumsum(within[:, -1]) - within[:, -1]
+    index = jnp.arange(groups * each, dtype=jnp.int32)
+    beyond = groups * each + index  # dropped, each at a place of its own
+    place = jnp.where(samples.valid.ravel(), (before[:, None] + within - 1).ravel(), beyond)
+    source = jnp.zeros_like(index).at[place].set(index, mode="drop", unique_indices=True)
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[source], samples)
+    return replace(flat, valid=index < jnp.sum(within[:, -1]))
 
 
 def gradient(

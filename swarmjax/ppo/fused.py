@@ -8,10 +8,13 @@ It is that of `losses.ppo_loss`, written out. With s over the valid samples, n =
 
 b_s being how far the mean action lies beyond -1..1.
 
-Its kernels sum over samples; what is the same for all of them, 1/n among it, comes after.
+Its kernels sum over samples; what is the same for all of them, 1/n among it, comes after. They take
+tiles of samples in any order, so that a batch whose valid samples lie first is learned from where
+it lies: a minibatch is a choice of tiles, and the rest of the batch costs nothing.
 """
 
 import functools
+import itertools
 import math
 import re
 from typing import Literal
@@ -19,10 +22,11 @@ from typing import Literal
 import chex
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
 from swarmjax.config import AlgoConfig, ConfigError, show
 from swarmjax.ppo import fused_kernel, networks
-from swarmjax.ppo.fused_kernel import Launch, Layer, Samples
+from swarmjax.ppo.fused_kernel import Launch, Layout, Place, Samples, Tiles
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
 
@@ -42,7 +46,10 @@ _LEAST_GENERATION = 8
 # Names that JAX has for products without tensor cores (`jax.default_matmul_precision`).
 _FULL = ("highest", "float32", "F32_F32_F32")
 
-_Run = functools.partial[fused_kernel.Sums]
+# What `flat_gradient` tells: the metrics of `losses.ppo_loss`.
+METRICS = ("approx_kl", "bound_loss", "clip_fraction", "entropy", "policy_loss", "value_loss")
+
+Flat = dict[str, jax.Array]  # a vector for each network, in the order of its tree's leaves
 
 
 def resolve(
@@ -133,8 +140,6 @@ def gradient(
 ) -> tuple[Params, Metrics]:
     """Computes what `jax.grad(losses.ppo_loss, has_aux=True)` does, but for rounding.
 
-    Products have JAX's precision, `jax.default_matmul_precision`.
-
     Args:
         params: Of actor and critic, of layers that `fits` accepts.
         minibatch: B samples.
@@ -149,68 +154,189 @@ def gradient(
     Raises:
         ValueError: `fits` says no.
     """
-    _check(params, minibatch, config)
     sizes = minibatch.observation.shape[1], minibatch.action.shape[1]
     launch = choose_launch(config, *sizes) if launch is None else launch
+    count = -(-len(minibatch.valid) // launch.tile)
+    tiles = Tiles(jnp.arange(count), jnp.array([0, count]))
+    found, metrics, _ = flat_gradient(
+        flatten(params),
+        layouts(params),
+        minibatch,
+        tiles,
+        config,
+        expected_valid,
+        launch=launch,
+        interpret=interpret,
+    )
+    return unflatten(found, params), metrics
+
+
+def flatten(params: Params) -> Flat:
+    """Lays each network of `params` out in one vector."""
+    return {name: ravel_pytree(network)[0] for name, network in params.items()}
+
+
+def unflatten(flat: Flat, like: Params) -> Params:
+    """Undoes `flatten` of parameters that have the shapes of `like`."""
+    return {name: ravel_pytree(network)[1](flat[name]) for name, network in like.items()}
+
+
+def layouts(params: Params) -> dict[str, Layout]:
+    """Says how `flatten` lays the networks out, by their names."""
+    return {
+        "actor": _layout(params["actor"], "mean"),
+        "critic": _layout(params["critic"], "value"),
+    }
+
+
+def shuffle(
+    keys: jax.Array, samples: int, valid: jax.Array, minibatches: int, launch: Launch
+) -> Tiles:
+    """Deals the tiles that hold valid samples out to minibatches, whose sizes differ by one tile.
+
+    Args:
+        keys: [E] random keys, one for each pass over the samples, consumed.
+        samples: B, the first `valid` of which are valid.
+        valid: [], int32.
+        minibatches: M of a pass.
+        launch: of what tiles.
+
+    Returns:
+        The passes' orders one after the other, and the span [E M, 2] of each minibatch.
+    """
+    count = -(-samples // launch.tile)
+    used = -(-valid // launch.tile)
+    index = jnp.arange(count, dtype=jnp.int32)
+
+    def order(key: jax.Array) -> jax.Array:
+        # The last number is kept for tiles without a valid sample, which sort to the end.
+        bits = jnp.minimum(jax.random.bits(key, (count,)), jnp.uint32(2**32 - 2))
+        return jax.lax.sort_key_val(jnp.where(index < used, bits, jnp.uint32(2**32 - 1)), index)[1]
+
+    # Rounded down, so that whole tiles are dealt out: M bounds from 0 to `used`.
+    share, rest = used // minibatches, used % minibatches
+    parts = jnp.arange(minibatches + 1, dtype=jnp.int32)
+    bounds = parts * share + jnp.minimum(parts, rest)
+    passes = count * jnp.arange(len(keys), dtype=jnp.int32)[:, None, None]
+    spans = passes + jnp.stack([bounds[:-1], bounds[1:]], axis=-1)
+    return Tiles(jax.vmap(order)(keys).ravel(), spans.reshape(-1, 2))
+
+
+def flat_gradient(
+    flat: Flat,
+    layout: dict[str, Layout],
+    samples: Minibatch,
+    tiles: Tiles,
+    config: AlgoConfig,
+    expected_valid: jax.Array,
+    *,
+    launch: Launch,
+    interpret: bool = False,
+) -> tuple[Flat, Metrics, jax.Array]:
+    """Computes the gradient over some tiles of a batch, with each network as one vector.
+
+    Products have JAX's precision, `jax.default_matmul_precision`.
+
+    Args:
+        flat: What `flatten` returned.
+        layout: What `layouts` returned, of layers that `fits` accepts.
+        samples: B samples.
+        tiles: Of `launch.tile` samples, the minibatch.
+        config: Clip range and costs.
+        expected_valid: [], as `losses.ppo_loss` takes it.
+        launch: How the kernels are spread over the GPU.
+        interpret: Run them as ordinary JAX, on any device.
+
+    Returns:
+        The gradient, as `flat`; `METRICS`, each []; how many samples of the tiles are valid, [].
+
+    Raises:
+        ValueError: `fits` says no.
+    """
+    _check(samples, layout, config)
     share = 1.0 / jnp.maximum(expected_valid, 1.0)
     run = functools.partial(
-        fused_kernel.sums, activation=config.activation, launch=launch, interpret=interpret
+        fused_kernel.sums,
+        activation=config.activation,
+        tiles=tiles,
+        launch=launch,
+        interpret=interpret,
     )
-    actor, surrogate = _actor_sums(run, params["actor"], minibatch, config)
-    critic, error = _critic_sums(run, params["critic"], minibatch)
-    weight = jnp.sum(minibatch.valid.astype(bool)) * share  # in a mean, of what all have in common
-    # The entropy is the sum of log_std and a constant, so its slope is 1.
-    log_std = surrogate.pop("log_std") * share - config.entropy_cost * weight
-    if config.exploration == "scheduled":
-        log_std = jnp.zeros_like(log_std)
+    names = ("observation", "action", "log_prob", "advantage")
+    size = samples.action.shape[1]
+    actor, surrogate = run(
+        flat["actor"],
+        layout["actor"],
+        loss=functools.partial(_surrogate, config, size),
+        samples=_samples(samples, names),
+    )
+    critic, error = run(
+        flat["critic"],
+        layout["critic"],
+        loss=_half_square,
+        samples=_samples(samples, ("observation", "return_")),
+    )
+    count = error.pop("valid")
+    weight = count * share  # in a mean, of what all have in common
+    first, width = layout["actor"].vectors["log_std"]
+    deviation = jnp.exp(flat["actor"][first : first + width])
     metrics = {name: total * share for name, total in (surrogate | error).items()}
-    metrics["entropy"] = networks.entropy(jnp.exp(params["actor"]["log_std"])) * weight
-    return {
-        "actor": _scaled(actor, share) | {"log_std": log_std},
-        "critic": _scaled(critic, config.value_cost * share),
-    }, metrics
+    metrics["entropy"] = networks.entropy(deviation) * weight
+    found = {
+        "actor": _with_entropy(actor * share, config, weight, first, width),
+        "critic": critic * (config.value_cost * share),
+    }
+    return found, metrics, count
 
 
-def _check(params: Params, minibatch: Minibatch, config: AlgoConfig) -> None:
-    chex.assert_rank([minibatch.observation, minibatch.action], 2)
-    chex.assert_rank([minibatch.log_prob, minibatch.valid], 1)
-    chex.assert_equal_shape(
-        [minibatch.log_prob, minibatch.advantage, minibatch.return_, minibatch.valid]
+def _with_entropy(
+    gradient: jax.Array, config: AlgoConfig, weight: jax.Array, first: int, width: int
+) -> jax.Array:
+    """Adds the slope of the entropy's cost by `log_std`, which is there from `first` on.
+
+    The entropy is the sum of log_std and a constant, so its slope is 1. Nothing moves a deviation
+    that follows a schedule.
+    """
+    index = jnp.arange(gradient.shape[0])
+    moved = 0.0 if config.exploration == "scheduled" else gradient - config.entropy_cost * weight
+    return jnp.where((index >= first) & (index < first + width), moved, gradient)
+
+
+def _layout(network: Params, last: str) -> Layout:
+    leaves, structure = jax.tree.flatten(network)
+    ends = list(itertools.accumulate(leaf.size for leaf in leaves))
+    firsts = jax.tree.unflatten(structure, [0, *ends[:-1]])
+    torso = [f"hidden_{index}" for index in range(len(network["torso"]))]
+    at = [firsts["torso"][name] for name in torso] + [firsts[last]]
+    layers = [network["torso"][name] for name in torso] + [network[last]]
+    places = (
+        Place(place["kernel"], place["bias"], layer["kernel"].shape)
+        for place, layer in zip(at, layers, strict=True)
     )
-    chex.assert_equal_shape_prefix([minibatch.observation, minibatch.action, minibatch.valid], 1)
-    observation_size, action_size = minibatch.observation.shape[1], minibatch.action.shape[1]
-    chex.assert_axis_dimension(params["actor"]["torso"]["hidden_0"]["kernel"], 0, observation_size)
-    chex.assert_shape(params["actor"]["log_std"], (action_size,))
+    vectors = {name: (firsts[name], network[name].size) for name in network if name == "log_std"}
+    return Layout(tuple(places), vectors, ends[-1])
+
+
+def _check(samples: Minibatch, layout: dict[str, Layout], config: AlgoConfig) -> None:
+    chex.assert_rank([samples.observation, samples.action], 2)
+    chex.assert_rank([samples.log_prob, samples.valid], 1)
+    chex.assert_equal_shape([samples.log_prob, samples.advantage, samples.return_, samples.valid])
+    chex.assert_equal_shape_prefix([samples.observation, samples.action, samples.valid], 1)
+    observation_size, action_size = samples.observation.shape[1], samples.action.shape[1]
+    for network in layout.values():
+        assert network.layers[0].shape[0] == observation_size
+    assert layout["actor"].vectors["log_std"][1] == action_size
     if not fits(config, observation_size, action_size):
         raise ValueError(f"the kernels do not take hidden layers of {config.hidden}")
 
 
-def _actor_sums(
-    run: _Run, actor: Params, minibatch: Minibatch, config: AlgoConfig
-) -> tuple[Params, Metrics]:
-    """Sums over samples of the surrogate's gradient, of metrics, and of the slope by `log_std`."""
-    size = minibatch.action.shape[1]
-    loss = functools.partial(_surrogate, config, size)
-    names = ("observation", "action", "log_prob", "advantage")
-    log_std = fused_kernel.pad(actor["log_std"], (fused_kernel.padded_width(size),))
-    layers, sums = run(
-        _layers(actor, "mean"),
-        loss=loss,
-        samples=_samples(minibatch, names),
-        constants={"log_std": log_std},
-    )
-    return _tree(layers, actor, "mean"), sums | {"log_std": sums["log_std"][:size]}
-
-
-def _critic_sums(run: _Run, critic: Params, minibatch: Minibatch) -> tuple[Params, Metrics]:
-    """Sums over samples of the gradient of half the squared error, and of that itself."""
-    samples = _samples(minibatch, ("observation", "return_"))
-    layers, sums = run(_layers(critic, "value"), loss=_half_square, samples=samples, constants={})
-    return _tree(layers, critic, "value"), sums
+def _samples(samples: Minibatch, names: tuple[str, ...]) -> Samples:
+    chosen = {name: getattr(samples, name).astype(jnp.float32) for name in names}
+    return chosen | {"valid": samples.valid.astype(bool).astype(jnp.float32)}
 
 
 def _surrogate(
-    config: AlgoConfig, size: int, output: jax.Array, samples: Samples, constants: Samples
+    config: AlgoConfig, size: int, output: jax.Array, samples: Samples, vectors: Samples
 ) -> tuple[jax.Array, Metrics]:
     """The clipped surrogate, negated, with the action padded by zeros.
 
@@ -220,7 +346,7 @@ def _surrogate(
     -z^2 / 2 - log sigma - log(2 pi) / 2: its slopes are z / sigma by mu and z^2 - 1 by log sigma.
     """
     mean = jnp.tanh(output) if config.output == "tanh" else output
-    log_std = constants["log_std"][None, :]
+    log_std = vectors["log_std"][None, :]
     standardised = (samples["action"] - mean) * jnp.exp(-log_std)
     log_density = jnp.sum(-0.5 * standardised * standardised - log_std, axis=1)
     log_density -= 0.5 * size * math.log(2.0 * math.pi)
@@ -245,44 +371,14 @@ def _surrogate(
 
 
 def _half_square(
-    output: jax.Array, samples: Samples, constants: Samples
+    output: jax.Array, samples: Samples, vectors: Samples
 ) -> tuple[jax.Array, Metrics]:
     """Half the squared error of the first column of the output, whose others are padding."""
-    del constants
+    del vectors
     value = jnp.sum(output, axis=1)
     error = jnp.where(samples["valid"] > 0.0, value - samples["return_"], 0.0)
     first = jnp.arange(output.shape[1]) == 0
-    return jnp.where(first[None, :], error[:, None], 0.0), {"value_loss": 0.5 * error * error}
-
-
-def _samples(minibatch: Minibatch, names: tuple[str, ...]) -> Samples:
-    chosen = {name: getattr(minibatch, name).astype(jnp.float32) for name in names}
-    return chosen | {"valid": minibatch.valid.astype(bool).astype(jnp.float32)}
-
-
-def _layers(network: Params, last: str) -> tuple[Layer, ...]:
-    """The layers of a network in order, padded."""
-    torso = network["torso"]
-    trees = [torso[f"hidden_{index}"] for index in range(len(torso))] + [network[last]]
-    return tuple(_padded(tree["kernel"], tree["bias"]) for tree in trees)
-
-
-def _padded(kernel: jax.Array, bias: jax.Array) -> Layer:
-    inputs, outputs = (fused_kernel.padded_width(width) for width in kernel.shape)
-    return Layer(fused_kernel.pad(kernel, (inputs, outputs)), fused_kernel.pad(bias, (outputs,)))
-
-
-def _tree(layers: tuple[Layer, ...], network: Params, last: str) -> Params:
-    """Layers as the network has them, without what was padded."""
-    torso = {f"hidden_{index}": layer for index, layer in enumerate(layers[:-1])}
-    cut = {name: _cut(layer, network["torso"][name]) for name, layer in torso.items()}
-    return {"torso": cut, last: _cut(layers[-1], network[last])}
-
-
-def _cut(layer: Layer, like: Params) -> Params:
-    inputs, outputs = like["kernel"].shape
-    return {"kernel": layer.kernel[:inputs, :outputs], "bias": layer.bias[:outputs]}
-
-
-def _scaled(tree: Params, factor: jax.Array) -> Params:
-    return jax.tree.map(lambda x: x * factor, tree)
+    return jnp.where(first[None, :], error[:, None], 0.0), {
+        "value_loss": 0.5 * error * error,
+        "valid": samples["valid"],
+    }

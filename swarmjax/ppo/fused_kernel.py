@@ -2,7 +2,8 @@
 
 XLA writes the activations of every layer to memory and reads them again; here a program of the grid
 keeps those of a tile of samples, and writes no more than its sums at its end. Programs share
-nothing, so that the same samples give the same bits.
+nothing, so that the same samples give the same bits. A network is one vector, and so is its
+gradient: of each there is one array to read, add up and step along instead of a dozen.
 
 B stands for samples, P for programs, `tile` for the samples that a program holds at once.
 """
@@ -39,6 +40,20 @@ class Layer(NamedTuple):
     bias: jax.Array
 
 
+class Place(NamedTuple):
+    """Where an affine layer lies in the vector of its network's parameters, row by row.
+
+    Attributes:
+        kernel: index of its first number.
+        bias: likewise.
+        shape: in and out.
+    """
+
+    kernel: int
+    bias: int
+    shape: tuple[int, int]
+
+
 class Launch(NamedTuple):
     """How the kernel is spread over the GPU.
 
@@ -53,13 +68,38 @@ class Launch(NamedTuple):
     warps: int
 
 
+class Layout(NamedTuple):
+    """How the parameters of a network lie in one vector.
+
+    Attributes:
+        layers: hidden layers and output, in order.
+        vectors: what else there is, by name: index of the first number, and width.
+        size: of the vector.
+    """
+
+    layers: tuple[Place, ...]
+    vectors: dict[str, tuple[int, int]]
+    size: int
+
+
+class Tiles(NamedTuple):
+    """Which tiles of the samples a kernel takes: tile i is samples i * tile to (i + 1) * tile.
+
+    Attributes:
+        order: [K], int32, tiles.
+        span: [2], int32, those of `order` that are taken: from the first number, below the other.
+    """
+
+    order: jax.Array
+    span: jax.Array
+
+
 # Samples of a tile by name, each [tile] or [tile, width], zero past the last sample.
 Samples = dict[str, jax.Array]
 # (output of the network [tile, width], samples, constants) -> (derivative of the loss with respect
 # to the output [tile, width], what else is to be summed over all samples, each [tile, ...]).
 Loss = Callable[[jax.Array, Samples, dict[str, jax.Array]], tuple[jax.Array, dict[str, jax.Array]]]
-# The gradient with respect to a network, and the loss's sums by name.
-Sums = tuple[tuple[Layer, ...], dict[str, jax.Array]]
+
 
 _Activations = list[tuple[jax.Array, jax.Array]]
 
@@ -99,99 +139,126 @@ def fits(
     return max(widths) <= MOST_WIDTH and 4 * numbers <= memory
 
 
-def pad(x: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Appends zeros to every axis until `x` has this shape."""
-    return jnp.pad(x, [(0, new - old) for old, new in zip(x.shape, shape, strict=True)])
-
-
 def sums(
-    network: tuple[Layer, ...],
+    parameters: jax.Array,
+    layout: Layout,
     activation: str,
     loss: Loss,
     samples: Samples,
-    constants: dict[str, jax.Array],
+    tiles: Tiles,
     launch: Launch,
     interpret: bool = False,
-) -> Sums:
-    """Sums the gradient of a loss, and what else it tells, over samples.
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Sums the gradient of a loss, and what else it tells, over the samples of some tiles.
 
     Args:
-        network: hidden layers and output, of widths that `padded_width` leaves as they are.
+        parameters: [n] of a network. All is read and written as it is, and padded on the chip.
+        layout: of these; hidden layers have widths that `padded_width` leaves as they are.
         activation: of the hidden layers: `tanh`, `relu` or `swish`.
-        loss: of the output; what must not count is 0 in all that it returns.
+        loss: of the output; what must not count is 0 in all that it returns. Of the layout's
+            vectors it takes the padded values, and returns the derivatives under their names.
         samples: by name, each [B] or [B, width], float32; of them `observation` [B, O] goes into
-            the network. They are read as they are and padded on the chip, with zeros.
-        constants: what else the loss takes, by name, each [width].
+            the network.
+        tiles: of `launch.tile` samples, which to take.
         launch: how it is spread over the GPU.
         interpret: run it as ordinary JAX, on any device.
 
     Returns:
-        The gradient with respect to `network`, and the loss's sums by name, each [...]: [tile, ...]
-        without its first axis.
+        The gradient [n], and what else the loss returns by name, each [].
     """
-    tile, tiles = launch.tile, -(-len(samples["observation"]) // launch.tile)
-    programs = min(launch.programs, tiles)
     of_tile = functools.partial(_of_tile, activation, loss)
-    shapes = jax.eval_shape(
-        of_tile,
-        network,
-        jax.tree.map(lambda x: jax.ShapeDtypeStruct(_tile_shape(x, tile), x.dtype), samples),
-        constants,
-    )
-    partial_sums = pl.pallas_call(
-        functools.partial(_program, of_tile, shapes, tile, -(-tiles // programs)),
+    shapes = jax.eval_shape(of_tile, *_shapes(layout, samples, launch.tile))
+    told = [name for name in shapes[1] if name not in layout.vectors]
+    width = layout.size + len(told)
+    programs = min(launch.programs, tiles.order.size)
+    totals = pl.pallas_call(
+        functools.partial(_program, of_tile, shapes, layout, launch.tile),
         grid=(programs,),
-        out_shape=jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct((programs, *x.shape), jnp.float32), shapes
-        ),
-        out_specs=jax.tree.map(_rows_of_program, shapes),
+        out_shape=jax.ShapeDtypeStruct((programs * width,), jnp.float32),
         # Nothing to run ahead of: a tile's samples are few bytes beside its products.
         compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=1),
         interpret=interpret,
-    )(network, samples, constants)
-    gradient, parts = jax.tree.map(lambda x: jnp.sum(x, axis=0), partial_sums)
-    return gradient, {name: jnp.sum(part, axis=0) for name, part in parts.items()}
+    )(parameters, samples, tiles)
+    total = jnp.sum(totals.reshape(programs, width), axis=0)
+    return total[: layout.size], dict(zip(told, total[layout.size :], strict=True))
 
 
-def _tile_shape(samples: jax.Array, tile: int) -> tuple[int, ...]:
-    return (tile, *(padded_width(width) for width in samples.shape[1:]))
+def _shapes(layout: Layout, samples: Samples, tile: int) -> Any:
+    """Shapes of the arguments of a tile: layers, samples and vectors, all padded."""
 
+    def array(*shape: int) -> Any:
+        return jax.ShapeDtypeStruct(tuple(map(padded_width, shape)), jnp.float32)
 
-def _rows_of_program(total: jax.ShapeDtypeStruct) -> pl.BlockSpec:
-    """The row of an output [P, ...] that a program writes."""
-    rank = len(total.shape)
-    return pl.BlockSpec((None, *total.shape), lambda program: (program, *[0] * rank))
+    layers = tuple(Layer(array(*x.shape), array(x.shape[1])) for x in layout.layers)
+    vectors = {name: array(width) for name, (_, width) in layout.vectors.items()}
+    return layers, {name: array(tile, *x.shape[1:]) for name, x in samples.items()}, vectors
 
 
 def _program(
     of_tile: Callable[..., Any],
     shapes: Any,
+    layout: Layout,
     tile: int,
-    rounds: int,
-    network: Any,
+    parameters: Any,
     samples: dict[str, Any],
-    constants: dict[str, Any],
-    *totals: Any,
+    tiles: Any,
+    totals: Any,
 ) -> None:
-    """A program: every P-th tile, in as many rounds; all arguments after `rounds` are references.
-
-    The last round may lie past the last sample, where zeros are read, which count for nothing.
-    """
-    first, programs = pl.program_id(0), pl.num_programs(0)
-    layers, fixed = jax.tree.map(lambda ref: ref[...], (network, constants))
+    """A program: every P-th tile; all arguments after `tile` are references."""
+    program, programs = pl.program_id(0), pl.num_programs(0)
+    layers = tuple(_read_layer(parameters, place) for place in layout.layers)
+    vectors = {name: _read_row(parameters, *at) for name, at in layout.vectors.items()}
+    first = tiles.span[0] + program
 
     def add(i: jax.Array, sofar: Any) -> Any:
-        rows = (first + i * programs) * tile + jnp.arange(tile)
+        rows = tiles.order[first + i * programs] * tile + jnp.arange(tile)
         read = {name: _read(ref, rows) for name, ref in samples.items()}
-        return jax.tree.map(jnp.add, sofar, of_tile(layers, read, fixed))
+        return jax.tree.map(jnp.add, sofar, of_tile(layers, read, vectors))
 
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, jnp.float32), shapes)
-    found = jax.lax.fori_loop(0, rounds, add, nothing)
-    jax.tree.map(_write, totals, found)
+    rounds = (tiles.span[1] - first + programs - 1) // programs
+    gradient, parts = jax.lax.fori_loop(0, rounds, add, nothing)
+    row = program * (totals.shape[0] // programs)
+    for place, layer in zip(layout.layers, gradient, strict=True):
+        _write_layer(totals, row, place, layer)
+    told = layout.size
+    for name, part in parts.items():
+        if name in layout.vectors:
+            _write_row(totals, row, *layout.vectors[name], jnp.sum(part, axis=0))
+        else:
+            totals[row + told] = jnp.sum(part, axis=0)
+            told += 1
 
 
-def _write(ref: Any, total: jax.Array) -> None:
-    ref[...] = total
+def _at(first: Any, shape: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
+    """Indices of an array that lies in a vector row by row, padded, and which of them it has."""
+    counts = [jnp.arange(padded_width(width)) for width in shape]
+    if len(shape) == 1:
+        return first + counts[0], counts[0] < shape[0]
+    rows, columns = counts[0][:, None], counts[1][None, :]
+    return first + rows * shape[1] + columns, (rows < shape[0]) & (columns < shape[1])
+
+
+def _read_layer(ref: Any, place: Place) -> Layer:
+    index, mask = _at(place.kernel, place.shape)
+    kernel = triton.load(ref.at[index], mask=mask, other=0.0)
+    return Layer(kernel, _read_row(ref, place.bias, place.shape[1]))
+
+
+def _read_row(ref: Any, first: int, width: int) -> jax.Array:
+    index, mask = _at(first, (width,))
+    return triton.load(ref.at[index], mask=mask, other=0.0)
+
+
+def _write_layer(ref: Any, row: jax.Array, place: Place, layer: Layer) -> None:
+    index, mask = _at(row + place.kernel, place.shape)
+    triton.store(ref.at[index], layer.kernel, mask=mask)
+    _write_row(ref, row, place.bias, place.shape[1], layer.bias)
+
+
+def _write_row(ref: Any, row: jax.Array, first: int, width: int, values: jax.Array) -> None:
+    index, mask = _at(row + first, (width,))
+    triton.store(ref.at[index], values, mask=mask)
 
 
 def _read(ref: Any, rows: jax.Array) -> jax.Array:
@@ -210,11 +277,11 @@ def _of_tile(
     loss: Loss,
     network: tuple[Layer, ...],
     samples: Samples,
-    constants: dict[str, jax.Array],
-) -> Sums:
+    vectors: dict[str, jax.Array],
+) -> tuple[tuple[Layer, ...], dict[str, jax.Array]]:
     """Forward, loss and backward of a tile: sums of the gradient, and what else is to be summed."""
     activations, output = _forward(activation, network, samples["observation"])
-    slope, parts = loss(output, samples, constants)
+    slope, parts = loss(output, samples, vectors)
     return _backward(activation, network, activations, slope), parts
 
 

@@ -6,7 +6,6 @@ G stands for groups of samples that are shuffled as one (arenas), N for the samp
 
 import functools
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import chex
@@ -14,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from jax.flatten_util import ravel_pytree
 
 from swarmjax.config import AlgoConfig
 from swarmjax.ppo import contact_price, exploration, full_batch, fused, losses, networks, normalizer
@@ -25,6 +25,8 @@ from swarmjax.ppo.normalizer import Normalizer
 # bound of normalised observations, continuous-action detail 7.
 OBSERVATION_LIMIT = 10.0
 _ADVANTAGE_EPSILON = 1e-8
+
+_METRICS = (*fused.METRICS, "grad_norm")  # of a step
 
 _Progress = tuple[Params, optax.OptState]
 
@@ -198,8 +200,12 @@ def update(
     _check(config, batch)
     samples = _samples(learner, config, batch)
     begun = (learner.params, learner.optimizer_state)
+    sizes = batch.observation.shape[-1], batch.action.shape[-1]
     # Where a step takes the whole batch, no order matters; an accelerator has it all at once.
-    if config.minibatches == 1 and jax.default_backend() == "cpu":
+    if fused.resolve(config, *sizes) == "fused":
+        progress, metrics = _learn_in_tiles(config, updates, begun, samples, key)
+        params, optimizer_state = progress
+    elif config.minibatches == 1 and jax.default_backend() == "cpu":
         learn = full_batch.in_turn(functools.partial(_learn_in_blocks, config, updates))
         (params, optimizer_state), metrics = learn(begun, samples)
     else:
@@ -291,6 +297,49 @@ def _learn_in_blocks(
     return jax.lax.scan(epoch, begun, length=config.epochs)
 
 
+def _learn_in_tiles(
+    config: AlgoConfig, updates: int, begun: _Progress, samples: Minibatch, key: jax.Array
+) -> tuple[_Progress, Metrics]:
+    """All epochs, in minibatches of tiles of valid samples; the metrics of each are [steps].
+
+    Networks and what the optimiser has of them are one vector each on the way: of a minibatch's
+    kernels most would otherwise add up, compare and move one of two dozen small arrays.
+    """
+    params, state = begun
+    flat_state = _flat_state(config, updates, *begun)
+    layouts, arranged = fused.layouts(params), full_batch.valid_first(samples)
+    launch = fused.choose_launch(config, arranged.observation.shape[-1], arranged.action.shape[-1])
+    valid = jnp.sum(arranged.valid, dtype=jnp.int32)
+    dealt = fused.shuffle(
+        jax.random.split(key, config.epochs), len(arranged.valid), valid, config.minibatches, launch
+    )
+
+    def step(progress: _Progress, span: jax.Array) -> tuple[_Progress, jax.Array]:
+        tiles = dealt._replace(span=span)
+        *found, count = fused.flat_gradient(
+            progress[0], layouts, arranged, tiles, config, valid / config.minibatches, launch=launch
+        )
+        progress, metrics = _take(config, updates, progress, (found[0], found[1]), count > 0)
+        return progress, jnp.stack([metrics[name] for name in _METRICS])
+
+    (flat, flat_state), rows = jax.lax.scan(step, (fused.flatten(params), flat_state), dealt.span)
+    learned = fused.unflatten(flat, params), _tree_state(flat_state, state)
+    return learned, dict(zip(_METRICS, rows.T, strict=True))
+
+
+def _flat_state(
+    config: AlgoConfig, updates: int, params: Params, state: optax.OptState
+) -> optax.OptState:
+    """The optimiser's state with one vector where there is a tree of each network's parameters."""
+    like = jax.eval_shape(_optimizer(config, updates).init, fused.flatten(params))
+    return jax.tree.map(lambda x, tree: ravel_pytree(tree)[0] if x.ndim else tree, like, state)
+
+
+def _tree_state(flat: optax.OptState, like: optax.OptState) -> optax.OptState:
+    """Undoes `_flat_state`."""
+    return jax.tree.map(lambda x, tree: ravel_pytree(tree)[1](x) if x.ndim else x, flat, like)
+
+
 def _epoch(
     config: AlgoConfig,
     step: functools.partial[tuple[_Progress, Metrics]],
@@ -317,16 +366,9 @@ def _step(
     minibatch: Minibatch,
 ) -> tuple[_Progress, Metrics]:
     """One step of the optimiser on a minibatch."""
-    found = _gradient(config, minibatch)(progress[0], minibatch, config, expected_valid)
+    gradient = jax.grad(losses.ppo_loss, has_aux=True)
+    found = gradient(progress[0], minibatch, config, expected_valid)
     return _take(config, updates, progress, found, jnp.any(minibatch.valid))
-
-
-def _gradient(config: AlgoConfig, minibatch: Minibatch) -> Callable[..., tuple[Params, Metrics]]:
-    """What computes the gradient of `losses.ppo_loss`, and its metrics, from its arguments."""
-    sizes = minibatch.observation.shape[-1], minibatch.action.shape[-1]
-    if fused.resolve(config, *sizes) == "fused":
-        return fused.gradient
-    return jax.grad(losses.ppo_loss, has_aux=True)
 
 
 def _take(

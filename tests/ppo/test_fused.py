@@ -5,14 +5,17 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import chex
+import hypothesis
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import strategies as st
 from jax.sharding import AbstractDevice, AbstractMesh
 
 from swarmjax.config import AlgoConfig, ConfigError
-from swarmjax.ppo import fused, fused_kernel, losses, networks
+from swarmjax.ppo import fused, fused_kernel, learner, losses, networks
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.fused_kernel import Launch
 from swarmjax.ppo.losses import Minibatch
@@ -203,35 +206,122 @@ def test_products_have_the_precision_that_jax_is_set_to(
 # Wiring
 
 
-def test_the_learner_steps_along_the_kernels_gradient(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = replace(SMALL, minibatches=4, epochs=2)
-    begun = ppo.init(jax.random.key(0), config, OBSERVATION, ACTION, 5)
-    drawn = _minibatch(begun.params, config, 8 * 20)
+def _batch(drawn: Minibatch, groups: int) -> ppo.Batch:
     names = ("observation", "action", "log_prob", "advantage", "return_", "valid")
-    batch = ppo.Batch(
-        **{name: np.reshape(x := getattr(drawn, name), (8, 20, *x.shape[1:])) for name in names}
-    )
+    cut = {n: np.reshape(x := getattr(drawn, n), (groups, -1, *x.shape[1:])) for n in names}
+    return ppo.Batch(**cut)
 
-    def update() -> tuple[Params, Any]:
-        made = jax.jit(lambda b: ppo.update(begun, config, b, jax.random.key(1), 5))(batch)
-        return made[0].params, made[1]
 
-    expected = update()
-    calls = []
+def _learn(config: AlgoConfig, begun: ppo.LearnerState, batch: ppo.Batch) -> Any:
+    """Parameters, the optimiser's state and metrics of an update."""
+    made, metrics = jax.jit(lambda b: ppo.update(begun, config, b, jax.random.key(1), 5))(batch)
+    return made.params, made.optimizer_state, metrics
 
-    def interpreted(*arguments: Any) -> Any:
+
+def _interpret(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Makes learners use the kernels, interpreted; lists each time that they are traced."""
+    calls, real = [], fused.flat_gradient
+
+    def interpreted(*arguments: Any, launch: Launch) -> Any:
         calls.append(arguments)
-        return gradient(*arguments, interpret=True)
+        return real(*arguments, launch=launch, interpret=True)
 
-    gradient = fused.gradient
     monkeypatch.setattr(fused, "resolve", lambda *_: "fused")
-    monkeypatch.setattr(fused, "gradient", interpreted)
-    found = update()
-    assert len(calls) == 1  # traced once, in a loop over minibatches
-    # Eight steps of Adam along gradients that differ by rounding.
+    monkeypatch.setattr(fused, "flat_gradient", interpreted)
+    return calls
+
+
+def _assert_learned_alike(found: Any, expected: Any) -> None:
+    """Holds steps of Adam along gradients that differ by rounding to each other."""
+    chex.assert_trees_all_equal_structs(found, expected)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), found, expected
     )
+
+
+def test_a_learner_that_takes_all_at_once_learns_as_by_autodiff(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = replace(SMALL, minibatches=1, epochs=3)
+    begun = ppo.init(jax.random.key(0), config, OBSERVATION, ACTION, 5)
+    batch = _batch(_minibatch(begun.params, config, 8 * 20), 8)
+    expected = _learn(config, begun, batch)
+    calls = _interpret(monkeypatch)
+    _assert_learned_alike(_learn(config, begun, batch), expected)
+    assert len(calls) == 1  # traced once, in a loop over steps
+
+
+def test_a_learner_steps_through_the_tiles_that_it_has_shuffled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = replace(SMALL, minibatches=4, epochs=2)
+    begun = ppo.init(jax.random.key(0), config, OBSERVATION, ACTION, 5)
+    drawn = _minibatch(begun.params, config, 32 * 80)
+    _interpret(monkeypatch)
+    found = _learn(config, begun, _batch(drawn, 32))
+
+    # By hand: about 1,800 valid samples, normalised, in tiles of 128.
+    valid = jax.tree.map(lambda x: x[np.asarray(drawn.valid)], drawn)
+    mean, std = np.mean(valid.advantage), np.std(valid.advantage)
+    valid = replace(valid, advantage=(valid.advantage - mean) / (std + 1e-8))
+    count = len(valid.valid)
+    # A new learner's moments are 0 and 1, which leave observations as they are but for 1e-8.
+    keys = jax.random.split(jax.random.key(1), config.epochs)
+    tiles = fused.shuffle(keys, 2560, jnp.int32(count), 4, fused.LARGE)
+    progress, told = (begun.params, begun.optimizer_state), []
+    for first, last in np.asarray(tiles.span):
+        chosen = np.asarray(tiles.order)[first:last]
+        rows = np.concatenate([np.arange(128 * i, min(128 * i + 128, count)) for i in chosen])
+        part = jax.tree.map(lambda x, rows=rows: x[rows], valid)
+        gradient = jax.grad(losses.ppo_loss, has_aux=True)
+        slope = gradient(progress[0], part, config, count / 4)
+        progress, metrics = learner._take(config, 5, progress, slope, jnp.bool_(True))
+        told.append(metrics)
+    means = jax.tree.map(lambda *x: np.mean(x), *told)
+    means["std"] = np.mean(np.exp(progress[0]["actor"]["log_std"]))
+    _assert_learned_alike(found, (*progress, means))
+
+
+@hypothesis.settings(deadline=None, max_examples=50)
+@hypothesis.given(
+    samples=st.integers(1, 700), share=st.floats(0.0, 1.0), minibatches=st.integers(1, 9)
+)
+def test_tiles_with_valid_samples_are_dealt_out_once_a_pass(
+    samples: int, share: float, minibatches: int
+) -> None:
+    valid = int(share * samples)
+    keys = jax.random.split(jax.random.key(samples), 3)
+    tiles = fused.shuffle(keys, samples, jnp.int32(valid), minibatches, Launch(16, 4, 4))
+    spans, used = np.asarray(tiles.span).reshape(3, minibatches, 2), -(-valid // 16)
+    dealt = [[np.asarray(tiles.order)[a:b] for a, b in one_pass] for one_pass in spans]
+    for one_pass in dealt:
+        assert sorted(np.concatenate(one_pass).tolist()) == list(range(used))
+        sizes = [len(part) for part in one_pass]
+        assert max(sizes) - min(sizes) <= 1
+    if used > 20:  # by chance once in 20!
+        assert np.any(np.concatenate(dealt[0]) != np.concatenate(dealt[1]))
+
+
+def test_what_the_kernels_tell_are_the_metrics_of_the_loss() -> None:
+    params = _params(SMALL)
+    _, expected = _expected(params, _minibatch(params, SMALL, 8), SMALL, 8.0)
+    assert sorted(expected) == list(fused.METRICS)
+
+
+@pytest.mark.parametrize("name", ["actor", "critic"])
+def test_a_layout_finds_each_parameter_in_the_vector(name: str) -> None:
+    params = _params(AlgoConfig(hidden=(16, 32)))
+    layout, flat = fused.layouts(params)[name], np.asarray(fused.flatten(params)[name])
+    network = params[name]
+    layers = [*network["torso"].values(), network["mean" if name == "actor" else "value"]]
+    for place, layer in zip(layout.layers, layers, strict=True):
+        kernel = flat[place.kernel :][: layer["kernel"].size].reshape(place.shape)
+        np.testing.assert_array_equal(kernel, layer["kernel"])
+        np.testing.assert_array_equal(flat[place.bias :][: place.shape[1]], layer["bias"])
+    for key, (first, width) in layout.vectors.items():
+        np.testing.assert_array_equal(flat[first:][:width], network[key])
+    assert list(layout.vectors) == (["log_std"] if name == "actor" else [])
+    assert layout.size == len(flat)
 
 
 @pytest.mark.parametrize(

@@ -183,8 +183,8 @@ def test_an_actor_beyond_the_range_of_commands_comes_back() -> None:
 
 def test_the_kernels_teach_the_actor_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fused, "resolve", lambda *_: "fused")
-    interpreted = functools.partial(fused.gradient, interpret=True)
-    monkeypatch.setattr(fused, "gradient", interpreted)
+    interpreted = functools.partial(fused.flat_gradient, interpret=True)
+    monkeypatch.setattr(fused, "flat_gradient", interpreted)
     probe = Probe(
         1, lambda draw, clock: draw, lambda draw, action, clock: -((action - 0.5 * draw) ** 2)
     )
