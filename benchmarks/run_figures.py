@@ -93,6 +93,7 @@ def _race(lines: Sequence[Line]) -> Figure | None:
         axes.plot(*zip(*line["curve"], strict=True), "o-", ms=3, label=line["trainer"])
     for share in (0.90, 0.95):
         axes.axhline(share, color="0.5", lw=0.8, ls="--")
-    axes.set(xlabel="seconds of training, compilation apart", ylabel="targets reached")
+    axes.set(xscale="log", xlabel="seconds of training, compilation apart")
+    axes.set(ylabel="targets reached")
     axes.legend(fontsize=8)
     return plot

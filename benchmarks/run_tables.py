@@ -94,18 +94,18 @@ def _rows(heads: Sequence[str], body: Iterable[Sequence[str]]) -> list[str]:
 
 
 def speed(value: float | None) -> str:
-    """Three digits, in thousands or millions."""
+    """Three digits, in thousands, millions or thousands of millions."""
     if value is None:
         return "-"
-    for unit, name in ((1e6, " M"), (1e3, " k")):
+    for unit, name in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
         if value >= unit:
             return f"{value / unit:.3g}{name}"
     return f"{value:.3g}"
 
 
-def seconds(value: float | None) -> str:
-    """Seconds with one digit behind the point; `-` where it never came to that."""
-    return "-" if value is None else f"{value:.1f}"
+def seconds(value: float | None, digits: int = 1) -> str:
+    """Seconds with so many digits behind the point; `-` where it never came to that."""
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def _over(
@@ -205,7 +205,7 @@ def _trainers(lines: Sequence[Line]) -> list[str]:
             speed(line["transitions_per_s"]),
             speed(line["arena_steps_per_s"]),
             seconds(line["compile_s"]),
-            *(seconds(line.get(key)) for key in ("seconds_to_0.90", "seconds_to_0.95")),
+            *(seconds(line.get(key), 2) for key in ("seconds_to_0.90", "seconds_to_0.95")),
         ]
         for line in mine
     )

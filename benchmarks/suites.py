@@ -98,12 +98,18 @@ TRAINERS = (
     Entry(
         name="race-swarmjax",
         module="race",
-        words=("trainer=swarmjax", *_TRAINED),
+        words=("trainer=swarmjax", "points=200", *_TRAINED),
     ),
     Entry(
         name="race-brax",
         module="race",
-        words=("trainer=brax", *_TRAINED),
+        words=("trainer=brax", "points=200", *_TRAINED),
+        seconds=400.0,
+    ),
+    Entry(
+        name="race-brax-playground",
+        module="race",
+        words=("trainer=brax", "settings=playground", "points=100", *_TRAINED),
         seconds=400.0,
     ),
     Entry(

@@ -262,15 +262,18 @@ def test_what_failed_and_was_not_mended_is_told() -> None:
 
 def test_tables() -> None:
     failed = {"benchmark": "b", "entry": "planar", "arenas": "64", "failed": "it died"}
-    lines = [_speed(256, 1.5e6), _speed(1024, 61.23e6), PEER, failed]
+    lines = [_speed(256, 1.5e6), _speed(1024, 61.23e6), _speed(4096, 1.234e9), PEER, failed]
     text = run_tables.markdown(lines)
     assert text.startswith("### 1 x Card\n\nCommits: `abc`.\n")
     assert (
-        "| arenas | 256 | 1,024 |\n| --- | --: | --: |\n"
-        "| swarmjax, planar, warp | 1.5 M | 61.2 M |\n| X | 999 |  |\n"
+        "| arenas | 256 | 1,024 | 4,096 |\n| --- | --: | --: | --: |\n"
+        "| swarmjax, planar, warp | 1.5 M | 61.2 M | 1.23 G |\n| X | 999 |  |  |\n"
     ) in text
     # 2048 bytes an arena are 2 KiB.
-    assert "| swarmjax, planar, warp: environment | 4.2 s, 2 KiB | 4.2 s, 2 KiB |" in text
+    assert (
+        "| swarmjax, planar, warp: environment | 4.2 s, 2 KiB | 4.2 s, 2 KiB | 4.2 s, 2 KiB |"
+        in text
+    )
     assert "| X | a step | 1 |" in text
     assert text.endswith("### Without a result\n\n- planar (arenas=64): failed: it died\n")
 
@@ -290,7 +293,7 @@ def test_trainers_and_seeds() -> None:
         "commit": "c",
     }
     text = run_tables.markdown([trainer])
-    assert "| T | 8 | 2.5 k | 500 | - | 1.2 | - |" in text
+    assert "| T | 8 | 2.5 k | 500 | - | 1.25 | - |" in text
     seeds = [
         _speed(8, 0.0)
         | {"benchmark": "command_to_success", "seed": seed, "judged": 0.96, "saved_s": 9.0}
