@@ -4,6 +4,8 @@
 ...]` also takes the keys of `swarmjax.train`, of which `algo.*` tell. For each batch it compiles
 autodiff and every launch of the kernels, times calls of them in turn, and prints a JSON line for
 each: seconds of a gradient, and how far it is from autodiff's at the same and at full precision.
+Every gradient by the kernels has the networks laid out as vectors and back in it, which learners do
+once an update.
 """
 
 import functools

@@ -7,13 +7,13 @@ discount, clip, costs and clipped gradients; both are judged by the same policy'
 levels, at `points` evenly spaced over the budget. What differs is what is Brax's own: one learning
 rate for actor and critic, which does not fall (`learning_rate`, that of our actor unless given),
 Adam's epsilon, a critic whose last layer begins as large as the others (Brax takes one
-initialisation for all), minibatches of robots instead of arenas, no bound on normalised
-observations, and no mask, so that robots that have arrived stay in its batch
-(benchmarks/brax_env.py). All of its robot steps are counted as transitions, of ours those that were
-learned from.
+initialisation for all), minibatches of robots instead of arenas or tiles of samples, no bound on
+normalised observations, no options of XLA's (`loop.compiler_options`), and no mask, so that robots
+that have arrived stay in its batch (benchmarks/brax_env.py). All of its robot steps are counted as
+transitions, of ours those that were learned from.
 
-`settings=playground` gives Brax rollouts, minibatches, discount, costs and a learning rate as
-MuJoCo Playground sets them for its walking robots, instead of ours; the networks stay.
+`settings=playground` gives Brax what MuJoCo Playground sets for its walking robots (`PLAYGROUND`)
+instead of our numbers; the networks stay.
 
 Seconds are of training alone. Brax compiles within its first two calls: these are taken to be as
 long as the median of the others, and the rest is its compile time. Judging is outside the clock of
@@ -156,10 +156,9 @@ def brax_settings(race: RaceConfig, trained: TrainConfig) -> dict[str, Any]:
     given = {"ours": _our_settings(trained), "playground": PLAYGROUND}[race.settings]
     if race.learning_rate is not None:
         given = given | {"learning_rate": race.learning_rate}
-    unroll = int(given["unroll_length"])
-    updates = _evenly(race, trained.updates * trained.algo.rollout // unroll)
+    updates = _evenly(race, _brax_updates(trained, given))
     return given | {
-        "num_timesteps": int(updates[-1]) * robots * unroll,
+        "num_timesteps": int(updates[-1]) * robots * given["unroll_length"],
         "num_envs": robots,
         "batch_size": robots // given["num_minibatches"],
         "normalize_observations": trained.algo.normalize_observations,
@@ -167,6 +166,11 @@ def brax_settings(race: RaceConfig, trained: TrainConfig) -> dict[str, Any]:
         "num_evals": race.points + 1,
         "episode_length": trained.task.step_limit,
     }
+
+
+def _brax_updates(trained: TrainConfig, given: dict[str, Any]) -> int:
+    """Rollouts of Brax's that our budget has room for."""
+    return trained.updates * trained.algo.rollout // given["unroll_length"]
 
 
 def _our_settings(trained: TrainConfig) -> dict[str, Any]:
@@ -347,15 +351,22 @@ def _check(race: RaceConfig, trained: TrainConfig) -> None:
             f"{stage.robots} robots, and Brax has no place for absent ones: give "
             f"sim.max_robots={stage.robots}."
         )
-    least = PLAYGROUND["num_minibatches"]
-    if race.settings == "playground" and trained.arenas % least:
+    updates = trained.updates
+    if race.trainer == "brax" and race.settings == "playground":
+        _check_playground(trained)
+        updates = _brax_updates(trained, PLAYGROUND)
+    if updates < race.points:
         raise config.ConfigError(
-            f"arenas is {trained.arenas}: settings=playground takes multiples of {least}."
+            f"points is {race.points}, but the budget is {updates} updates: give at most as many."
         )
-    if trained.updates < race.points:
+
+
+def _check_playground(trained: TrainConfig) -> None:
+    robots, parts = trained.arenas * trained.sim.max_robots, PLAYGROUND["num_minibatches"]
+    if robots % parts:
         raise config.ConfigError(
-            f"points is {race.points}, but the budget is {trained.updates} updates: give at most "
-            "as many."
+            f"arenas is {trained.arenas}: settings=playground takes a number of robots, {robots} "
+            f"of which there are, that {parts} divides."
         )
 
 

@@ -438,7 +438,7 @@ def _ended(arenas: EnvState, came: env.TimeStep, *, by_robot: bool) -> Ended:
 
 
 def _to_counts(ended: Ended) -> _Counts:
-    """Lays all counts [A, ...] of a step side by side [A, K]: one array to write instead of 12."""
+    """Lays all counts [A, ...] of a step side by side [A, K]: one array to write instead of 11."""
     columns = [getattr(ended, name).reshape(len(ended.reward), -1) for name in _COUNTS]
     return jnp.concatenate(columns, axis=1), ended.reward, ended.robots
 

@@ -15,6 +15,7 @@ from swarmjax.config import AlgoConfig, SimConfig, StageConfig, TaskConfig, Trai
 from swarmjax.ppo import learner as ppo
 from swarmjax.task import env
 from swarmjax.task.env import World
+from tests.sentences import refusal
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # JAXopt, which Brax imports, says that nobody keeps it up
@@ -85,6 +86,34 @@ def test_brax_is_given_playgrounds_numbers(tiny_config: TrainConfig) -> None:
     assert (found["discounting"], found["learning_rate"]) == (0.97, 3e-4)
     words = dataclasses.replace(words, learning_rate=1e-3)
     assert race.brax_settings(words, larger)["learning_rate"] == 1e-3
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            ["trainer=brax", "settings=playground", "arenas=40"],
+            "arenas is 40: settings=playground takes a number of robots, 200 of which there are, "
+            "that 32 divides.",
+        ),
+        # 32 updates of 8 control steps are 12 of 20.
+        (
+            ["trainer=brax", "settings=playground", "arenas=32", "algo.rollout=8", "budget=8192"],
+            "points is 30, but the budget is 12 updates: give at most as many.",
+        ),
+        (
+            ["arenas=40", "budget=12800"],
+            "points is 30, but the budget is 10 updates: give at most as many.",
+        ),
+        (
+            ["stage=s1"],
+            "sim.max_robots is 5, but stage s1 has 2 robots, and Brax has no place for "
+            "absent ones: give sim.max_robots=2.",
+        ),
+    ],
+)
+def test_a_race_that_cannot_be_run_is_refused(words: list[str], sentence: str) -> None:
+    assert refusal(race.parse, words) == sentence
 
 
 def test_the_judge_sees_the_policy_that_brax_trained(tiny_config: TrainConfig) -> None:

@@ -261,3 +261,14 @@ def test_newcomers_start_from_what_the_others_learned(independent: Independent) 
     for name in carried:
         np.testing.assert_array_equal(kept[name][2], untouched[name][2], err_msg=name)
         np.testing.assert_array_equal(carried[name][2], carried[name][0], err_msg=name)
+
+
+def test_xla_has_options_on_a_gpu_alone_and_knows_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert loop.compiler_options() == {}
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    options = loop.compiler_options()
+    assert options
+    lowered = jax.jit(lambda x: x + 1.0).lower(1.0)
+    assert lowered.compile(options)(1.0) == 2.0
+    with pytest.raises(Exception, match="No such compile option"):
+        lowered.compile({f"{name}_": value for name, value in options.items()})

@@ -7,7 +7,6 @@ learner in every step: learners and seeds take their turns instead.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -17,6 +16,7 @@ from swarmjax.config import AlgoConfig
 from swarmjax.ppo import losses
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
+from swarmjax.ppo.valid_first import valid_first
 
 # Samples of a block: of 100 to 6,000, with layers of 64, 250 to 400 took least CPU time.
 BLOCK = 256
@@ -53,26 +53,6 @@ def arrange(samples: Minibatch) -> Blocks:
 
     valid = jnp.sum(flat.valid, dtype=jnp.int32)
     return Blocks(jax.tree.map(cut, flat), (valid + size - 1) // size)
-
-
-def valid_first(samples: Minibatch) -> Minibatch:
-    """Lays all samples out along one axis, the valid ones first, in the order that they have.
-
-    Args:
-        samples: [G, N, ...].
-
-    Returns:
-        [G N, ...]; past the valid samples are copies of others, which are not valid.
-    """
-    groups, each = samples.valid.shape
-    within = jnp.cumsum(samples.valid, axis=1, dtype=jnp.int32)
-    before = jnp.cumsum(within[:, -1]) - within[:, -1]
-    index = jnp.arange(groups * each, dtype=jnp.int32)
-    beyond = groups * each + index  # dropped, each at a place of its own
-    place = jnp.where(samples.valid.ravel(), (before[:, None] + within - 1).ravel(), beyond)
-    source = jnp.zeros_like(index).at[place].set(index, mode="drop", unique_indices=True)
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[source], samples)
-    return replace(flat, valid=index < jnp.sum(within[:, -1]))
 
 
 def gradient(

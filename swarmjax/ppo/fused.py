@@ -17,6 +17,7 @@ import functools
 import itertools
 import math
 import re
+from dataclasses import replace
 from typing import Literal
 
 import chex
@@ -36,6 +37,8 @@ from swarmjax.ppo.networks import Params
 LAUNCH = Launch(tile=64, programs=264, warps=4)
 # Faster by 30 % on an H100 (design.md), where a program may take so much of the chip.
 LARGE = Launch(tile=128, programs=264, warps=8)
+# Of a minibatch: with fewer, one tile more or less would make minibatches too unlike.
+_LEAST_TILES = 8
 # By compute capability, bytes, where a program may have more than the least: CUDA C++ Programming
 # Guide, "Technical Specifications per Compute Capability".
 _MEMORY = {"8.0": 163 * 1024, "9.0": 227 * 1024, "10.0": 227 * 1024}
@@ -49,6 +52,7 @@ _FULL = ("highest", "float32", "F32_F32_F32")
 # What `flat_gradient` tells: the metrics of `losses.ppo_loss`.
 METRICS = ("approx_kl", "bound_loss", "clip_fraction", "entropy", "policy_loss", "value_loss")
 
+_Run = functools.partial[tuple[jax.Array, Metrics]]
 Flat = dict[str, jax.Array]  # a vector for each network, in the order of its tree's leaves
 
 
@@ -102,17 +106,22 @@ def fits(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
     return fused_kernel.fits(observation_size, config.hidden, action_size, LAUNCH.tile)
 
 
-def choose_launch(config: AlgoConfig, observation_size: int, action_size: int) -> Launch:
+def choose_launch(
+    config: AlgoConfig, observation_size: int, action_size: int, samples: int | None = None
+) -> Launch:
     """Chooses how the kernels are spread over the GPU that JAX computes on.
 
     Args:
         config: Of networks that `fits` accepts.
         observation_size: O.
         action_size: U.
+        samples: B of the batch that minibatches are dealt from; None: all of it is one.
 
     Returns:
-        `LARGE` where the chip has room for it.
+        `LARGE` where the chip has room for it, and the batch has `_LEAST_TILES` for a minibatch.
     """
+    if samples is not None and samples < _LEAST_TILES * config.minibatches * LARGE.tile:
+        return LAUNCH
     memory = _MEMORY.get(_capability(), fused_kernel.SHARED_MEMORY)
     sizes = (observation_size, config.hidden, action_size)
     return LARGE if fused_kernel.fits(*sizes, LARGE.tile, memory) else LAUNCH
@@ -158,10 +167,11 @@ def gradient(
     launch = choose_launch(config, *sizes) if launch is None else launch
     count = -(-len(minibatch.valid) // launch.tile)
     tiles = Tiles(jnp.arange(count), jnp.array([0, count]))
+    mask = minibatch.valid.astype(bool).astype(jnp.float32)
     found, metrics, _ = flat_gradient(
         flatten(params),
         layouts(params),
-        minibatch,
+        replace(minibatch, valid=mask),
         tiles,
         config,
         expected_valid,
@@ -172,17 +182,39 @@ def gradient(
 
 
 def flatten(params: Params) -> Flat:
-    """Lays each network of `params` out in one vector."""
+    """Lays each network out in one vector.
+
+    Args:
+        params: Of actor and critic.
+
+    Returns:
+        The vectors, [n] and [m], by the networks' names.
+    """
     return {name: ravel_pytree(network)[0] for name, network in params.items()}
 
 
 def unflatten(flat: Flat, like: Params) -> Params:
-    """Undoes `flatten` of parameters that have the shapes of `like`."""
+    """Undoes `flatten`.
+
+    Args:
+        flat: The vectors, [n] and [m], of parameters or of what has their shapes.
+        like: Parameters of these shapes.
+
+    Returns:
+        What `flat` holds, as `like`.
+    """
     return {name: ravel_pytree(network)[1](flat[name]) for name, network in like.items()}
 
 
 def layouts(params: Params) -> dict[str, Layout]:
-    """Says how `flatten` lays the networks out, by their names."""
+    """Says how `flatten` lays the networks out.
+
+    Args:
+        params: Of actor and critic, arrays or their shapes.
+
+    Returns:
+        The layouts, by the networks' names.
+    """
     return {
         "actor": _layout(params["actor"], "mean"),
         "critic": _layout(params["critic"], "value"),
@@ -192,7 +224,9 @@ def layouts(params: Params) -> dict[str, Layout]:
 def shuffle(
     keys: jax.Array, samples: int, valid: jax.Array, minibatches: int, launch: Launch
 ) -> Tiles:
-    """Deals the tiles that hold valid samples out to minibatches, whose sizes differ by one tile.
+    """Deals the tiles that hold valid samples out to minibatches; sizes differ by one at most.
+
+    Where there are fewer of them than minibatches, some minibatches have none.
 
     Args:
         keys: [E] random keys, one for each pass over the samples, consumed.
@@ -210,10 +244,9 @@ def shuffle(
 
     def order(key: jax.Array) -> jax.Array:
         # The last number is kept for tiles without a valid sample, which sort to the end.
-        bits = jnp.minimum(jax.random.bits(key, (count,)), jnp.uint32(2**32 - 2))
+        bits = jnp.minimum(jax.random.bits(key, (count,), jnp.uint32), jnp.uint32(2**32 - 2))
         return jax.lax.sort_key_val(jnp.where(index < used, bits, jnp.uint32(2**32 - 1)), index)[1]
 
-    # Rounded down, so that whole tiles are dealt out: M bounds from 0 to `used`.
     share, rest = used // minibatches, used % minibatches
     parts = jnp.arange(minibatches + 1, dtype=jnp.int32)
     bounds = parts * share + jnp.minimum(parts, rest)
@@ -240,7 +273,7 @@ def flat_gradient(
     Args:
         flat: What `flatten` returned.
         layout: What `layouts` returned, of layers that `fits` accepts.
-        samples: B samples.
+        samples: B samples; `valid` is float32, 0 or 1, lest it be converted at every step.
         tiles: Of `launch.tile` samples, the minibatch.
         config: Clip range and costs.
         expected_valid: [], as `losses.ppo_loss` takes it.
@@ -262,20 +295,8 @@ def flat_gradient(
         launch=launch,
         interpret=interpret,
     )
-    names = ("observation", "action", "log_prob", "advantage")
-    size = samples.action.shape[1]
-    actor, surrogate = run(
-        flat["actor"],
-        layout["actor"],
-        loss=functools.partial(_surrogate, config, size),
-        samples=_samples(samples, names),
-    )
-    critic, error = run(
-        flat["critic"],
-        layout["critic"],
-        loss=_half_square,
-        samples=_samples(samples, ("observation", "return_")),
-    )
+    actor, surrogate = _actor_sums(run, flat["actor"], layout["actor"], samples, config)
+    critic, error = _critic_sums(run, flat["critic"], layout["critic"], samples)
     count = error.pop("valid")
     weight = count * share  # in a mean, of what all have in common
     first, width = layout["actor"].vectors["log_std"]
@@ -287,6 +308,23 @@ def flat_gradient(
         "critic": critic * (config.value_cost * share),
     }
     return found, metrics, count
+
+
+def _actor_sums(
+    run: _Run, actor: jax.Array, layout: Layout, samples: Minibatch, config: AlgoConfig
+) -> tuple[jax.Array, Metrics]:
+    """Sums over samples of the surrogate's gradient, and of metrics."""
+    loss = functools.partial(_surrogate, config, samples.action.shape[1])
+    names = ("observation", "action", "log_prob", "advantage", "valid")
+    return run(actor, layout, loss=loss, samples=_samples(samples, names))
+
+
+def _critic_sums(
+    run: _Run, critic: jax.Array, layout: Layout, samples: Minibatch
+) -> tuple[jax.Array, Metrics]:
+    """Sums over samples of the gradient of half the squared error, of that, and of `valid`."""
+    names = ("observation", "return_", "valid")
+    return run(critic, layout, loss=_half_square, samples=_samples(samples, names))
 
 
 def _with_entropy(
@@ -331,8 +369,7 @@ def _check(samples: Minibatch, layout: dict[str, Layout], config: AlgoConfig) ->
 
 
 def _samples(samples: Minibatch, names: tuple[str, ...]) -> Samples:
-    chosen = {name: getattr(samples, name).astype(jnp.float32) for name in names}
-    return chosen | {"valid": samples.valid.astype(bool).astype(jnp.float32)}
+    return {name: getattr(samples, name).astype(jnp.float32) for name in names}
 
 
 def _surrogate(

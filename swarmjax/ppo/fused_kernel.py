@@ -59,7 +59,7 @@ class Launch(NamedTuple):
 
     Attributes:
         tile: samples of a tile, a power of two of at least `LEAST_WIDTH`.
-        programs: programs of the grid, at most; fewer where there are fewer tiles.
+        programs: programs of the grid, at most; no more than there are tiles to choose from.
         warps: warps of a program.
     """
 
@@ -96,7 +96,7 @@ class Tiles(NamedTuple):
 
 # Samples of a tile by name, each [tile] or [tile, width], zero past the last sample.
 Samples = dict[str, jax.Array]
-# (output of the network [tile, width], samples, constants) -> (derivative of the loss with respect
+# (output of the network [tile, width], samples, vectors) -> (derivative of the loss with respect
 # to the output [tile, width], what else is to be summed over all samples, each [tile, ...]).
 Loss = Callable[[jax.Array, Samples, dict[str, jax.Array]], tuple[jax.Array, dict[str, jax.Array]]]
 

@@ -1,7 +1,8 @@
 """One PPO learner: its state, how it acts and how it learns.
 
 All functions are pure and serve a single learner; `jax.vmap` over state, batch and key serves L.
-G stands for groups of samples that are shuffled as one (arenas), N for the samples of a group.
+G stands for groups of samples (arenas), N for the samples of a group. Minibatches are of whole
+groups or, by the kernels of `fused`, of whole tiles of valid samples.
 """
 
 import functools
@@ -20,6 +21,7 @@ from swarmjax.ppo import contact_price, exploration, full_batch, fused, losses, 
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
 from swarmjax.ppo.normalizer import Normalizer
+from swarmjax.ppo.valid_first import valid_first
 
 # Huang et al. 2022, "The 37 Implementation Details of Proximal Policy Optimization":
 # bound of normalised observations, continuous-action detail 7.
@@ -183,7 +185,8 @@ def update(
 
     The batch's observations were normalised, and its log densities computed, by the normalizer as
     it is before this update. All epochs keep to that one, so that the ratio of new to old density
-    starts at 1; only then does the normalizer take in the batch. A minibatch without a
+    starts at 1; only then does the normalizer take in the batch. By the kernels of `fused`, there
+    may be fewer tiles of valid samples than minibatches. A minibatch without a
     valid sample is no step: it moves neither the parameters nor the learning rate's schedule.
 
     Args:
@@ -201,11 +204,11 @@ def update(
     samples = _samples(learner, config, batch)
     begun = (learner.params, learner.optimizer_state)
     sizes = batch.observation.shape[-1], batch.action.shape[-1]
-    # Where a step takes the whole batch, no order matters; an accelerator has it all at once.
     if fused.resolve(config, *sizes) == "fused":
         progress, metrics = _learn_in_tiles(config, updates, begun, samples, key)
         params, optimizer_state = progress
     elif config.minibatches == 1 and jax.default_backend() == "cpu":
+        # Where a step takes the whole batch, no order matters; an accelerator has it all at once.
         learn = full_batch.in_turn(functools.partial(_learn_in_blocks, config, updates))
         (params, optimizer_state), metrics = learn(begun, samples)
     else:
@@ -307,19 +310,20 @@ def _learn_in_tiles(
     """
     params, state = begun
     flat_state = _flat_state(config, updates, *begun)
-    layouts, arranged = fused.layouts(params), full_batch.valid_first(samples)
-    launch = fused.choose_launch(config, arranged.observation.shape[-1], arranged.action.shape[-1])
+    layouts, arranged = fused.layouts(params), valid_first(samples)
     valid = jnp.sum(arranged.valid, dtype=jnp.int32)
-    dealt = fused.shuffle(
-        jax.random.split(key, config.epochs), len(arranged.valid), valid, config.minibatches, launch
-    )
+    arranged = replace(arranged, valid=arranged.valid.astype(jnp.float32))
+    count, size = arranged.observation.shape
+    launch = fused.choose_launch(config, size, arranged.action.shape[-1], count)
+    keys = jax.random.split(key, config.epochs)
+    dealt = fused.shuffle(keys, count, valid, config.minibatches, launch)
 
     def step(progress: _Progress, span: jax.Array) -> tuple[_Progress, jax.Array]:
         tiles = dealt._replace(span=span)
-        *found, count = fused.flat_gradient(
+        gradient, metrics, taken = fused.flat_gradient(
             progress[0], layouts, arranged, tiles, config, valid / config.minibatches, launch=launch
         )
-        progress, metrics = _take(config, updates, progress, (found[0], found[1]), count > 0)
+        progress, metrics = _take(config, updates, progress, (gradient, metrics), taken > 0)
         return progress, jnp.stack([metrics[name] for name in _METRICS])
 
     (flat, flat_state), rows = jax.lax.scan(step, (fused.flatten(params), flat_state), dealt.span)

@@ -19,6 +19,7 @@ def _batch(share: float, seed: int = 0) -> Minibatch:
     """Samples [G, N, ...] of which about this share is valid, zero where not."""
     rng = np.random.default_rng(seed)
     valid = rng.uniform(size=(GROUPS, SAMPLES)) < share
+    valid[0, 0] |= share > 0.0  # what fills gaps up must not count again
     drawn = {
         "observation": rng.normal(size=(GROUPS, SAMPLES, OBSERVATION)),
         "action": rng.normal(size=(GROUPS, SAMPLES, ACTION)),

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from jax.sharding import AbstractDevice, AbstractMesh
 
 from swarmjax.config import AlgoConfig, ConfigError
-from swarmjax.ppo import fused, fused_kernel, learner, losses, networks
+from swarmjax.ppo import fused, fused_kernel, losses, networks
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.fused_kernel import Launch
 from swarmjax.ppo.losses import Minibatch
@@ -59,7 +59,7 @@ def _minibatch(params: Params, config: AlgoConfig, size: int, seed: int = 0) -> 
         log_prob=np.asarray(log_prob, np.float32),
         advantage=random.normal(size=size).astype(np.float32),
         return_=random.normal(size=size).astype(np.float32),
-        valid=random.uniform(size=size) < 0.7,
+        valid=(random.uniform(size=size) < 0.7) | (np.arange(size) == 0),
     )
 
 
@@ -256,30 +256,64 @@ def test_a_learner_steps_through_the_tiles_that_it_has_shuffled(
 ) -> None:
     config = replace(SMALL, minibatches=4, epochs=2)
     begun = ppo.init(jax.random.key(0), config, OBSERVATION, ACTION, 5)
-    drawn = _minibatch(begun.params, config, 32 * 80)
+    drawn = _minibatch(begun.params, config, 32 * 40)
     _interpret(monkeypatch)
     found = _learn(config, begun, _batch(drawn, 32))
 
-    # By hand: about 1,800 valid samples, normalised, in tiles of 128.
+    # By hand: about 900 valid samples, normalised, in tiles of 64.
     valid = jax.tree.map(lambda x: x[np.asarray(drawn.valid)], drawn)
     mean, std = np.mean(valid.advantage), np.std(valid.advantage)
     valid = replace(valid, advantage=(valid.advantage - mean) / (std + 1e-8))
     count = len(valid.valid)
     # A new learner's moments are 0 and 1, which leave observations as they are but for 1e-8.
     keys = jax.random.split(jax.random.key(1), config.epochs)
-    tiles = fused.shuffle(keys, 2560, jnp.int32(count), 4, fused.LARGE)
+    tiles = fused.shuffle(keys, 1280, jnp.int32(count), 4, fused.LAUNCH)
     progress, told = (begun.params, begun.optimizer_state), []
     for first, last in np.asarray(tiles.span):
         chosen = np.asarray(tiles.order)[first:last]
-        rows = np.concatenate([np.arange(128 * i, min(128 * i + 128, count)) for i in chosen])
+        rows = np.concatenate([np.arange(64 * i, min(64 * i + 64, count)) for i in chosen])
         part = jax.tree.map(lambda x, rows=rows: x[rows], valid)
         gradient = jax.grad(losses.ppo_loss, has_aux=True)
         slope = gradient(progress[0], part, config, count / 4)
-        progress, metrics = learner._take(config, 5, progress, slope, jnp.bool_(True))
+        progress, metrics = ppo._take(config, 5, progress, slope, jnp.bool_(True))
         told.append(metrics)
     means = jax.tree.map(lambda *x: np.mean(x), *told)
     means["std"] = np.mean(np.exp(progress[0]["actor"]["log_std"]))
     _assert_learned_alike(found, (*progress, means))
+
+
+def test_minibatches_without_a_valid_sample_are_no_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = replace(SMALL, minibatches=4, epochs=3)
+    begun = ppo.init(jax.random.key(0), config, OBSERVATION, ACTION, 5)
+    drawn = _minibatch(begun.params, config, 8 * 40)
+    _interpret(monkeypatch)
+    few = replace(drawn, valid=drawn.valid & (np.arange(8 * 40) < 80))  # one tile of 64
+    params, state, _ = _learn(config, begun, _batch(few, 8))
+    counts = [int(leaf) for leaf in jax.tree.leaves(state) if leaf.ndim == 0]
+    assert counts == [3] * len(counts)  # one step a pass
+    after = replace(begun, params=params, optimizer_state=state)
+    none = replace(drawn, valid=np.zeros(8 * 40, bool))
+    still = _learn(config, after, _batch(none, 8))
+    chex.assert_trees_all_equal((params, state), still[:2])
+
+
+def test_learners_side_by_side_learn_as_each_does_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = replace(SMALL, minibatches=2, epochs=2)
+    _interpret(monkeypatch)
+    begun, batches = [], []
+    for seed, share in enumerate((1.0, 0.4, 0.0)):
+        begun.append(ppo.init(jax.random.key(seed), config, OBSERVATION, ACTION, 5))
+        drawn = _minibatch(begun[-1].params, config, 8 * 20, seed)
+        batches.append(_batch(replace(drawn, valid=np.arange(8 * 20) < share * 8 * 20), 8))
+
+    def update(learner: ppo.LearnerState, batch: ppo.Batch) -> ppo.LearnerState:
+        return ppo.update(learner, config, batch, jax.random.key(3), 5)[0]
+
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *zip(begun, batches, strict=True))
+    together = jax.jit(jax.vmap(update))(*stacked)
+    for lane, (one, batch) in enumerate(zip(begun, batches, strict=True)):
+        mine = jax.tree.map(lambda x, i=lane: x[i], together)
+        chex.assert_trees_all_close(mine, jax.jit(update)(one, batch), atol=1e-6)  # rounding
 
 
 @hypothesis.settings(deadline=None, max_examples=50)
@@ -395,6 +429,15 @@ def test_tiles_are_as_large_as_the_chip_takes(
     _on(monkeypatch, compute_capability=capability)
     found = fused.choose_launch(AlgoConfig(hidden=hidden), OBSERVATION, ACTION)
     assert found == expected
+
+
+@pytest.mark.parametrize(("samples", "expected"), [(8191, fused.LAUNCH), (8192, fused.LARGE)])
+def test_a_small_batch_has_small_tiles(
+    samples: int, expected: Launch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _on(monkeypatch, compute_capability="9.0")
+    config = AlgoConfig(minibatches=8)  # 8 tiles of 128 a minibatch are 8,192 samples
+    assert fused.choose_launch(config, OBSERVATION, ACTION, samples) == expected
 
 
 def test_full_precision_is_left_to_autodiff(monkeypatch: pytest.MonkeyPatch) -> None:
