@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Trains policies on the real body on one NVIDIA GPU, by one command:
 #   bash launch/policy.sh DIR [key=value ...]     e.g. bash launch/policy.sh runs/policy seeds=5 seed=300
-# Five seeds side by side took 65 s on an H100 with their program compiled before, 38 s of it training;
+# Five seeds side by side took 54 s on an H100 with their program compiled before, 34 s of it training;
 # compiling takes half a minute more, once. Keys given here win over those below.
 # docs/results.md says what was measured of this, and of others.
 set -euo pipefail
