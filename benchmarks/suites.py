@@ -168,6 +168,13 @@ ON_CPU = tuple(
         Entry(name="cpu_paper_way", module="cpu_paper_way", words=("seconds=30",)),
         Entry(name="cpu_sb3", module="cpu_sb3", words=("seconds=30",)),
         Entry(
+            name="cpu-benchmarl",
+            module="peer_benchmarl",
+            words=("device=cpu",),
+            over="arenas",
+            values=("64",),
+        ),
+        Entry(
             name="cpu-success",
             module="command_to_success",
             over="seed",
