@@ -402,7 +402,8 @@ class AlgoConfig(Section):
     gradient: Literal["auto", "autodiff", "fused"] = field(
         default="auto",
         metadata=about(
-            "how the gradient is computed; auto: fused on an NVIDIA GPU where the layers fit it"
+            "how gradients are computed; fused: also, minibatches of tiles of valid samples; "
+            "auto: fused on an NVIDIA GPU where the layers fit it"
         ),
     )
     contact_limit: float | None = field(
