@@ -25,8 +25,9 @@ from jax.errors import JaxRuntimeError
 from benchmarks import peers, timing
 from swarmjax import command, config, provenance, rollout
 from swarmjax.config import AlgoConfig
-from swarmjax.ppo import fused, losses, networks
-from swarmjax.ppo.fused_kernel import Launch
+from swarmjax.ppo import losses, networks
+from swarmjax.ppo.fast import fused
+from swarmjax.ppo.fast.kernel import Launch
 from swarmjax.ppo.losses import Minibatch
 from swarmjax.ppo.networks import Params
 from swarmjax.settings import Section, about

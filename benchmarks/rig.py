@@ -14,7 +14,7 @@ from swarmjax.config import RobotConfig
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.body import AS_BUILT, Body
-from swarmjax.sim.geom import FLOOR_GROUP, HULL_GROUP
+from swarmjax.sim.geometry import FLOOR_GROUP, HULL_GROUP
 
 CONTROL_STEP = 0.032  # s; Webots basicTimeStep
 # Physics steps of a control step, as swarmjax.evaluate has them.

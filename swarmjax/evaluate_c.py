@@ -26,10 +26,10 @@ from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps, noise
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.noise import Stream
+from swarmjax.task import electronics, level, observation
 from swarmjax.task import factors as task_factors
-from swarmjax.task import level, observation, senses
+from swarmjax.task.electronics import Memory, Sight
 from swarmjax.task.factors import Factors
-from swarmjax.task.senses import Memory, Sight
 
 
 class Arenas(NamedTuple):
@@ -122,7 +122,7 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     data[:] = [place(judge, *each) for each in zip(model, pose, obstacle, side, strict=True)]
     outcome = _no_outcome(len(levels), judge.spacing.robots)
     sight = look(judge, data, factors, pose, target, obstacle)
-    memory, seen = senses.begin(judge.electronics, factors, sight, outcome.clock, np)
+    memory, seen = electronics.begin(judge.electronics, factors, sight, outcome.clock, np)
     return Arenas(
         model=model,
         data=data,
@@ -160,7 +160,7 @@ def _no_outcome(count: int, robots: int) -> Outcome:
 def _models(judge: Judge, factors: Factors, count: int) -> np.ndarray:
     """Returns the models [A] of arenas, each with the robots that its episode has."""
     models = np.full(count, judge.model, object)
-    chassis = senses.chassis(factors)
+    chassis = electronics.chassis(factors)
     if all(part is None for part in chassis):
         return models
     body = sim_model.BODIES[judge.config.robot.body]
@@ -225,7 +225,7 @@ def step(judge: Judge, arenas: Arenas) -> Arenas:
     gap = np.where(touches, 0.0, np.inf)
     begins, apart = gaps.count_contacts(gap, arenas.apart, task.control_step, np)
     clock = arenas.outcome.clock + 1
-    memory, seen = senses.sense(judge.electronics, memory, arenas.factors, sight, clock, np)
+    memory, seen = electronics.sense(judge.electronics, memory, arenas.factors, sight, clock, np)
     step = _Step(active, arrives, begins, touches, impulse, sight.ray < task.sensor_range)
     anchor, outcome = _tally(arenas, pose, step)
     return arenas._replace(
@@ -275,7 +275,7 @@ def _drive(
         Memory, new poses [A, R, 3], and impulses [A, R, 3] (N s) by kind of contact.
     """
     wanted = sim_drive.command(_act(judge, arenas), judge.drive, np)
-    memory, wheels = senses.drive(
+    memory, wheels = electronics.drive(
         judge.electronics,
         arenas.memory,
         arenas.factors,
@@ -286,7 +286,7 @@ def _drive(
     )
     wheels = np.where(active[..., None], wheels, 0.0)
     body, robot = sim_model.BODIES[judge.config.robot.body], judge.config.robot
-    ctrl = body.ctrl(wheels, senses.chassis(arenas.factors), robot, np)
+    ctrl = body.ctrl(wheels, electronics.chassis(arenas.factors), robot, np)
     pushes: list[_Pushes] = []
     for each in zip(arenas.model, arenas.data, ctrl, strict=True):
         pushes += _advance(judge, *each)
@@ -401,7 +401,7 @@ def look(
     Returns:
         What the sensors have before them.
     """
-    mount, shades = senses.mount(factors), senses.reflectance(factors)
+    mount, shades = electronics.mount(factors), electronics.reflectance(factors)
     ray, geom = evaluate_rays.cast_rays(judge.scene, data, pose, obstacle, mount)
     bright = None if shades is None else evaluate_rays.brightness(judge.scene, shades, geom)
     return Sight(ray, bright, *observation.to_target(pose, target, np))

@@ -13,10 +13,11 @@ from swarmjax.policy import Policy, PolicyError
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps
 from swarmjax.sim import model as sim_model
+from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors as task_factors
-from swarmjax.task import level, observation, senses, shapes
+from swarmjax.task import level, observation, shapes
 from swarmjax.task import stage as task_stage
-from swarmjax.task.senses import Electronics
+from swarmjax.task.electronics import Electronics
 
 SOLVER_ITERATIONS = 100  # MuJoCo's own default: until its tolerance of 1e-8 is met
 
@@ -76,7 +77,7 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
     example = shapes.expand(draw_level(stage, spacing, config.seed, 0), config.shape)
     compiled, ids = _compile(config, example.obstacle[:, 3:] if half is None else half)
     geom_robot, geom_kind = _geoms(compiled, ids)
-    electronics = senses.load(config.task, config.realism, trained.encoding)
+    electronics = task_electronics.load(config.task, config.realism, trained.encoding)
     return Judge(
         config=config,
         policy=trained,

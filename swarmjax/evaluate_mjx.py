@@ -34,7 +34,7 @@ from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.sim import noise, physics
 from swarmjax.sim.noise import Stream
-from swarmjax.task import env, level, senses
+from swarmjax.task import electronics, env, level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
 from swarmjax.task.level import Level, Spacing
@@ -196,7 +196,7 @@ def play(
 def _program(
     world: World,
     steps: int,
-    encoding: senses.Encoding,
+    encoding: electronics.Encoding,
     limits: tuple[float, float],
     activation: str,
     limit: float,
@@ -207,7 +207,7 @@ def _program(
     mine = replace(
         world,
         drive=world.drive._replace(max_speed=speed, max_turn_rate=turn_rate),
-        electronics=senses.load(config.task, config.realism, encoding),
+        electronics=electronics.load(config.task, config.realism, encoding),
     )
 
     def play(weights: Any, log_std: Array, levels: Level) -> tuple[dict[str, Array], Array]:

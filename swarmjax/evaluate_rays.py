@@ -9,7 +9,7 @@ import numpy as np
 from swarmjax import epuck
 from swarmjax.sim import infrared
 from swarmjax.sim import model as sim_model
-from swarmjax.sim.geom import FLOOR_GROUP, HULL_GROUP
+from swarmjax.sim.geometry import FLOOR_GROUP, HULL_GROUP
 
 # Rays pass through contact spheres, wheels, skids and floor.
 _RAY_GROUPS = np.array([i not in (HULL_GROUP, FLOOR_GROUP) for i in range(6)], np.uint8)

@@ -18,8 +18,8 @@ from swarmjax import episodes, promotion, rollout
 from swarmjax.config import TrainConfig
 from swarmjax.curriculum import Curriculum, Decision, Mode, Schedule
 from swarmjax.curriculum_modes import MODES
-from swarmjax.ppo import fused
 from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.fast import fused
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.rollout import Ended
 from swarmjax.sim import gaps

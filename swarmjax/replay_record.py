@@ -11,7 +11,7 @@ from swarmjax.config import RewardConfig
 from swarmjax.evaluate_c import Arenas, Judge
 from swarmjax.policy import Policy, PolicyError
 from swarmjax.sim import gaps, infrared
-from swarmjax.task import senses
+from swarmjax.task import electronics
 from swarmjax.task.level import Level
 
 
@@ -168,7 +168,7 @@ def record(
     """
     earning = weights(judge.policy, judge.config.task)
     arenas = evaluate_c.start(judge, levels)
-    mount = senses.mount(arenas.factors)
+    mount = electronics.mount(arenas.factors)
     frames = [_look(judge, arenas)]
     while len(frames) <= judge.config.steps and not frames[-1].arrived.all():
         arenas = evaluate_c.step(judge, arenas)

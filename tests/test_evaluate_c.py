@@ -29,7 +29,7 @@ from swarmjax.evaluate_c import Arenas
 from swarmjax.evaluate_judge import Judge
 from swarmjax.policy import PolicyError
 from swarmjax.sim import gaps, infrared, model, noise, physics
-from swarmjax.task import env, observation, senses, shapes
+from swarmjax.task import electronics, env, observation, shapes
 from swarmjax.task.env import EnvState, TimeStep, World
 from swarmjax.task.level import Level
 
@@ -514,7 +514,7 @@ def test_the_judge_sees_how_bright_each_thing_is(tmp_path: Path) -> None:
         for name in ("start", "side", "obstacle")
     )
     args = (arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)
-    sight, shades = evaluate_c.look(judge, *args), senses.reflectance(arenas.factors)
+    sight, shades = evaluate_c.look(judge, *args), electronics.reflectance(arenas.factors)
     assert shades is not None
     assert sight.reflectance is not None
     ray, bright = infrared.sights(pose, side, box, 0.037, 0.1, shades, None, np)

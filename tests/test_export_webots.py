@@ -20,7 +20,8 @@ from swarmjax import export_webots as webots
 from swarmjax.config import RealismConfig, RobotConfig, TaskConfig
 from swarmjax.policy import Policy
 from swarmjax.sim import drive, response
-from swarmjax.task import factors, observation, senses
+from swarmjax.task import electronics as task_electronics
+from swarmjax.task import factors, observation
 
 # What a controller sees of Webots: written from the manual's names and units. It plays a script,
 # {"basic": ms, "custom": text, "missing": [names], "steps": [{"counts": [8], "gps": [3],
@@ -165,11 +166,11 @@ def _chain(
     """Wheel speeds [T, R, 2] that `evaluate` comes to there, with sensors of that response."""
     pose, ray = (np.array(part)[:, None] for part in zip(*scenes, strict=True))
     realism = RealismConfig(infrared=answers)
-    electronics = senses.load(TaskConfig(), realism, encoding=trained.encoding)
+    electronics = task_electronics.load(TaskConfig(), realism, encoding=trained.encoding)
     distance, bearing = observation.to_target(pose, np.array([target], np.float32), np)
-    sight = senses.Sight(ray, None, distance, bearing)
+    sight = task_electronics.Sight(ray, None, distance, bearing)
     none = factors.Factors(**dict.fromkeys(factors.Factors._fields))
-    _, seen = senses.begin(electronics, none, sight, np.zeros(len(scenes)), np)
+    _, seen = task_electronics.begin(electronics, none, sight, np.zeros(len(scenes)), np)
     robots = np.repeat(seen, len(trained.mean), axis=1)
     robot = drive.from_config(RobotConfig())
     command = drive.command(policy.act(trained, robots), robot, np)

@@ -17,11 +17,13 @@ from flax import struct
 from jax.flatten_util import ravel_pytree
 
 from swarmjax.config import AlgoConfig
-from swarmjax.ppo import contact_price, exploration, full_batch, fused, losses, networks, normalizer
+from swarmjax.ppo import contact_price, exploration, losses, networks, normalizer
+from swarmjax.ppo.fast import blocks as full_batch
+from swarmjax.ppo.fast import fused
+from swarmjax.ppo.fast.valid_first import valid_first
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
 from swarmjax.ppo.normalizer import Normalizer
-from swarmjax.ppo.valid_first import valid_first
 
 # Huang et al. 2022, "The 37 Implementation Details of Proximal Policy Optimization":
 # bound of normalised observations, continuous-action detail 7.

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from swarmjax.sim.fast.unroll import least, pieces
 from swarmjax.sim.infrared import Box, to_box_frame, turned
-from swarmjax.sim.pieces import least, pieces
 
 Array = Any
 KINDS = ("robot", "obstacle", "wall")  # the last axis of gaps and contacts

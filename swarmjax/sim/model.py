@@ -13,7 +13,7 @@ import numpy as np
 from swarmjax import epuck
 from swarmjax.config import RobotConfig
 from swarmjax.sim.body import Body, Rows, find_rows
-from swarmjax.sim.geom import add_geom, add_ray_hull
+from swarmjax.sim.geometry import add_geom, add_ray_hull
 from swarmjax.sim.planar import PLANAR
 from swarmjax.sim.wheeled import WHEELED
 

@@ -21,10 +21,10 @@ import numpy as np
 from jax import Array
 
 from swarmjax.config import ConfigError, RobotConfig
-from swarmjax.sim import discs as sim_discs
 from swarmjax.sim import model as sim_model
-from swarmjax.sim import solver_planar_jax
 from swarmjax.sim.body import AS_BUILT, Body, Chassis
+from swarmjax.sim.fast import discs as sim_discs
+from swarmjax.sim.fast import planar_jax
 
 # Iterations and line-search steps at most; see docs/design.md for what was measured. MJX's Newton
 # method by `jax` is cut off where it is near enough; all else has room to converge.
@@ -180,7 +180,7 @@ def load(
     limits = _limits(model, len(ids.hull_body), arenas) if impl == "warp" else {}
     if solver == "swarm":
         model = copy.copy(model)
-        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE  # as solver_wheeled reads it
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE  # as wheeled_warp reads it
     mjx = _mjx()
     template = mjx.make_data(model, impl=impl, **limits)
     device_model = mjx.put_model(model, impl=impl)
@@ -199,18 +199,18 @@ def _mjx() -> Any:
 def _push_apart(impl: str) -> sim_discs.Solve:
     """What solves for the contacts of discs."""
     if impl == "jax":
-        return solver_planar_jax.push_apart
-    from swarmjax.sim import solver_planar  # needs Warp
+        return planar_jax.push_apart
+    from swarmjax.sim.fast import planar_warp  # needs Warp
 
-    return solver_planar.push_apart
+    return planar_warp.push_apart
 
 
 def _with_wheeled_solver(model: Model) -> Model:
     """Lets a model be stepped by the solver that is made for wheeled robots."""
-    from swarmjax.sim import solver, solver_wheeled  # need Warp
+    from swarmjax.sim.fast import warp_step, wheeled_warp  # need Warp
 
-    solver.install()
-    return model.tree_replace({"opt.solver": solver_wheeled.NUMBER})
+    warp_step.install()
+    return model.tree_replace({"opt.solver": wheeled_warp.NUMBER})
 
 
 def _limits(model: mujoco.MjModel, robots: int, arenas: int) -> dict[str, int]:

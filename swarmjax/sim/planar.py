@@ -18,7 +18,7 @@ from swarmjax import epuck
 from swarmjax.config import RobotConfig
 from swarmjax.sim.body import Body, Changes, Chassis, Rows, Servos, scale_mass
 from swarmjax.sim.drive import body_velocity
-from swarmjax.sim.geom import add_hull
+from swarmjax.sim.geometry import add_hull
 
 Array = Any
 _SERVOS = "forward", "lateral", "turn"

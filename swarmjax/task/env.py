@@ -17,12 +17,13 @@ from swarmjax.config import TrainConfig, substeps
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps as sim_gaps
 from swarmjax.sim import infrared, model, physics
+from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors as task_factors
-from swarmjax.task import observation, reward, senses
+from swarmjax.task import observation, reward
 from swarmjax.task import stage as task_stage
+from swarmjax.task.electronics import Electronics, Memory, Sight
 from swarmjax.task.factors import Factors
 from swarmjax.task.level import Level, Spacing
-from swarmjax.task.senses import Electronics, Memory, Sight
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +154,7 @@ def load(config: TrainConfig) -> World:
     spacing = Spacing(
         sim.max_robots, sim.max_obstacles, config.robot.hull_radius, config.task.target_radius
     )
-    electronics = senses.load(config.task, config.realism)
+    electronics = task_electronics.load(config.task, config.realism)
     return World(config, engine, spacing, sim_drive.from_config(config.robot), electronics)
 
 
@@ -184,7 +185,7 @@ def reset(world: World, level: Level, stage: Array, cohort: Array) -> EnvState:
     factors = task_factors.draw(level.seed, realism, robot, robots, obstacles, jnp)
     sight = _look(world, level.start, level, factors)
     clock = jnp.zeros((), jnp.int32)
-    memory, seen = senses.begin(world.electronics, factors, sight, clock, jnp)
+    memory, seen = task_electronics.begin(world.electronics, factors, sight, clock, jnp)
     return EnvState(
         sim=physics.rest(world.physics, level.start),
         level=level,
@@ -227,7 +228,9 @@ def step(world: World, state: EnvState, action: Array) -> tuple[EnvState, TimeSt
     clock = state.clock + 1
     data, memory, pose, sound = _move(world, state, action, active)
     sight = _look(world, pose, state.level, state.factors)
-    memory, seen = senses.sense(world.electronics, memory, state.factors, sight, clock, jnp)
+    memory, seen = task_electronics.sense(
+        world.electronics, memory, state.factors, sight, clock, jnp
+    )
     arrives = active & (sight.distance <= world.config.task.target_radius)
     gap = sim_gaps.gaps(
         pose, state.level.side, state.level.obstacle, world.config.robot.hull_radius, jnp
@@ -280,11 +283,11 @@ def _move(
     """
     found, level = state.factors, state.level
     command = sim_drive.command(action, world.drive, jnp)
-    memory, wheels = senses.drive(
+    memory, wheels = task_electronics.drive(
         world.electronics, state.memory, found, command, world.drive, state.clock, jnp
     )
     wheels = jnp.where(active[:, None], wheels, 0.0)
-    chassis = senses.chassis(found)
+    chassis = task_electronics.chassis(found)
     data = physics.step(world.physics, state.sim, level.side, level.obstacle, wheels, chassis)
     sound = physics.is_finite(data)
     # What follows stays finite: an arena that broke is seen where it last was, and reset.
@@ -296,7 +299,7 @@ def _look(world: World, pose: Array, level: Level, factors: Factors) -> Sight:
     """Works out what there is to be sensed at poses [R, 3]."""
     distance, bearing = observation.to_target(pose, level.target, jnp)
     radius, reach = world.config.robot.hull_radius, world.electronics.reach
-    mount, shades = senses.mount(factors), senses.reflectance(factors)
+    mount, shades = task_electronics.mount(factors), task_electronics.reflectance(factors)
     arena = (pose, level.side, level.obstacle, radius, reach)
     if shades is None:
         ray, bright = infrared.distances(*arena, jnp, mount), None

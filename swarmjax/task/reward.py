@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from swarmjax.config import RewardConfig
+from swarmjax.sim.fast.unroll import least, pieces
 from swarmjax.sim.gaps import KINDS
-from swarmjax.sim.pieces import least, pieces
 
 
 class Step(NamedTuple):

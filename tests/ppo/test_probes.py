@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from swarmjax.config import AlgoConfig
-from swarmjax.ppo import fused, learner
+from swarmjax.ppo import learner
+from swarmjax.ppo.fast import fused
 from swarmjax.ppo.gae import generalized_advantages
 from swarmjax.ppo.learner import Batch, LearnerState
 

@@ -11,8 +11,10 @@ import pytest
 from engines import BodyName
 
 from swarmjax.config import ConfigError, RobotConfig, SimConfig, StageConfig, TrainConfig, substeps
-from swarmjax.sim import discs, drive, model, physics, solver_planar_jax
+from swarmjax.sim import drive, model, physics
 from swarmjax.sim.body import AS_BUILT
+from swarmjax.sim.fast import discs
+from swarmjax.sim.fast import planar_jax as solver_planar_jax
 from swarmjax.task import env
 
 Impl = Literal["jax", "warp"]

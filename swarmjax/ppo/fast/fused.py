@@ -26,8 +26,9 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from swarmjax.config import AlgoConfig, ConfigError, show
-from swarmjax.ppo import fused_kernel, networks
-from swarmjax.ppo.fused_kernel import Launch, Layout, Place, Samples, Tiles
+from swarmjax.ppo import networks
+from swarmjax.ppo.fast import kernel
+from swarmjax.ppo.fast.kernel import Launch, Layout, Place, Samples, Tiles
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
 
@@ -103,7 +104,7 @@ def fits(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
     Returns:
         Whether `gradient` may be called.
     """
-    return fused_kernel.fits(observation_size, config.hidden, action_size, LAUNCH.tile)
+    return kernel.fits(observation_size, config.hidden, action_size, LAUNCH.tile)
 
 
 def choose_launch(
@@ -122,9 +123,9 @@ def choose_launch(
     """
     if samples is not None and samples < _LEAST_TILES * config.minibatches * LARGE.tile:
         return LAUNCH
-    memory = _MEMORY.get(_capability(), fused_kernel.SHARED_MEMORY)
+    memory = _MEMORY.get(_capability(), kernel.SHARED_MEMORY)
     sizes = (observation_size, config.hidden, action_size)
-    return LARGE if fused_kernel.fits(*sizes, LARGE.tile, memory) else LAUNCH
+    return LARGE if kernel.fits(*sizes, LARGE.tile, memory) else LAUNCH
 
 
 def _capability() -> str:
@@ -289,7 +290,7 @@ def flat_gradient(
     _check(samples, layout, config)
     share = 1.0 / jnp.maximum(expected_valid, 1.0)
     run = functools.partial(
-        fused_kernel.sums,
+        kernel.sums,
         activation=config.activation,
         tiles=tiles,
         launch=launch,

@@ -15,10 +15,11 @@ from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import infrared, noise
 from swarmjax.sim.motor import Motor
 from swarmjax.sim.noise import Stream
+from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors as task_factors
-from swarmjax.task import observation, senses
+from swarmjax.task import observation
+from swarmjax.task.electronics import Electronics, Memory, Sight
 from swarmjax.task.factors import Factors
-from swarmjax.task.senses import Electronics, Memory, Sight
 
 MODULES = pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
 ENCODINGS = pytest.mark.parametrize("encoding", ["metric", "webots"])
@@ -37,7 +38,7 @@ FREE = 67.19  # counts of Webots' sensor that sees nothing
 
 
 def _electronics(encoding: Encoding | None = None, **realism: Any) -> Electronics:
-    return senses.load(TaskConfig(), RealismConfig(**realism), encoding)
+    return task_electronics.load(TaskConfig(), RealismConfig(**realism), encoding)
 
 
 def _factors(xp: ModuleType, **fields: Any) -> Factors:
@@ -77,7 +78,7 @@ def _clock(xp: ModuleType, clock: int) -> Any:
 
 def _first(electronics: Electronics, found: Factors, sight: Sight, xp: ModuleType) -> np.ndarray:
     """The first observation [A, R, O]."""
-    return np.asarray(senses.begin(electronics, found, sight, _clock(xp, 0), xp)[1])
+    return np.asarray(task_electronics.begin(electronics, found, sight, _clock(xp, 0), xp)[1])
 
 
 # --- what is the same for every episode
@@ -98,7 +99,7 @@ def _first(electronics: Electronics, found: Factors, sight: Sight, xp: ModuleTyp
 )
 def test_reach(kind: Kind, encoding: Encoding, sensor_range: float, expected: float) -> None:
     task = TaskConfig(sensor_range=sensor_range)
-    assert senses.load(task, RealismConfig(infrared=kind), encoding).reach == expected
+    assert task_electronics.load(task, RealismConfig(infrared=kind), encoding).reach == expected
 
 
 @pytest.mark.parametrize(("bounds", "expected"), [(None, 0), ((0, 0), 0), ((1, 3), 3)])
@@ -111,21 +112,21 @@ def test_a_policy_observes_what_it_was_trained_to() -> None:
     assert _electronics(infrared="real").encoding == "metric"
     assert _electronics("metric", infrared="webots").encoding == "metric"
     task = TaskConfig(encoding="webots", sensor_range=0.03, control_step=0.02)
-    found = senses.load(task, RealismConfig())
+    found = task_electronics.load(task, RealismConfig())
     assert (found.encoding, found.sensor_range, found.control_step) == ("webots", 0.03, 0.02)
 
 
 @MODULES
 def test_mount_and_reflectance_are_there_if_any_part_of_them_is(xp: ModuleType) -> None:
     off = Factors(mass=xp.ones((ARENAS, ROBOTS)))
-    assert senses.mount(off) is None
-    assert senses.reflectance(off) is None
+    assert task_electronics.mount(off) is None
+    assert task_electronics.reflectance(off) is None
     yaw, place = xp.ones((2, 3, 8)), xp.ones((2, 3, 8, 2))
     wall, box, robot = xp.ones(2), xp.ones((2, 4)), xp.ones((2, 3))
-    assert senses.mount(Factors(infrared_yaw=yaw)) == infrared.Mount(yaw, None)
-    assert senses.mount(Factors(infrared_position=place)) == infrared.Mount(None, place)
+    assert task_electronics.mount(Factors(infrared_yaw=yaw)) == infrared.Mount(yaw, None)
+    assert task_electronics.mount(Factors(infrared_position=place)) == infrared.Mount(None, place)
     for name, shade in (("wall", wall), ("obstacle", box), ("robot", robot)):
-        found = senses.reflectance(Factors(**{f"reflectance_{name}": shade}))
+        found = task_electronics.reflectance(Factors(**{f"reflectance_{name}": shade}))
         assert found is not None
         assert [part is shade for part in found] == [part == name for part in found._fields]
 
@@ -139,12 +140,14 @@ def test_with_all_factors_off_nothing_is_touched(xp: ModuleType, encoding: Encod
     electronics, off = _electronics(encoding), Factors()
     ray = np.random.default_rng(0).uniform(0.0, 0.069, (ARENAS, ROBOTS, SENSORS))
     sight = _sight(xp, ray, 0.7, -3.0)
-    memory, seen = senses.begin(electronics, off, sight, _clock(xp, 0), xp)
+    memory, seen = task_electronics.begin(electronics, off, sight, _clock(xp, 0), xp)
     assert memory == Memory(None, None, None)
     command = xp.asarray(np.random.default_rng(1).uniform(-3, 3, (ARENAS, ROBOTS, 2)))
-    memory, wheels = senses.drive(electronics, memory, off, command, MOTORS, _clock(xp, 0), xp)
+    memory, wheels = task_electronics.drive(
+        electronics, memory, off, command, MOTORS, _clock(xp, 0), xp
+    )
     assert memory == Memory(None, None, None)
-    memory, again = senses.sense(electronics, memory, off, sight, _clock(xp, 1), xp)
+    memory, again = task_electronics.sense(electronics, memory, off, sight, _clock(xp, 1), xp)
     assert memory == Memory(None, None, None)
     np.testing.assert_array_equal(wheels, sim_drive.wheel_speeds(command, MOTORS, xp))
     np.testing.assert_array_equal(seen, again)
@@ -231,8 +234,8 @@ def test_noise_of_the_sensors_is_drawn_at_every_control_step(xp: ModuleType) -> 
     electronics = _electronics("webots", infrared="webots")
     worn = _factors(xp, seed=SEED, infrared_noise=2.0)
     sight, clock = _sight(xp), _clock(xp, 0)
-    memory, seen = senses.begin(electronics, worn, sight, clock, xp)
-    _, later = senses.sense(electronics, memory, worn, sight, clock + 7, xp)
+    memory, seen = task_electronics.begin(electronics, worn, sight, clock, xp)
+    _, later = task_electronics.sense(electronics, memory, worn, sight, clock + 7, xp)
     for now, found in ((0, seen), (7, later)):
         drawn = noise.normal(SEED, np.array(now), Stream.INFRARED, (ROBOTS, SENSORS), np)
         # Free space has a deviation of 0.04897 of its counts, here twice that.
@@ -258,11 +261,11 @@ def test_a_sample_is_held_until_the_next(xp: ModuleType, encoding: Encoding) -> 
     slow = _factors(xp, infrared_period=[0.05, 0.01, 0.032])
     rays = 0.001 * np.arange(STEPS + 1) + 0.01
     fresh = [_first(electronics, Factors(), _sight(xp, ray), xp)[0, 0, 3] for ray in rays]
-    memory, seen = senses.begin(electronics, slow, _sight(xp, rays[0]), _clock(xp, 0), xp)
+    memory, seen = task_electronics.begin(electronics, slow, _sight(xp, rays[0]), _clock(xp, 0), xp)
     found, bearing = [seen], [0.1 * n for n in range(STEPS + 1)]
     for n in range(1, STEPS + 1):
         sight = _sight(xp, rays[n], bearing=bearing[n])
-        memory, seen = senses.sense(electronics, memory, slow, sight, _clock(xp, n), xp)
+        memory, seen = task_electronics.sense(electronics, memory, slow, sight, _clock(xp, n), xp)
         found.append(seen)
     ray = np.stack(found)[..., :8]  # [T, A, R, K]
     last = [max([m for m in DUE_50 if m <= n], default=0) for n in range(STEPS + 1)]
@@ -284,7 +287,7 @@ def _due(clock: Any, period: Any, xp: Any) -> Any:
     none = xp.zeros((count, robots, SENSORS), xp.float32)
     sight = Sight(none + 0.02, None, none[..., 0], none[..., 0])
     found, memory = Factors(infrared_period=period), Memory(None, none, None)
-    return senses.sense(electronics, memory, found, sight, clock, xp)[1][..., 0] > 0.0
+    return task_electronics.sense(electronics, memory, found, sight, clock, xp)[1][..., 0] > 0.0
 
 
 @MODULES
@@ -318,14 +321,16 @@ def test_an_observation_arrives_after_its_latency(xp: ModuleType) -> None:
     electronics = _electronics(observation_latency=(0, 2))
     late = np.array([[0, 1, 2], [2, 2, 0]], np.int32)
     found = _factors(xp, observation_latency=late)
-    memory, seen = senses.begin(electronics, found, _sight(xp, distance=1.0), _clock(xp, 0), xp)
+    memory, seen = task_electronics.begin(
+        electronics, found, _sight(xp, distance=1.0), _clock(xp, 0), xp
+    )
     np.testing.assert_array_equal(seen[..., 8], 1.0)
     assert memory.seen is not None
     assert memory.seen.shape == (ARENAS, 2, ROBOTS, observation.SIZE)
     arrived = []
     for n in range(1, 6):
         sight = _sight(xp, distance=1.0 + n)
-        memory, seen = senses.sense(electronics, memory, found, sight, _clock(xp, n), xp)
+        memory, seen = task_electronics.sense(electronics, memory, found, sight, _clock(xp, n), xp)
         assert seen.shape == (ARENAS, ROBOTS, observation.SIZE)
         arrived.append(np.asarray(seen[..., 8]))
     # Of distances 1, 2, .. 6; the first has been seen all along.
@@ -341,9 +346,11 @@ def test_a_latency_of_zero_keeps_nothing(xp: ModuleType) -> None:
     electronics = _electronics(observation_latency=(0, 0), action_latency=(0, 0))
     none = np.zeros(ROBOTS, np.int32)
     found = _factors(xp, observation_latency=none, action_latency=none)
-    memory, _ = senses.begin(electronics, found, _sight(xp), _clock(xp, 0), xp)
+    memory, _ = task_electronics.begin(electronics, found, _sight(xp), _clock(xp, 0), xp)
     assert memory == Memory(None, None, None)
-    _, seen = senses.sense(electronics, memory, found, _sight(xp, distance=2.0), _clock(xp, 1), xp)
+    _, seen = task_electronics.sense(
+        electronics, memory, found, _sight(xp, distance=2.0), _clock(xp, 1), xp
+    )
     np.testing.assert_array_equal(seen[..., 8], 2.0)
 
 
@@ -352,11 +359,11 @@ def test_a_late_sample_is_both_held_and_late(xp: ModuleType) -> None:
     """A sample every second control step, which the policy sees one step later."""
     electronics = _electronics(observation_latency=(1, 1), infrared_period=(0.064, 0.064))
     found = _factors(xp, observation_latency=np.int32(1), infrared_period=0.064)
-    memory, _ = senses.begin(electronics, found, _sight(xp, 0.010), _clock(xp, 0), xp)
+    memory, _ = task_electronics.begin(electronics, found, _sight(xp, 0.010), _clock(xp, 0), xp)
     arrived = []
     for n in range(1, 7):
         sight = _sight(xp, 0.010 + 0.001 * n)
-        memory, seen = senses.sense(electronics, memory, found, sight, _clock(xp, n), xp)
+        memory, seen = task_electronics.sense(electronics, memory, found, sight, _clock(xp, n), xp)
         arrived.append(round(1000 * float(seen[1, 2, 3])))
     # Sampled in steps 0, 2, 4, 6.
     assert arrived == [10, 10, 12, 12, 14, 14]
@@ -372,7 +379,9 @@ def _targets(xp: ModuleType, distance: float, bearing: float, **realism: Any) ->
     found = Factors(seed=xp.arange(MANY, dtype=xp.uint32))
     sight = _sight(xp, 1.0, distance, bearing, arenas=MANY)
     clock = xp.zeros(MANY, xp.int32)
-    return np.asarray(senses.begin(_electronics(**realism), found, sight, clock, xp)[1])[..., 8:]
+    return np.asarray(task_electronics.begin(_electronics(**realism), found, sight, clock, xp)[1])[
+        ..., 8:
+    ]
 
 
 @MODULES
@@ -393,8 +402,8 @@ def test_noise_of_the_target(xp: ModuleType) -> None:
 def test_noise_of_the_target_is_drawn_at_every_control_step(xp: ModuleType) -> None:
     electronics = _electronics(target_distance_noise=0.01)
     found, sight = _factors(xp, seed=SEED), _sight(xp)
-    memory, _ = senses.begin(electronics, found, sight, _clock(xp, 0), xp)
-    _, seen = senses.sense(electronics, memory, found, sight, _clock(xp, 9), xp)
+    memory, _ = task_electronics.begin(electronics, found, sight, _clock(xp, 0), xp)
+    _, seen = task_electronics.sense(electronics, memory, found, sight, _clock(xp, 9), xp)
     drawn = noise.normal(SEED, np.array(9), Stream.TARGET_DISTANCE, (ROBOTS,), np)
     # Float32, and the rounding of log and cos.
     np.testing.assert_allclose(seen[..., 8], 0.3 + 0.01 * drawn, rtol=1e-6)
@@ -429,12 +438,14 @@ def _wheels(
 ) -> tuple[np.ndarray, Memory]:
     """Wheel speeds [T, A, R, 2] of commands that all robots get, and the last memory."""
     electronics = _electronics(**realism)
-    memory, _ = senses.begin(electronics, found, _sight(xp), _clock(xp, 0), xp)
+    memory, _ = task_electronics.begin(electronics, found, _sight(xp), _clock(xp, 0), xp)
     driven = []
     for n, command in enumerate(commands):
         every = xp.asarray(np.broadcast_to(np.float32(command), (ARENAS, ROBOTS, 2)))
         clock = _clock(xp, n)
-        memory, wheels = senses.drive(electronics, memory, found, every, MOTORS, clock, xp)
+        memory, wheels = task_electronics.drive(
+            electronics, memory, found, every, MOTORS, clock, xp
+        )
         driven.append(np.asarray(wheels))
     return np.stack(driven), memory
 
@@ -512,11 +523,11 @@ def _live(
     ray = (0.025 + 0.01 * xp.sin(0.3 * n))[..., None] + xp.zeros(SENSORS, xp.float32)
     sight = Sight(ray, 0.0 * ray + 0.6, 0.5 - 0.01 * n, 0.2 * n)
     if memory is None:
-        memory, seen = senses.begin(electronics, found, sight, clock, xp)
+        memory, seen = task_electronics.begin(electronics, found, sight, clock, xp)
     else:
-        memory, seen = senses.sense(electronics, memory, found, sight, clock, xp)
+        memory, seen = task_electronics.sense(electronics, memory, found, sight, clock, xp)
     command = xp.stack([nothing + 0.1, xp.sin(n)], axis=-1)
-    memory, wheels = senses.drive(electronics, memory, found, command, MOTORS, clock, xp)
+    memory, wheels = task_electronics.drive(electronics, memory, found, command, MOTORS, clock, xp)
     return memory, xp.concatenate([seen, wheels], axis=-1)
 
 
@@ -525,7 +536,7 @@ def test_a_real_robot_is_the_same_in_numpy_and_jax(encoding: Encoding) -> None:
     """Many arenas along leading axes, as the judge has them, and mapped over, as training."""
     realism = config.load_train(["realism=real"]).realism
     electronics, seeds = (
-        senses.load(TaskConfig(), realism, encoding),
+        task_electronics.load(TaskConfig(), realism, encoding),
         np.arange(16, dtype=np.uint32),
     )
     found = task_factors.draw(seeds, realism, RobotConfig(), ROBOTS, 2, np)

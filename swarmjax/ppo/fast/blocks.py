@@ -14,9 +14,9 @@ import jax.numpy as jnp
 
 from swarmjax.config import AlgoConfig
 from swarmjax.ppo import losses
+from swarmjax.ppo.fast.valid_first import valid_first
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
-from swarmjax.ppo.valid_first import valid_first
 
 # Samples of a block: of 100 to 6,000, with layers of 64, 250 to 400 took least CPU time.
 BLOCK = 256

@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from swarmjax.sim import model as sim_model
-from swarmjax.sim.discs import DEEPEST, TOLERANCE, Discs, Robots, spring
+from swarmjax.sim.fast.discs import DEEPEST, TOLERANCE, Discs, Robots, spring
 from swarmjax.sim.infrared import Box, to_box_frame, turned
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from swarmjax.sim import gaps, infrared
-from swarmjax.sim.pieces import MOST, least, pieces
+from swarmjax.sim.fast.unroll import MOST, least, pieces
 
 RADIUS = 0.037  # m
 RANGE = 0.04  # m

@@ -15,9 +15,11 @@ from hypothesis import strategies as st
 from jax.sharding import AbstractDevice, AbstractMesh
 
 from swarmjax.config import AlgoConfig, ConfigError
-from swarmjax.ppo import fused, fused_kernel, losses, networks
 from swarmjax.ppo import learner as ppo
-from swarmjax.ppo.fused_kernel import Launch
+from swarmjax.ppo import losses, networks
+from swarmjax.ppo.fast import fused
+from swarmjax.ppo.fast import kernel as fused_kernel
+from swarmjax.ppo.fast.kernel import Launch
 from swarmjax.ppo.losses import Minibatch
 from swarmjax.ppo.networks import Params
 

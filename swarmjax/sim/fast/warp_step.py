@@ -9,7 +9,7 @@ from typing import Any
 import mujoco.mjx.third_party.mujoco_warp as mjw
 from mujoco.mjx.warp import forward
 
-from swarmjax.sim import solver_wheeled
+from swarmjax.sim.fast import wheeled_warp
 
 _newton = mjw.step
 
@@ -26,4 +26,4 @@ def step(m: Any, d: Any) -> None:
       m: Warp's model.
       d: Warp's data of all arenas, written to.
     """
-    (solver_wheeled.step if m.opt.solver == solver_wheeled.NUMBER else _newton)(m, d)
+    (wheeled_warp.step if m.opt.solver == wheeled_warp.NUMBER else _newton)(m, d)

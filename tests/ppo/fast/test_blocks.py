@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from swarmjax.config import AlgoConfig
-from swarmjax.ppo import full_batch, losses, networks
 from swarmjax.ppo import learner as ppo
+from swarmjax.ppo import losses, networks
+from swarmjax.ppo.fast import blocks as full_batch
 from swarmjax.ppo.losses import Minibatch
 
 CONFIG = AlgoConfig(hidden=(8,), minibatches=1, epochs=3, entropy_cost=0.01)

@@ -14,7 +14,7 @@ second solver, PGS, goes through them one by one,
     f_i <- max(0, f_i + (aref_i - J_i a - R_i f_i) / (J_i M^-1 J_i' + R_i)),
 
 a always being the acceleration that the forces of now bring about, and ends where Newton's method
-does: there is one minimum. `solver_planar_jax` does so by JAX, `solver_planar` by Warp. A sweep
+does: there is one minimum. `planar_jax` does so by JAX, `planar_warp` by Warp. A sweep
 goes through the fixtures one by one, for all robots, and then through the pairs of robots.
 """
 
@@ -29,7 +29,7 @@ from flax import struct
 from jax import Array
 
 from swarmjax.sim import model as sim_model
-from swarmjax.sim.geom import CONTACT_HEIGHT
+from swarmjax.sim.geometry import CONTACT_HEIGHT
 
 # Contacts that a solver has room for: neighbours of its size that a disc can touch at once.
 ROWS_PER_ROBOT = 6
@@ -127,7 +127,7 @@ def load(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve: Solve)
       model: compiled, one arena.
       ids: where things lie in it.
       radius: of the hulls, m.
-      solve: `push_apart` of `solver_planar` or `solver_planar_jax`.
+      solve: `push_apart` of `planar_warp` or `planar_jax`.
 
     Returns:
       What is fixed for a program.
