@@ -20,11 +20,11 @@ from brax.envs.base import Env, State
 from flax import struct
 from jax import Array
 
-from swarmjax import rollout
 from swarmjax.sim import physics
 from swarmjax.task import env, observation
 from swarmjax.task.env import EnvState, TimeStep, World
 from swarmjax.task.stage import Stage
+from swarmjax.training import rollout
 
 
 @struct.dataclass

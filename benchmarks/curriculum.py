@@ -27,13 +27,15 @@ import numpy as np
 
 from benchmarks import curriculum_arms
 from benchmarks.curriculum_arms import StudyConfig
-from swarmjax import command, config, evaluate_mjx, loop, provenance, seeds, trainer
+from swarmjax import command, config, evaluate_mjx, provenance
 from swarmjax.config import StageConfig, TrainConfig
-from swarmjax.loop import Program, TrainState
 from swarmjax.ppo.learner import LearnerState
+from swarmjax.run import trainer
 from swarmjax.sim import physics
 from swarmjax.task import env
 from swarmjax.task.level import Level
+from swarmjax.training import loop, seeds
+from swarmjax.training.loop import Program, TrainState
 
 Judge = Callable[[LearnerState], dict[str, dict[str, np.ndarray]]]
 

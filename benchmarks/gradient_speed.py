@@ -23,7 +23,7 @@ import optax
 from jax.errors import JaxRuntimeError
 
 from benchmarks import peers, timing
-from swarmjax import command, config, provenance, rollout
+from swarmjax import command, config, provenance
 from swarmjax.config import AlgoConfig
 from swarmjax.ppo import losses, networks
 from swarmjax.ppo.fast import fused
@@ -32,6 +32,7 @@ from swarmjax.ppo.losses import Minibatch
 from swarmjax.ppo.networks import Params
 from swarmjax.settings import Section, about
 from swarmjax.task import observation
+from swarmjax.training import rollout
 
 _STEP = 1e-6  # along each gradient: none may be computed once for all
 _VALID = 0.75  # share of the samples

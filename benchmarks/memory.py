@@ -19,9 +19,10 @@ import jax
 import numpy as np
 
 from benchmarks import peers, steps_per_second, timing
-from swarmjax import command, config, loop, seeds
+from swarmjax import command, config
 from swarmjax.config import TrainConfig
 from swarmjax.sim import physics
+from swarmjax.training import loop, seeds
 
 _UPDATES = 2
 

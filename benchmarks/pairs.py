@@ -8,8 +8,9 @@ from math import comb
 import jax
 import numpy as np
 
-from swarmjax import loop, seeds, trainer
 from swarmjax.config import TrainConfig
+from swarmjax.run import trainer
+from swarmjax.training import loop, seeds
 
 
 class Arm:

@@ -34,8 +34,8 @@ from flax import linen
 from benchmarks import curriculum, peers, steps_per_second, timing
 from benchmarks.curriculum_arms import StudyConfig
 from swarmjax import config
-from swarmjax import curriculum as curricula
 from swarmjax.config import TrainConfig
+from swarmjax.curriculum import engine as curricula
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.settings import Section, about

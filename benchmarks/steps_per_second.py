@@ -23,13 +23,14 @@ import numpy as np
 from jax import Array
 
 from benchmarks import timing
-from swarmjax import command, config, loop, provenance, rollout, seeds
+from swarmjax import command, config, provenance
 from swarmjax.config import TrainConfig
-from swarmjax.curriculum import Schedule
-from swarmjax.loop import Program, TrainState
+from swarmjax.curriculum.engine import Schedule
 from swarmjax.sim import drive, physics
 from swarmjax.task import env
 from swarmjax.task.env import EnvState
+from swarmjax.training import loop, rollout, seeds
+from swarmjax.training.loop import Program, TrainState
 
 # Of one call of physics and environment; whole rollouts of the default algorithm.
 CONTROL_STEPS = {"planar": 64, "wheeled": 32}

@@ -15,8 +15,8 @@ from pathlib import Path
 from swarmjax import report_rows
 from swarmjax.command import USER_ERROR
 from swarmjax.config import ConfigError, substeps
-from swarmjax.recorder import METRICS
 from swarmjax.report_rows import Row
+from swarmjax.run.recorder import METRICS
 
 USAGE = "usage: python -m benchmarks.time_to_success RUN [SHARE]\n"
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from swarmjax import loop
+from swarmjax.training import loop
 
 REPEATS = 5
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from swarmjax import command, report_rows
-from swarmjax.recorder import METRICS
+from swarmjax.run.recorder import METRICS
 from swarmjax.settings import ConfigError
 
 # Of a run's summary, what a line about it says of where it was made.

@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from swarmjax import evaluate_judge, measures, rollout
+from swarmjax import evaluate_judge, measures
 from swarmjax.config import (
     AlgoConfig,
     ConfigError,
@@ -38,6 +38,7 @@ from swarmjax.task import electronics, env, level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
 from swarmjax.task.level import Level, Spacing
+from swarmjax.training import rollout
 
 LARGEST_BOX = 0.3  # m; the largest that a stage takes
 _ACTIVATIONS = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}

@@ -137,7 +137,8 @@ def _by_mjx(
     report: Callable[[int], None],
 ) -> Iterator[tuple[list[Outcome], np.ndarray]]:
     """Runs each cell at once by the engine that trains."""
-    from swarmjax import compile_cache, evaluate_mjx  # those that need JAX
+    from swarmjax import evaluate_mjx
+    from swarmjax.run import compile_cache  # those that need JAX
 
     for cell in cells:
         mine, outcomes = specialise(config, cell, entrants[0].path), []

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 
 from swarmjax import (
-    checkpoint,
     command,
     compose,
     config,
@@ -26,13 +25,14 @@ from swarmjax import (
     export_webots,
     policy_file,
     provenance,
-    seeds,
 )
-from swarmjax.checkpoint import CheckpointError, Leaves
 from swarmjax.config import AlgoConfig, ConfigError, ExportConfig, RobotConfig, TrainConfig
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import normalizer
+from swarmjax.run import checkpoint
+from swarmjax.run.checkpoint import CheckpointError, Leaves
 from swarmjax.task import observation
+from swarmjax.training import seeds
 
 POLICY = "policy.npz"
 _DRIVE = ("wheel_radius", "track", "max_wheel_speed")

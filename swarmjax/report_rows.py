@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax import config, recorder
+from swarmjax import config
 from swarmjax.config import ConfigError, TrainConfig
+from swarmjax.run import recorder
 from swarmjax.statistics import iqm
 
 Row = dict[str, Any]

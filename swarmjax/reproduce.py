@@ -26,11 +26,11 @@ from swarmjax import (
     reproduce_judge,
     reproduce_page,
 )
-from swarmjax.checkpoint import CheckpointError
 from swarmjax.config import ConfigError, ReproduceConfig
 from swarmjax.reproduce_judge import Task
 from swarmjax.reproduce_rows import EVALUATION, FACTS, FORMAT
-from swarmjax.trainer import Stop, TrainingError
+from swarmjax.run.checkpoint import CheckpointError
+from swarmjax.run.trainer import Stop, TrainingError
 
 FAILED = 1
 _PLATFORMS = {"cpu": "cpu", "gpu": "cuda,cpu"}  # as JAX calls them

@@ -8,11 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from swarmjax import checkpoint, compile_cache, config, export, memory, train
-from swarmjax.checkpoint import CheckpointError
+from swarmjax import config, export, train
 from swarmjax.config import ARMS, Arm, ConfigError, ReproduceConfig, TrainConfig
-from swarmjax.display import Display
-from swarmjax.trainer import Stop
+from swarmjax.run import checkpoint, compile_cache, memory
+from swarmjax.run.checkpoint import CheckpointError
+from swarmjax.run.display import Display
+from swarmjax.run.trainer import Stop
 
 _EXPANDED, _MODERN = "_expanded", "modern_"
 _STAGES = {"curriculum": "paper_curriculum", "baseline": "paper6"}

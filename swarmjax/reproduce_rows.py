@@ -14,8 +14,8 @@ import numpy as np
 
 from swarmjax import report_rows
 from swarmjax.config import ConfigError
-from swarmjax.recorder import EPISODES
 from swarmjax.report_rows import Row
+from swarmjax.run.recorder import EPISODES
 from swarmjax.statistics import LEAST_DRAWN
 
 FACTS, EVALUATION = "reproduce.json", "evaluation.json"

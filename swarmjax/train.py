@@ -16,36 +16,19 @@ from typing import Any
 
 import jax
 
-from swarmjax import (
-    checkpoint,
-    command,
-    compile_cache,
-    config,
-    curriculum,
-    export,
-    loop,
-    memory,
-    provenance,
-    seeds,
-    start,
-)
-from swarmjax.checkpoint import CheckpointError
+from swarmjax import command, config, export, provenance
 from swarmjax.config import ConfigError, TrainConfig
-from swarmjax.curriculum import Schedule
-from swarmjax.display import Display
-from swarmjax.loop import Program, TrainState
+from swarmjax.curriculum import engine as curriculum
+from swarmjax.curriculum.engine import Schedule
+from swarmjax.run import checkpoint, compile_cache, memory, warm_start
+from swarmjax.run.checkpoint import CheckpointError
+from swarmjax.run.display import Display
+from swarmjax.run.trainer import Stop, Tally, TrainingError, compile_chunk, measure, prepare, train
+from swarmjax.run.warm_start import Source
 from swarmjax.sim import physics
-from swarmjax.start import Source
 from swarmjax.task import env
-from swarmjax.trainer import (
-    Stop,
-    Tally,
-    TrainingError,
-    compile_chunk,
-    measure,
-    prepare,
-    train,
-)
+from swarmjax.training import loop, seeds
+from swarmjax.training.loop import Program, TrainState
 
 FAILED = 1
 
@@ -95,7 +78,7 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
       CheckpointError: if what it goes on with is damaged.
       TrainingError: if a loss is no longer finite.
     """
-    source = start.read(settings)
+    source = warm_start.read(settings)
     program, schedule, init, template = _load(settings)
     state, skipped = _first_state(program, lambda: init(schedule), template, source)
     for sentence in skipped:
@@ -150,7 +133,7 @@ def _first_state(
         state = init()
         if source is None:
             return state, []
-        return start.carry(source, state, settings), source.skipped
+        return warm_start.carry(source, state, settings), source.skipped
     leaves, update, skipped = checkpoint.restore(Path(settings.resume))
     if update > settings.updates:
         raise ConfigError(
@@ -196,7 +179,7 @@ def _unwritable(run: Path, error: OSError) -> ConfigError:
 
 def _dry_run(settings: TrainConfig) -> int:
     """Compiles, says what it took and what a run needs, and stops."""
-    start.read(settings)
+    warm_start.read(settings)
     program, schedule, _, template = _load(settings)
     compiled = compile_chunk(program, schedule, template)
     memory.check(settings, compiled.total_bytes, memory.limit())

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from benchmarks import race
-from swarmjax import curriculum
 from swarmjax.config import AlgoConfig, SimConfig, StageConfig, TaskConfig, TrainConfig
+from swarmjax.curriculum import engine as curriculum
 from swarmjax.ppo import learner as ppo
 from swarmjax.task import env
 from swarmjax.task.env import World

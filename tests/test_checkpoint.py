@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax import checkpoint
-from swarmjax.checkpoint import CheckpointError, Checkpoints
+from swarmjax.run import checkpoint
+from swarmjax.run.checkpoint import CheckpointError, Checkpoints
 
 # Where a restore fails, Orbax leaves an event loop that complains when it is collected.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

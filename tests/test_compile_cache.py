@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from swarmjax import compile_cache, train
+from swarmjax import train
+from swarmjax.run import compile_cache
 
 _NAMES = ("jax_compilation_cache_dir", "jax_enable_compilation_cache", *compile_cache._OPTIONS)
 

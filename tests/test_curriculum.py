@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swarmjax import curriculum
 from swarmjax.config import CurriculumConfig, StageConfig, TaskConfig, TrainConfig
-from swarmjax.curriculum import (
+from swarmjax.curriculum import engine as curriculum
+from swarmjax.curriculum.engine import (
     BY_BUDGET,
     BY_DEMOTION,
     BY_THRESHOLD,
@@ -25,8 +25,8 @@ from swarmjax.curriculum import (
     Schedule,
     Tally,
 )
-from swarmjax.curriculum_modes import MODES
-from swarmjax.rollout import Ended
+from swarmjax.curriculum.modes import MODES
+from swarmjax.training.rollout import Ended
 
 OPTIONS = CurriculumConfig(mode="sequential")
 NOW, BEFORE = -1, -2  # the current cohort, and the one before

@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swarmjax import curriculum, rollout
 from swarmjax.config import (
     AlgoConfig,
     CurriculumConfig,
@@ -23,7 +22,8 @@ from swarmjax.config import (
     TaskConfig,
     TrainConfig,
 )
-from swarmjax.curriculum import (
+from swarmjax.curriculum import engine as curriculum
+from swarmjax.curriculum.engine import (
     BY_BUDGET,
     BY_DEMOTION,
     BY_THRESHOLD,
@@ -37,11 +37,12 @@ from swarmjax.curriculum import (
     Schedule,
     Verdict,
 )
-from swarmjax.curriculum_modes import MODES
+from swarmjax.curriculum.modes import MODES
 from swarmjax.ppo import learner as ppo
-from swarmjax.rollout import Ended
 from swarmjax.task import env, observation
 from swarmjax.task.env import EnvState
+from swarmjax.training import rollout
+from swarmjax.training.rollout import Ended
 
 COHORT = 4  # updates
 SEQUENTIAL, MIXED = (CurriculumConfig(mode=mode) for mode in ("sequential", "mixed"))

@@ -4,7 +4,7 @@ import io
 
 from rich.console import Console
 
-from swarmjax.display import Display, StageState, summarize
+from swarmjax.run.display import Display, StageState, summarize
 
 NAMES = ["s1", "s2", "s3"]
 ROW = {

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from sentences import refusal
 
-from swarmjax import checkpoint, episodes, loop, rollout, seeds, trainer
 from swarmjax.config import TrainConfig, load_train
-from swarmjax.display import Display
-from swarmjax.rollout import Ended, Robots
+from swarmjax.run import checkpoint, trainer
+from swarmjax.run.display import Display
+from swarmjax.training import episodes, loop, rollout, seeds
+from swarmjax.training.rollout import Ended, Robots
 
 
 def _ended(done: np.ndarray, robots: int) -> Ended:

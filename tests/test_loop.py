@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax import curriculum, loop
-from swarmjax.checkpoint import digest, to_leaves
 from swarmjax.config import CurriculumConfig, StageConfig, TrainConfig
-from swarmjax.curriculum import BY_BUDGET, NEVER, Schedule
-from swarmjax.loop import Program, TrainState
+from swarmjax.curriculum import engine as curriculum
+from swarmjax.curriculum.engine import BY_BUDGET, NEVER, Schedule
+from swarmjax.run.checkpoint import digest, to_leaves
 from swarmjax.task.env import World
+from swarmjax.training import loop
+from swarmjax.training.loop import Program, TrainState
 
 Chunk = Callable[[Schedule, TrainState, np.int32], tuple[TrainState, dict]]
 

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from swarmjax import config, memory, train, trainer
+from swarmjax import config, train
 from swarmjax.config import AlgoConfig, ConfigError, RunConfig, StageConfig, TrainConfig
+from swarmjax.run import memory, trainer
 
 GIB = 2**30
 SETTINGS = TrainConfig(stage=(StageConfig(name="pair", robots=2, side=0.5),), budget=10**9)

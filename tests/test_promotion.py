@@ -9,11 +9,11 @@ import numpy as np
 import optax
 import pytest
 
-from swarmjax import promotion
 from swarmjax.config import AlgoConfig, CurriculumConfig, TrainConfig
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import normalizer
 from swarmjax.ppo.learner import Batch, LearnerState
+from swarmjax.training import promotion
 
 LEARNERS, OBSERVED = 5, 3
 ALGO = AlgoConfig(

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarmjax import recorder
-from swarmjax.recorder import Recorder
+from swarmjax.run import recorder
+from swarmjax.run.recorder import Recorder
 
 ONE_SEED = {
     "update": np.array([4, 5, 0]),

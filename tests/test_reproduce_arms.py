@@ -9,7 +9,7 @@ from sentences import refusal
 
 from swarmjax import config, reproduce_arms
 from swarmjax.config import ARMS, ReproduceConfig, TrainConfig, load_train
-from swarmjax.trainer import Stop
+from swarmjax.run.trainer import Stop
 
 OUT = Path("somewhere") / "a=b, c"
 MADE = {arm: reproduce_arms.settings(ReproduceConfig(), arm, OUT) for arm in ARMS}

@@ -10,17 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax import rollout
 from swarmjax.config import AlgoConfig
 from swarmjax.ppo import gae
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
-from swarmjax.rollout import Ended, Trajectory
 from swarmjax.sim import gaps, physics
 from swarmjax.task import env, observation
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, TimeStep, World
 from swarmjax.task.level import Level
+from swarmjax.training import rollout
+from swarmjax.training.rollout import Ended, Trajectory
 
 ArenaStep = Callable[[EnvState, jax.Array], tuple[EnvState, TimeStep]]
 Draw = Callable[[int, int], EnvState]

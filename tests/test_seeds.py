@@ -11,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax import curriculum, loop, seeds
-from swarmjax.checkpoint import Leaves, to_leaves
 from swarmjax.config import TrainConfig
-from swarmjax.loop import Program, TrainState
+from swarmjax.curriculum import engine as curriculum
+from swarmjax.run.checkpoint import Leaves, to_leaves
 from swarmjax.sim import physics
 from swarmjax.task import env
 from swarmjax.task.env import World
+from swarmjax.training import loop, seeds
+from swarmjax.training.loop import Program, TrainState
 
 SEEDS, UPDATES = 3, np.int32(2)
 Run = Callable[[TrainState, np.int32], tuple[TrainState, dict]]

@@ -11,11 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarmjax import checkpoint, command, config, export, loop, seeds, start, train
-from swarmjax.checkpoint import CheckpointError, Checkpoints, digest
+from swarmjax import command, config, export, train
 from swarmjax.config import TrainConfig
-from swarmjax.loop import TrainState
-from swarmjax.start import Source
+from swarmjax.run import checkpoint, warm_start
+from swarmjax.run.checkpoint import CheckpointError, Checkpoints, digest
+from swarmjax.run.warm_start import Source
+from swarmjax.training import loop, seeds
+from swarmjax.training.loop import TrainState
 
 UPDATES = 3
 TINY = [
@@ -67,7 +69,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _load(words: list[str]) -> tuple[Source, TrainState, TrainConfig]:
     """What is carried over, the state of the same run without it, and the config."""
     settings = config.load_train([*TINY, *words])
-    source = start.read(settings)
+    source = warm_start.read(settings)
     assert source is not None
     return source, seeds.init(*loop.load(settings)), settings
 
@@ -102,7 +104,7 @@ def _flip_one_bit(step: Path) -> None:
 
 def test_networks_and_normaliser_are_carried_and_nothing_else(trained: Path) -> None:
     source, state, settings = _load([*OTHER, f"start={trained}"])
-    found = checkpoint.to_leaves(start.carry(source, state, settings))
+    found = checkpoint.to_leaves(warm_start.carry(source, state, settings))
     fresh = checkpoint.to_leaves(state)
     learned = checkpoint.restore(trained)[0]
     assert found.keys() == fresh.keys()
@@ -127,15 +129,15 @@ def test_it_is_known_how_many_robots_have_trained(trained: Path) -> None:
     # A promotion copies no learner over one that has learned: two robots trained, one begins.
     source, state, settings = _load(["stage.robots=1", f"start={trained}"])
     assert state.curriculum.met.tolist() == [1]
-    assert start.carry(source, state, settings).curriculum.met.tolist() == [2]
+    assert warm_start.carry(source, state, settings).curriculum.met.tolist() == [2]
 
 
 def test_exploration_is_reset_only_where_that_is_said(trained: Path) -> None:
     words = [f"start={trained}", "algo.initial_std=0.25"]
     source, state, keeping = _load(words)
-    kept = checkpoint.to_leaves(start.carry(source, state, keeping))
+    kept = checkpoint.to_leaves(warm_start.carry(source, state, keeping))
     resetting = config.load_train([*TINY, *words, "start_std=reset"])
-    reset = checkpoint.to_leaves(start.carry(source, state, resetting))
+    reset = checkpoint.to_leaves(warm_start.carry(source, state, resetting))
     learned = checkpoint.restore(trained)[0]
     np.testing.assert_array_equal(kept[LOG_STD], learned[LOG_STD], strict=True)
     expected = np.full((1, 1, 2), math.log(0.25), np.float32)
@@ -157,7 +159,7 @@ def test_a_schedule_of_exploration_goes_on_unless_it_is_reset(
     def explored(*words: str) -> list[int] | None:
         settings = config.load_train([*TINY, *words])
         source, state, _ = _load([w for w in words if w not in TINY])
-        found = checkpoint.to_leaves(start.carry(source, state, settings)).get(EXPLORED)
+        found = checkpoint.to_leaves(warm_start.carry(source, state, settings)).get(EXPLORED)
         return None if found is None else found[0].tolist()
 
     begun = f"start={tmp_path / 'run'}"
@@ -183,7 +185,7 @@ def pair(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_several_seeds_begin_with_as_many_lane_by_lane(trained: Path, pair: Path) -> None:
     source, state, settings = _load([f"start={pair}", "seeds=2", "seed=5"])
-    found = checkpoint.to_leaves(start.carry(source, state, settings))
+    found = checkpoint.to_leaves(warm_start.carry(source, state, settings))
     learned = checkpoint.restore(trained)[0]
     for name in (name for name in found if name.startswith(CARRIED)):
         expected = np.concatenate([learned[name], learned[name] + 1])
@@ -193,7 +195,7 @@ def test_several_seeds_begin_with_as_many_lane_by_lane(trained: Path, pair: Path
 @pytest.mark.slow
 def test_several_seeds_may_all_begin_with_the_same_one(trained: Path) -> None:
     source, state, settings = _load([f"start={trained}", "seeds=3"])
-    found = checkpoint.to_leaves(start.carry(source, state, settings))
+    found = checkpoint.to_leaves(warm_start.carry(source, state, settings))
     fresh, learned = checkpoint.to_leaves(state), checkpoint.restore(trained)[0]
     for name, leaf in found.items():
         expected = fresh[name]

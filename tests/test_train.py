@@ -11,9 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarmjax import checkpoint, command, config, curriculum, export, policy, train
-from swarmjax.checkpoint import CheckpointError, Checkpoints, digest
+from swarmjax import command, config, export, policy, train
 from swarmjax.config import ExportConfig, TrainConfig
+from swarmjax.curriculum import engine as curriculum
+from swarmjax.run import checkpoint
+from swarmjax.run.checkpoint import CheckpointError, Checkpoints, digest
 
 TINY = [
     "stage=s1",

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmjax import trainer
+from swarmjax.run import trainer
 
 
 def test_groups_are_called_at_once_and_keep_their_order() -> None:

@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmjax import rollout
 from swarmjax.config import AlgoConfig, load_train
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import networks
 from swarmjax.ppo.learner import LearnerState
-from swarmjax.rollout import Trajectory
+from swarmjax.training import rollout
+from swarmjax.training.rollout import Trajectory
 
 PAPER = load_train(["algo=paper"]).algo
 CONFIGS = {

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from sentences import refusal
 
-from swarmjax import compose, config, epuck, rollout
+from swarmjax import compose, config, epuck
 from swarmjax.config import AlgoConfig, RewardConfig, TrainConfig, load_train
 from swarmjax.sim import drive
 from swarmjax.task import observation
 from swarmjax.task import stage as task_stage
+from swarmjax.training import rollout
 
 FILES = Path(compose.__file__).resolve().parent.parent / "configs"
 PAPER = load_train(["algo=paper"])

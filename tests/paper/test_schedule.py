@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax import curriculum, loop, rollout
 from swarmjax.config import SimConfig, StageConfig, TrainConfig, load_train
-from swarmjax.loop import Program, TrainState
+from swarmjax.curriculum import engine as curriculum
 from swarmjax.ppo import exploration
+from swarmjax.training import loop, rollout
+from swarmjax.training.loop import Program, TrainState
 
 PAPER = load_train(["algo=paper", "sim.impl=jax"])
 

@@ -8,10 +8,11 @@ import jax
 import numpy as np
 import pytest
 
-from swarmjax import export, loop, policy, seeds
-from swarmjax.checkpoint import to_leaves
+from swarmjax import export, policy
 from swarmjax.config import TrainConfig, load_train
 from swarmjax.ppo import learner as ppo
+from swarmjax.run.checkpoint import to_leaves
+from swarmjax.training import loop, seeds
 
 ROLLOUT, LIMIT, UPDATES = 128, 32, 8
 KERNEL = "learners/params/actor/mean/kernel"

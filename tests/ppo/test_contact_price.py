@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarmjax import rollout
 from swarmjax.config import AlgoConfig
 from swarmjax.ppo import contact_price
 from swarmjax.ppo import learner as ppo
-from swarmjax.rollout import Trajectory
+from swarmjax.training import rollout
+from swarmjax.training.rollout import Trajectory
 
 CONFIG = AlgoConfig(contact_limit=0.1, contact_price_rate=1e-3, contact_price_arrivals=0.9)
 

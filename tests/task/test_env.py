@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax import config, rollout
+from swarmjax import config
 from swarmjax.sim import gaps, infrared, physics
 from swarmjax.task import env, observation
 from swarmjax.task import factors as task_factors
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, TimeStep, World
 from swarmjax.task.level import Level
+from swarmjax.training import rollout
 
 ArenaStep = Callable[[EnvState, jax.Array], tuple[EnvState, TimeStep]]
 

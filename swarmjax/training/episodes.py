@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from swarmjax import rollout
 from swarmjax.config import TrainConfig
-from swarmjax.rollout import Ended, Robots
+from swarmjax.training import rollout
+from swarmjax.training.rollout import Ended, Robots
 
 KEY = "episodes_log"  # of the metrics of an update, beside its numbers
 MOST_HELD = 2**19  # episodes that a call may hand on, over all updates and seeds

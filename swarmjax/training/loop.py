@@ -13,18 +13,18 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from swarmjax import curriculum as curricula
-from swarmjax import episodes, promotion, rollout
 from swarmjax.config import TrainConfig
-from swarmjax.curriculum import Curriculum, Decision, Mode, Schedule
-from swarmjax.curriculum_modes import MODES
+from swarmjax.curriculum import engine as curricula
+from swarmjax.curriculum.engine import Curriculum, Decision, Mode, Schedule
+from swarmjax.curriculum.modes import MODES
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.fast import fused
 from swarmjax.ppo.learner import Batch, LearnerState
-from swarmjax.rollout import Ended
 from swarmjax.sim import gaps
 from swarmjax.task import env, observation
 from swarmjax.task.env import EnvState, World
+from swarmjax.training import episodes, promotion, rollout
+from swarmjax.training.rollout import Ended
 
 MAX_ROWS = 4096  # updates that a call can report, over all seeds; a longer chunk is several calls
 

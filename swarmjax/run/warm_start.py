@@ -12,10 +12,11 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from swarmjax import checkpoint, config, export
-from swarmjax.checkpoint import CheckpointError, Leaves
+from swarmjax import config, export
 from swarmjax.config import ConfigError, TrainConfig
-from swarmjax.loop import TrainState
+from swarmjax.run import checkpoint
+from swarmjax.run.checkpoint import CheckpointError, Leaves
+from swarmjax.training.loop import TrainState
 
 _CARRIED = ("params", "normalizer")  # of a learner
 _EXPLORED = "explored"  # likewise, of one whose exploration is scheduled

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from swarmjax.config import CurriculumConfig
-from swarmjax.curriculum import (
+from swarmjax.curriculum.engine import (
     BY_BUDGET,
     BY_DEMOTION,
     BY_THRESHOLD,

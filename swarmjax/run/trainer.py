@@ -17,14 +17,17 @@ from typing import Any
 import jax
 import numpy as np
 
-from swarmjax import config, curriculum, episodes, loop, memory, provenance, recorder, seeds
-from swarmjax.checkpoint import Checkpoints
+from swarmjax import config, provenance
 from swarmjax.config import TrainConfig
-from swarmjax.curriculum import Schedule
-from swarmjax.display import Display, summarize
-from swarmjax.loop import Program, TrainState
-from swarmjax.recorder import Recorder, Row
+from swarmjax.curriculum import engine as curriculum
+from swarmjax.curriculum.engine import Schedule
+from swarmjax.run import memory, recorder
+from swarmjax.run.checkpoint import Checkpoints
+from swarmjax.run.display import Display, summarize
+from swarmjax.run.recorder import Recorder, Row
 from swarmjax.sim import physics
+from swarmjax.training import episodes, loop, seeds
+from swarmjax.training.loop import Program, TrainState
 
 CALL_SECONDS = 1.0  # what a call should take when run.chunk is auto: the display's pace
 GROWTH = 4  # a call is at most this many times as long as the one before

@@ -19,9 +19,9 @@ from flax import struct
 from jax import Array
 
 from swarmjax.config import CurriculumConfig, TrainConfig
-from swarmjax.rollout import Ended
 from swarmjax.task import stage as task_stage
 from swarmjax.task.stage import Stage
+from swarmjax.training.rollout import Ended
 
 STAYED, BY_THRESHOLD, BY_BUDGET, BY_DEMOTION, REWEIGHED = range(5)
 REASONS = ("stayed", "threshold", "budget", "demotion", "reweighed")

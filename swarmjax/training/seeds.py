@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from swarmjax import loop
 from swarmjax.config import TrainConfig
-from swarmjax.curriculum import Schedule
-from swarmjax.loop import Metrics, Program, TrainState
+from swarmjax.curriculum.engine import Schedule
 from swarmjax.sim.physics import PhysicsState
+from swarmjax.training import loop
+from swarmjax.training.loop import Metrics, Program, TrainState
 
 
 def numbers(config: TrainConfig) -> range:

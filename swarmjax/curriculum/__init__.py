@@ -1,0 +1,1 @@
+"""The curriculum: its engine, and the modes that decide."""

@@ -1,0 +1,1 @@
+"""The compiled side of a run: rollouts, the training loop, seeds."""
