@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from swarmjax import command, config, epuck, evaluate, policy_file, provenance
+from swarmjax import command, config, epuck, policy_file, provenance
 from swarmjax.config import EvaluateConfig
+from swarmjax.evaluate import __main__ as evaluate
 from swarmjax.task import observation
 
 # Action (speed, turn rate; -1..1) at bearing 0, and what each radian to the left or right adds:

@@ -21,8 +21,11 @@ import numpy as np
 
 from benchmarks import peers, steps_per_second
 from benchmarks.watched_run import MADE_WITH, Watched
-from swarmjax import cells, command, config, evaluate_run, export, report_rows
-from swarmjax.report_rows import Row
+from swarmjax import command, config
+from swarmjax.evaluate import cells, trials
+from swarmjax.export import __main__ as export
+from swarmjax.report import rows as report_rows
+from swarmjax.report.rows import Row
 from swarmjax.settings import Section, about
 
 SHARES = (0.90, 0.95)
@@ -71,8 +74,8 @@ def judge(run: Path, stage: str, episodes: int) -> dict[str, Any]:
     settings = config.load_evaluate(
         [f"policy={path}", f"stage={stage}", "robot=wheeled", f"episodes={episodes}"]
     )
-    policies = evaluate_run.read_policies([str(path)])
-    (trial,) = evaluate_run.run(settings, cells.load(settings).cells, policies)
+    policies = trials.read_policies([str(path)])
+    (trial,) = trials.run(settings, cells.load(settings).cells, policies)
     judged = float(np.mean(trial.found["targets_reached"]))
     return {"judged": judged, "action": settings.action}
 

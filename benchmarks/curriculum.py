@@ -27,8 +27,9 @@ import numpy as np
 
 from benchmarks import curriculum_arms
 from benchmarks.curriculum_arms import StudyConfig
-from swarmjax import command, config, evaluate_mjx, provenance
+from swarmjax import command, config, provenance
 from swarmjax.config import StageConfig, TrainConfig
+from swarmjax.evaluate import engine_mjx
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.run import trainer
 from swarmjax.sim import physics
@@ -62,9 +63,9 @@ def load_judge(study: StudyConfig, trained: TrainConfig, judged: dict[str, Stage
             budget=arenas * trained.algo.rollout,
         )
     )
-    drawn = [evaluate_mjx.draw_levels(world, s, study.level_seed, study.levels) for s in stages]
+    drawn = [engine_mjx.draw_levels(world, s, study.level_seed, study.levels) for s in stages]
     levels = Level(*(np.concatenate(fields) for fields in zip(*drawn, strict=True)))
-    run = partial(evaluate_mjx.outcomes, world, steps=trained.task.step_limit)
+    run = partial(engine_mjx.outcomes, world, steps=trained.task.step_limit)
     call = jax.jit(jax.vmap(run, in_axes=(0, None)))
 
     def judge(learners: LearnerState) -> dict[str, dict[str, np.ndarray]]:

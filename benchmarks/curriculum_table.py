@@ -6,7 +6,7 @@ learning curves of each into DIR, as `<goal>-<policy>-<arenas>-<budget>-<measure
 is the share of targets that were reached, or of episodes in which all were.
 
 Every figure is the interquartile mean over seeds, with the 95 % interval of a stratified bootstrap
-over them (swarmjax.statistics). The columns:
+over them (swarmjax.evaluate.statistics). The columns:
 
 - `goal`, `1.5 m`: the share at the end, on the goal and in the arena never trained.
 - `to 0.8`, `to 0.9`: arena steps until a seed's share on the goal is first so large.
@@ -29,9 +29,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from benchmarks.curriculum_arms import BASELINE
-from swarmjax import command, statistics
+from swarmjax import command
 from swarmjax.config import ConfigError, TrainConfig
-from swarmjax.statistics import Interval
+from swarmjax.evaluate import statistics
+from swarmjax.evaluate.statistics import Interval
 
 MEASURES = {"targets_reached": "targets reached", "all_reached": "episodes in which all arrived"}
 THRESHOLDS = (0.8, 0.9)

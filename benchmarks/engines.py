@@ -14,9 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax import command, config, evaluate, evaluate_summary, provenance
+from swarmjax import command, config, provenance
 from swarmjax.config import ConfigError, EvaluateConfig
-from swarmjax.evaluate_run import Trial
+from swarmjax.evaluate import __main__ as evaluate
+from swarmjax.evaluate import summary as evaluate_summary
+from swarmjax.evaluate.trials import Trial
 
 SAME_TIME = 0.032  # s; arrivals may fall into neighbouring control steps
 

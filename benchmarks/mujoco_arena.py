@@ -1,8 +1,8 @@
 """One arena of MuJoCo's C engine as an environment for trainers that know nothing of JAX.
 
-The arena is the judge's (`swarmjax.evaluate_c`), with the reward of `task.reward` in NumPy. The
-judge asks a policy for actions; here that is one of a learner for each robot, of weight 0, whose
-bias is the action.
+The arena is the judge's (`swarmjax.evaluate.engine_c`), with the reward of `task.reward` in
+NumPy. The judge asks a policy for actions; here that is one of a learner for each robot, of weight
+0, whose bias is the action.
 """
 
 from dataclasses import replace
@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarmjax import config, evaluate_c
+from swarmjax import config
 from swarmjax.config import ConfigError, EvaluateConfig
-from swarmjax.evaluate_c import Arenas
-from swarmjax.evaluate_judge import Judge
+from swarmjax.evaluate import engine_c
+from swarmjax.evaluate.engine_c import Arenas
+from swarmjax.evaluate.judge import Judge
 from swarmjax.policy import Policy
 from swarmjax.task import observation
 
@@ -60,17 +61,17 @@ class Arena:
                 raise ConfigError(f"task.reward.{name} is {weight}: give 0.")
         robots = settings.stage.robots
         told = replace(settings, action="mean")  # what it is told, and nothing drawn beside it
-        self.judge = evaluate_c.load(told, _puppet(told, np.zeros((robots, ACTION_SIZE))))
+        self.judge = engine_c.load(told, _puppet(told, np.zeros((robots, ACTION_SIZE))))
         self._number = first
         self.arenas: Arenas | None = None
 
     def reset(self) -> np.ndarray:
         """Begins the next level; returns what its robots observe, [R, O]."""
-        level = evaluate_c.draw_level(
+        level = engine_c.draw_level(
             self.judge.stage, self.judge.spacing, self.judge.config.seed, self._number
         )
         self._number += 1
-        self.arenas = evaluate_c.start(self.judge, [level])
+        self.arenas = engine_c.start(self.judge, [level])
         return self.arenas.observation[0]
 
     def step(self, action: np.ndarray) -> Moved:
@@ -85,7 +86,7 @@ class Arena:
         before = self.arenas
         assert before is not None  # reset comes first
         puppet = _puppet(self.judge.config, action)
-        after = evaluate_c.step(replace(self.judge, policy=puppet), before)
+        after = engine_c.step(replace(self.judge, policy=puppet), before)
         self.arenas = after
         arrived = after.outcome.arrived[0]
         timeout = after.outcome.clock[0] >= self.judge.config.steps

@@ -17,7 +17,7 @@ from pathlib import Path
 from benchmarks import peers, steps_per_second
 from benchmarks.watched_run import MADE_WITH, Watched
 from swarmjax import command, config
-from swarmjax.report_rows import Row
+from swarmjax.report.rows import Row
 from swarmjax.settings import Section, about
 
 _FIRST = ("run.chunk=1", "run.stop_after=1")

@@ -12,10 +12,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from swarmjax import report_rows
 from swarmjax.command import USER_ERROR
 from swarmjax.config import ConfigError, substeps
-from swarmjax.report_rows import Row
+from swarmjax.report import rows as report_rows
+from swarmjax.report.rows import Row
 from swarmjax.run.recorder import METRICS
 
 USAGE = "usage: python -m benchmarks.time_to_success RUN [SHARE]\n"

@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax import cells, command, config, evaluate_run, policy_file, provenance, statistics
+from swarmjax import command, config, policy_file, provenance
 from swarmjax.config import ConfigError, EvaluateConfig
+from swarmjax.evaluate import cells, statistics, trials
 
 WORLDS = (("planar", "ideal"), ("wheeled", "ideal"), ("wheeled", "webots"), ("wheeled", "real"))
 MEASURES = ("targets_reached", "all_reached", "contacts_per_robot", "episode_time_s")
@@ -33,9 +34,7 @@ def judge(settings: EvaluateConfig, files: Sequence[str]) -> dict[str, np.ndarra
     Returns:
       [seeds, levels] of each measure.
     """
-    (trial,) = evaluate_run.run(
-        settings, cells.load(settings).cells, evaluate_run.read_policies(files)
-    )
+    (trial,) = trials.run(settings, cells.load(settings).cells, trials.read_policies(files))
     return {name: trial.found[name] for name in MEASURES}
 
 

@@ -11,7 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from swarmjax import command, report_rows
+from swarmjax import command
+from swarmjax.report import rows as report_rows
 from swarmjax.run.recorder import METRICS
 from swarmjax.settings import ConfigError
 

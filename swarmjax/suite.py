@@ -21,10 +21,12 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from swarmjax import cells, command, compose, config, evaluate, evaluate_run, policy_file
-from swarmjax.cells import Cell, Suite
+from swarmjax import command, compose, config, policy_file
 from swarmjax.config import CellConfig, ConfigError, EvaluateConfig, SuiteConfig
-from swarmjax.evaluate_run import Entrant, Trial
+from swarmjax.evaluate import __main__ as evaluate
+from swarmjax.evaluate import cells, trials
+from swarmjax.evaluate.cells import Cell, Suite
+from swarmjax.evaluate.trials import Entrant, Trial
 
 _WIDTH = 100  # of a line of a suite's file
 
@@ -73,7 +75,7 @@ def _renew(settings: SuiteConfig) -> Suite:
     file = config.read_suite(settings.suite)
     wanted = file.cells
     if settings.policies is not None:
-        entrants = evaluate_run.read_policies(evaluate.list_files("policies", settings.policies))
+        entrants = trials.read_policies(evaluate.list_files("policies", settings.policies))
         wanted = tuple(_search(settings, each, entrants) for each in wanted)
     suite = Suite(file.name, tuple(cells.draw_cell(each) for each in wanted))
     path = compose.suite_path(settings.suite)
@@ -113,7 +115,7 @@ def _search(settings: SuiteConfig, cell: CellConfig, entrants: Sequence[Entrant]
     progress.disable = not progress.console.is_terminal
     with progress:
         bar = progress.add_task(cell.name, total=settings.pool * len(entrants))
-        (trial,) = evaluate_run.run(judged, [pool], entrants, partial(progress.advance, bar))
+        (trial,) = trials.run(judged, [pool], entrants, partial(progress.advance, bar))
     chosen = choose(trial, cell.levels)
     return replace(cell, episodes=tuple(chosen.tolist()), digest=None)
 
@@ -172,7 +174,7 @@ def _show(console: Console, suite: Suite) -> None:
 
 def _row(cell: Cell) -> list[str]:
     stage = cell.stage
-    lost = np.isinf(evaluate_run.ways(EvaluateConfig(policy="", stage=stage), cell.levels))
+    lost = np.isinf(trials.ways(EvaluateConfig(policy="", stage=stage), cell.levels))
     numbers = (stage.robots, stage.obstacles, f"{'-'.join(f'{x:g}' for x in set(stage.sides))} m")
     words = (cell.shape, cell.realism or "-", len(cell.episodes), int(lost.any(axis=-1).sum()))
     return [str(each) for each in (cell.name, *numbers, *words, cell.digest[:12])]

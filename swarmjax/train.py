@@ -16,10 +16,11 @@ from typing import Any
 
 import jax
 
-from swarmjax import command, config, export, provenance
+from swarmjax import command, config, provenance
 from swarmjax.config import ConfigError, TrainConfig
 from swarmjax.curriculum import engine as curriculum
 from swarmjax.curriculum.engine import Schedule
+from swarmjax.export import __main__ as export
 from swarmjax.run import checkpoint, compile_cache, memory, warm_start
 from swarmjax.run.checkpoint import CheckpointError
 from swarmjax.run.display import Display

@@ -4,10 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from swarmjax import cells, config, evaluate_judge, evaluate_run, replay_record
+from swarmjax import config
 from swarmjax.config import ReplayConfig
-from swarmjax.evaluate_judge import Judge
-from swarmjax.replay_record import Episode, Recording, Scene
+from swarmjax.evaluate import cells, trials
+from swarmjax.evaluate import judge as evaluate_judge
+from swarmjax.evaluate.judge import Judge
+from swarmjax.replay import record as replay_record
+from swarmjax.replay.record import Episode, Recording, Scene
 
 SMALL = ("stage.robots=3", "stage.side=0.9", "stage.obstacles=2")
 
@@ -15,7 +18,7 @@ SMALL = ("stage.robots=3", "stage.side=0.9", "stage.obstacles=2")
 def judge(settings: ReplayConfig) -> Judge:
     """The judge of the first policy on the stage of a replay."""
     cell = cells.load(settings.evaluation).cells[0]
-    (entrant,) = evaluate_run.read_policies(settings.policies[:1])
+    (entrant,) = trials.read_policies(settings.policies[:1])
     return evaluate_judge.load(settings.evaluation, entrant.policy, cell.half)
 
 

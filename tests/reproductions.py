@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax.reproduce_rows import ARMS, EXPANDED, JUDGED, LAST, Log, Reproduction
+from swarmjax.reproduce.rows import ARMS, EXPANDED, JUDGED, LAST, Log, Reproduction
 
 SEEDS = (0, 1, 2)
 FACTS = {

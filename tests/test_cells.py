@@ -14,9 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sentences import refusal
 
-from swarmjax import cells, compose, config
-from swarmjax.cells import Suite
+from swarmjax import compose, config
 from swarmjax.config import ConfigError, EvaluateConfig, StageConfig
+from swarmjax.evaluate import cells
+from swarmjax.evaluate.cells import Suite
 
 NAMES = compose.choices("suites")
 # Suites of levels that others have too: to be compared with them level by level, or picked out.

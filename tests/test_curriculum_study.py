@@ -16,8 +16,9 @@ from sentences import refusal
 from benchmarks import curriculum, curriculum_arms, curriculum_table
 from benchmarks.curriculum_arms import StudyConfig
 from benchmarks.curriculum_table import Key
-from swarmjax import command, config, evaluate_mjx
+from swarmjax import command, config
 from swarmjax.config import TrainConfig
+from swarmjax.evaluate import engine_mjx
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.task import env, level
@@ -175,9 +176,9 @@ def test_the_judge_gives_means_by_seed_and_stage(trained: TrainConfig) -> None:
     learners.params["actor"]["mean"]["bias"] += np.array([[[1.0, 0.0]], [[0.5, 0.3]]], np.float32)
     found = curriculum.load_judge(study, trained, judged)(learners)
     world = env.load(replace(trained, arenas=4, algo=replace(trained.algo, minibatches=1)))
-    alone = jax.jit(partial(evaluate_mjx.outcomes, world, steps=trained.task.step_limit))
+    alone = jax.jit(partial(engine_mjx.outcomes, world, steps=trained.task.step_limit))
     for role, stage in judged.items():
-        levels = evaluate_mjx.draw_levels(world, stage, 5, 4)
+        levels = engine_mjx.draw_levels(world, stage, 5, 4)
         for seed in range(2):
             outcome = alone(jax.tree.map(lambda x, i=seed: x[i], learners), levels)
             for name, values in outcome._asdict().items():

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks import engines
-from swarmjax.cells import Cell
 from swarmjax.config import StageConfig
-from swarmjax.evaluate_run import Trial
+from swarmjax.evaluate.cells import Cell
+from swarmjax.evaluate.trials import Trial
 from swarmjax.settings import ConfigError
 
 

@@ -13,21 +13,15 @@ import pytest
 import steering
 from steering import SPEED, STAY, STEP
 
-from swarmjax import (
-    cells,
-    command,
-    compose,
-    config,
-    evaluate,
-    evaluate_run,
-    evaluate_summary,
-    policy,
-    statistics,
-)
-from swarmjax.cells import Cell
+from swarmjax import command, compose, config, policy
 from swarmjax.config import EvaluateConfig, RealismConfig, RobotConfig, StageConfig, TaskConfig
-from swarmjax.evaluate_run import Trial
-from swarmjax.measures import MEASURES
+from swarmjax.evaluate import __main__ as evaluate
+from swarmjax.evaluate import cells, statistics
+from swarmjax.evaluate import summary as evaluate_summary
+from swarmjax.evaluate import trials as evaluate_run
+from swarmjax.evaluate.cells import Cell
+from swarmjax.evaluate.measures import MEASURES
+from swarmjax.evaluate.trials import Trial
 from swarmjax.settings import build, to_dict
 from swarmjax.task import observation
 
@@ -319,7 +313,9 @@ def test_a_suite_that_is_not_pooled_has_no_row_of_all(
 def test_unreachable_targets_are_shown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(evaluate_run.paths, "shortest", lambda side, start, *_: _lost(start))
+    monkeypatch.setattr(
+        evaluate_run.shortest_path, "shortest", lambda side, start, *_: _lost(start)
+    )
     path = steering.write(tmp_path / "policy.npz")
     words = (f"policy={path}", "stage=s1", "episodes=3", "steps=2", "workers=1")
     assert _command(monkeypatch, *words, f"out={tmp_path}/r.json") == 0

@@ -14,7 +14,7 @@ import pytest
 import steering
 from steering import AHEAD, SPEED, SPIN, STAY, STEER, STEP, STRIDE
 
-from swarmjax import config, evaluate_c, evaluate_rays, policy
+from swarmjax import config, policy
 from swarmjax.config import (
     ConfigError,
     EvaluateConfig,
@@ -25,8 +25,10 @@ from swarmjax.config import (
     TaskConfig,
     TrainConfig,
 )
-from swarmjax.evaluate_c import Arenas
-from swarmjax.evaluate_judge import Judge
+from swarmjax.evaluate import engine_c
+from swarmjax.evaluate import rays as evaluate_rays
+from swarmjax.evaluate.engine_c import Arenas
+from swarmjax.evaluate.judge import Judge
 from swarmjax.policy import PolicyError
 from swarmjax.sim import gaps, infrared, model, noise, physics
 from swarmjax.task import electronics, env, observation, shapes
@@ -47,14 +49,14 @@ def _judge(tmp_path: Path, stage: StageConfig, drive: tuple = STEER, **rest: Any
     path = steering.write(tmp_path / "policy.npz", drive)
     robot = rest.pop("robot", RobotConfig())  # planar, whose motion is worked out by hand
     config = EvaluateConfig(policy=str(path), stage=stage, robot=robot, **rest)
-    return evaluate_c.load(config, policy.load(path))
+    return engine_c.load(config, policy.load(path))
 
 
 def _start(
     judge: Judge, pose: list, target: list | None = None, obstacle: list | None = None
 ) -> Arenas:
     """Starts one arena by hand; without a target it lies far ahead, out of reach."""
-    return evaluate_c.start(judge, [_level(judge, pose, target, obstacle)])
+    return engine_c.start(judge, [_level(judge, pose, target, obstacle)])
 
 
 def _level(
@@ -80,12 +82,12 @@ def _level(
 
 def _run(judge: Judge, arenas: Arenas, steps: int) -> Arenas:
     for _ in range(steps):
-        arenas = evaluate_c.step(judge, arenas)
+        arenas = engine_c.step(judge, arenas)
     return arenas
 
 
 def _draw_some(judge: Judge, episodes: Sequence[int]) -> list[Level]:
-    return [evaluate_c.draw_level(judge.stage, judge.spacing, 1, number) for number in episodes]
+    return [engine_c.draw_level(judge.stage, judge.spacing, 1, number) for number in episodes]
 
 
 def _pose(arenas: Arenas) -> np.ndarray:
@@ -197,9 +199,7 @@ def test_a_control_step_is_that_many_steps_of_mujoco(tmp_path: Path) -> None:
     pose = [[-0.1, 0.02, 0.1], [0.1, 0.0, 2.5]]
     box = [[0.0, 0.15, 0.3, 0.05, 0.05]]
     arenas = _run(judge, _start(judge, pose, obstacle=box), 50)
-    data = evaluate_c.place(
-        judge, judge.model, np.array(pose, np.float32), np.array(box, np.float32)
-    )
+    data = engine_c.place(judge, judge.model, np.array(pose, np.float32), np.array(box, np.float32))
     data.ctrl = [SPEED, 0.0, 0.0] * 2
     # Float32 rounds the policy's action, which contacts do not magnify here.
     mujoco.mj_step(judge.model, data, 150)
@@ -216,7 +216,7 @@ def test_touching_is_a_gap_below_zero(tmp_path: Path) -> None:
     box[..., 2] *= 8.0
     box[..., 3:] = 0.05
     data = np.empty(count, object)
-    data[:] = [evaluate_c.place(judge, judge.model, *each) for each in zip(pose, box, strict=True)]
+    data[:] = [engine_c.place(judge, judge.model, *each) for each in zip(pose, box, strict=True)]
     gap = np.stack(
         [
             gaps.gaps(p.astype(float), judge.stage.side, b.astype(float), 0.037, np)
@@ -224,7 +224,7 @@ def test_touching_is_a_gap_below_zero(tmp_path: Path) -> None:
         ]
     )
     assert np.abs(gap).min() > 1e-7  # float32 in the walls' quaternions moves them by 1e-8 m
-    touching = evaluate_c.touching(judge, data)
+    touching = engine_c.touching(judge, data)
     assert touching.mean(axis=(0, 1)).min() > 0.1  # every kind occurs
     np.testing.assert_array_equal(touching, gap <= 0.0)
 
@@ -232,14 +232,14 @@ def test_touching_is_a_gap_below_zero(tmp_path: Path) -> None:
 def test_the_walls_stand_where_the_level_says(tmp_path: Path) -> None:
     """Of arenas whose side is drawn: a robot 5 mm away sees it, one 1 mm inside touches it."""
     judge = _judge(tmp_path, _stage(robots=1, side=(0.6, 1.4)))
-    drawn = [evaluate_c.draw_level(judge.stage, judge.spacing, 1, i) for i in range(20)]
+    drawn = [engine_c.draw_level(judge.stage, judge.spacing, 1, i) for i in range(20)]
     sides = [level.side for level in drawn]
     assert max(sides) - min(sides) > 0.4
     for gap in (0.005, -0.001):
         wall = [np.array([[0.5 * side - 0.037 - gap, 0.0, 0.0]], np.float32) for side in sides]
         levels = [level._replace(start=x) for level, x in zip(drawn, wall, strict=True)]
-        arenas = evaluate_c.start(judge, levels)
-        touched = evaluate_c.touching(judge, arenas.data)
+        arenas = engine_c.start(judge, levels)
+        touched = engine_c.touching(judge, arenas.data)
         assert (touched.any(axis=(1, 2)) == (gap < 0)).all()
         if gap > 0:
             nearest = arenas.observation[:, 0, :8].min(axis=-1)
@@ -251,8 +251,8 @@ def test_the_judge_counts_what_the_training_environment_counts(tmp_path: Path) -
     stage = _stage(robots=3, side=0.7, obstacles=1)
     judge = _judge(tmp_path, stage)
     # An episode in which robots meet one another and the obstacle, and all arrive.
-    drawn = evaluate_c.draw_level(judge.stage, judge.spacing, 1, 65)
-    arenas = evaluate_c.start(judge, [drawn])
+    drawn = engine_c.draw_level(judge.stage, judge.spacing, 1, 65)
+    arenas = engine_c.start(judge, [drawn])
     sim = SimConfig(impl="jax", max_robots=3, max_obstacles=1)
     world = env.load(TrainConfig(stage=(stage,), sim=sim))
     zero = jnp.zeros((), jnp.int32)
@@ -265,7 +265,7 @@ def test_the_judge_counts_what_the_training_environment_counts(tmp_path: Path) -
     for _ in range(168):
         state, came = step(state, policy.act(judge.policy, np.asarray(seen)))
         seen = np.asarray(came.observation)
-        arenas = evaluate_c.step(judge, arenas)
+        arenas = engine_c.step(judge, arenas)
         np.testing.assert_allclose(seen, arenas.observation[0], atol=1e-3)
         np.testing.assert_array_equal(state.arrived, arenas.outcome.arrived[0])
     assert arenas.outcome.arrived.all()
@@ -310,12 +310,12 @@ def engines(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
         return dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
 
     step = jax.jit(lambda state, action: env.step(world, state, action))
-    return Engines(evaluate_c.load(judged, policy.load(path)), world, jax.jit(reset), step)
+    return Engines(engine_c.load(judged, policy.load(path)), world, jax.jit(reset), step)
 
 
 def _draw(engines: Engines) -> Level:
     """An episode in which robots meet one another and the obstacle."""
-    return evaluate_c.draw_level(engines.judge.stage, engines.judge.spacing, 1, 65)
+    return engine_c.draw_level(engines.judge.stage, engines.judge.spacing, 1, 65)
 
 
 def _train(engines: Engines, drawn: Level, steps: int) -> tuple[list[EnvState], list[np.ndarray]]:
@@ -333,7 +333,7 @@ def _train(engines: Engines, drawn: Level, steps: int) -> tuple[list[EnvState], 
 def test_judge_and_training_see_the_same_and_count_the_same(engines: Engines) -> None:
     drawn, steps = _draw(engines), 64
     states, seen = _train(engines, drawn, steps)
-    arenas = evaluate_c.start(engines.judge, [drawn])
+    arenas = engine_c.start(engines.judge, [drawn])
     for theirs, mine in zip(states[0].factors, arenas.factors, strict=True):
         assert (theirs is None) == (mine is None)
         if theirs is not None and mine is not None:
@@ -354,7 +354,7 @@ def test_judge_and_training_see_the_same_and_count_the_same(engines: Engines) ->
         np.testing.assert_array_equal(state.episode.contacts, arenas.outcome.contacts[0])
         np.testing.assert_array_equal(state.arrived, arenas.outcome.arrived[0])
         touched = bool(arenas.outcome.contacts.any())
-        arenas = evaluate_c.step(engines.judge, arenas)
+        arenas = engine_c.step(engines.judge, arenas)
     assert touched
     assert (seen[-1][:, :8] < 0.04).any()
 
@@ -366,8 +366,7 @@ def test_a_level_replays_exactly(engines: Engines) -> None:
     np.testing.assert_array_equal(seen, seen_again)
     np.testing.assert_array_equal(states[-1].sim.qpos, again[-1].sim.qpos)
     first, second = (
-        _run(engines.judge, evaluate_c.start(engines.judge, [drawn, drawn]), steps)
-        for _ in range(2)
+        _run(engines.judge, engine_c.start(engines.judge, [drawn, drawn]), steps) for _ in range(2)
     )
     np.testing.assert_array_equal(first.observation, second.observation)
     np.testing.assert_array_equal(first.observation[0], first.observation[1])
@@ -376,7 +375,7 @@ def test_a_level_replays_exactly(engines: Engines) -> None:
     # What is random about it comes from its seed, and nothing else does.
     other = drawn._replace(seed=drawn.seed ^ np.uint32(1))
     _, elsewhere = _train(engines, other, steps)
-    judged = _run(engines.judge, evaluate_c.start(engines.judge, [other]), steps)
+    judged = _run(engines.judge, engine_c.start(engines.judge, [other]), steps)
     is_random = engines.world.config.realism.name == "real"
     assert (np.array(elsewhere) != np.array(seen)).any() == is_random
     assert (judged.observation[0] != first.observation[0]).any() == is_random
@@ -401,7 +400,7 @@ def _tour(tmp_path: Path, body: BodyName, **realism: Any) -> tuple[np.ndarray, n
     arenas = _start(judge, CROWD, obstacle=BOX)
     path, seen = [], [arenas.observation[0]]
     for _ in range(12):
-        arenas = evaluate_c.step(judge, arenas)
+        arenas = engine_c.step(judge, arenas)
         path.append(model.BODIES[body].pose(arenas.data[0].qpos.copy(), np))
         seen.append(arenas.observation[0])
     return np.array(path), np.array(seen)
@@ -505,16 +504,16 @@ def test_the_judge_sees_how_bright_each_thing_is(tmp_path: Path) -> None:
         reflectance_robot=shade,
     )
     judge = _judge(tmp_path, _stage(robots=3, side=0.7, obstacles=2), realism=real)
-    levels = [evaluate_c.draw_level(judge.stage, judge.spacing, 1, n) for n in range(200)]
+    levels = [engine_c.draw_level(judge.stage, judge.spacing, 1, n) for n in range(200)]
     # Closer together than they would ever start.
     levels = [drawn._replace(start=drawn.start * np.float32([1.0, 0.7, 1.0])) for drawn in levels]
-    arenas = evaluate_c.start(judge, levels)
+    arenas = engine_c.start(judge, levels)
     pose, side, box = (
         np.array([getattr(drawn, name) for drawn in levels], np.float64)
         for name in ("start", "side", "obstacle")
     )
     args = (arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)
-    sight, shades = evaluate_c.look(judge, *args), electronics.reflectance(arenas.factors)
+    sight, shades = engine_c.look(judge, *args), electronics.reflectance(arenas.factors)
     assert shades is not None
     assert sight.reflectance is not None
     ray, bright = infrared.sights(pose, side, box, 0.037, 0.1, shades, None, np)
@@ -535,7 +534,7 @@ def test_each_arena_has_robots_of_its_own(tmp_path: Path, body: BodyName) -> Non
     levels = [
         _level(judge, [[-0.04, 0.0, 0.0], [0.04, 0.0, math.pi]], seed=seed) for seed in range(6)
     ]
-    arenas = evaluate_c.start(judge, levels)
+    arenas = engine_c.start(judge, levels)
     mass = arenas.factors.mass
     assert mass is not None
     for one, found in zip(arenas.model, mass, strict=True):
@@ -551,10 +550,10 @@ def test_each_arena_has_robots_of_its_own(tmp_path: Path, body: BodyName) -> Non
 
 def test_an_episode_does_not_depend_on_those_beside_it(tmp_path: Path) -> None:
     judge = _judge(tmp_path, _stage(robots=3, side=0.7, obstacles=1), steps=150)
-    together = evaluate_c.simulate(judge, _draw_some(judge, range(8)))
+    together = engine_c.simulate(judge, _draw_some(judge, range(8)))
     assert len(set(together.clock.tolist())) > 2  # arenas leave at different times
     for episode in (0, 5, 7):
-        alone = evaluate_c.simulate(judge, _draw_some(judge, [episode]))
+        alone = engine_c.simulate(judge, _draw_some(judge, [episode]))
         for one, all_ in zip(alone, together, strict=True):
             np.testing.assert_array_equal(one[0], all_[episode])
 
@@ -562,10 +561,10 @@ def test_an_episode_does_not_depend_on_those_beside_it(tmp_path: Path) -> None:
 def test_seed_and_number_alone_decide_the_level(tmp_path: Path) -> None:
     judge = _judge(tmp_path, _stage(robots=2, obstacles=2))
     again, other, next_ = (
-        evaluate_c.draw_level(judge.stage, judge.spacing, seed, episode)
+        engine_c.draw_level(judge.stage, judge.spacing, seed, episode)
         for seed, episode in ((1, 4), (2, 4), (1, 5))
     )
-    first = evaluate_c.draw_level(judge.stage, judge.spacing, 1, 4)
+    first = engine_c.draw_level(judge.stage, judge.spacing, 1, 4)
     np.testing.assert_array_equal(first.start, again.start)
     assert (first.start != other.start).any()
     assert (first.start != next_.start).any()
@@ -589,7 +588,7 @@ def test_the_policy_says_how_fast_it_may_ask_for(tmp_path: Path) -> None:
     names = {"names": ["speed", "turn_rate"], "units": ["m/s", "rad/s"]}
     path = steering.write(tmp_path / "policy.npz", AHEAD, action=names | limits)
     config = EvaluateConfig(policy=str(path), stage=_stage(), robot=RobotConfig())
-    judge = evaluate_c.load(config, policy.load(path))
+    judge = engine_c.load(config, policy.load(path))
     arenas = _run(judge, _start(judge, [[0.0, 0.0, 0.0]]), 10)
     assert _pose(arenas)[0, 0, 0] == pytest.approx(10 * 0.05 * STEP, abs=1e-7)  # float32 action
 
@@ -602,17 +601,17 @@ def test_physics_that_breaks_down_is_refused(
     arenas = _start(judge, [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])
     arenas.data[0].qvel[3] = np.nan
     with pytest.raises(ConfigError, match=r"^the physics broke down.*substeps of more than 1.*\.$"):
-        evaluate_c.step(judge, arenas)
+        engine_c.step(judge, arenas)
 
 
 def test_a_policy_of_three_judges_three(tmp_path: Path) -> None:
     path = steering.write(tmp_path / "policy.npz", learners=3, policy="independent")
     config = EvaluateConfig(policy=str(path), stage=_stage(robots=4))
     with pytest.raises(PolicyError, match=r"each of 3 robots, but stage test has 4"):
-        evaluate_c.load(config, policy.load(path))
+        engine_c.load(config, policy.load(path))
     config = EvaluateConfig(policy=str(path), stage=_stage(robots=3), task=TaskConfig(), steps=2)
-    judge = evaluate_c.load(config, policy.load(path))
-    assert evaluate_c.simulate(judge, _draw_some(judge, [0])).clock.tolist() == [2]
+    judge = engine_c.load(config, policy.load(path))
+    assert engine_c.simulate(judge, _draw_some(judge, [0])).clock.tolist() == [2]
 
 
 def test_robots_draw_their_actions(tmp_path: Path) -> None:
@@ -621,9 +620,9 @@ def test_robots_draw_their_actions(tmp_path: Path) -> None:
     learned = judge.policy._replace(log_std=np.log(np.array([[0.2, 0.1]], np.float32)))
     poses = [[-0.2, 0.0, 0.3], [0.2, 0.0, -1.0]]
     levels = [_level(judge, poses, seed=seed) for seed in (4, 5)]
-    arenas = _run(dataclasses.replace(judge, policy=learned), evaluate_c.start(judge, levels), 1)
+    arenas = _run(dataclasses.replace(judge, policy=learned), engine_c.start(judge, levels), 1)
     before = arenas.observation
-    arenas = evaluate_c.step(dataclasses.replace(judge, policy=learned), arenas)
+    arenas = engine_c.step(dataclasses.replace(judge, policy=learned), arenas)
     normal = noise.normal(np.uint32([4, 5]), np.array([1, 1]), noise.Stream.ACTION, (2, 2), np)
     action = policy.act(judge.policy, before) + np.array([0.2, 0.1]) * normal
     speed, turn = np.clip(action, -1, 1).transpose(2, 0, 1)
@@ -640,15 +639,15 @@ def test_robots_draw_their_actions(tmp_path: Path) -> None:
 def test_what_is_drawn_does_not_depend_on_who_is_judged_beside(tmp_path: Path) -> None:
     path = steering.write(tmp_path / "policy.npz", log_std=math.log(0.3))
     given = EvaluateConfig(policy=str(path), stage=_stage(robots=2), robot=RobotConfig(), steps=60)
-    judge = evaluate_c.load(given, policy.load(path))
+    judge = engine_c.load(given, policy.load(path))
     levels = _draw_some(judge, [0, 1, 2])
-    together = evaluate_c.simulate(judge, levels)
+    together = engine_c.simulate(judge, levels)
     for i, one in enumerate(levels):
-        alone = evaluate_c.simulate(judge, [one])
+        alone = engine_c.simulate(judge, [one])
         for whole, mine in zip(together, alone, strict=True):
             np.testing.assert_array_equal(whole[i], mine[0])
-    mean = evaluate_c.load(dataclasses.replace(given, action="mean"), policy.load(path))
-    assert (evaluate_c.simulate(mean, levels).path != together.path).all()
+    mean = engine_c.load(dataclasses.replace(given, action="mean"), policy.load(path))
+    assert (engine_c.simulate(mean, levels).path != together.path).all()
 
 
 # --- what episodes come to
@@ -695,11 +694,11 @@ def test_a_contact_without_overlap_has_no_force(tmp_path: Path) -> None:
         pose = np.array([[*place, 0.0] for place in row])
         arenas = _start(judge, pose.tolist())
         # In double precision, in which 0.074 is twice the hull's radius.
-        arenas.data[0] = evaluate_c.place(judge, judge.model, pose, np.zeros((0, 5)))
+        arenas.data[0] = engine_c.place(judge, judge.model, pose, np.zeros((0, 5)))
         contact = arenas.data[0].contact
         assert contact.dist[0] == 0.0
         assert contact.efc_address[0] == -1
-        pushed = evaluate_c.step(judge, arenas).outcome.impulse[0, :, gaps.KINDS.index("robot")]
+        pushed = engine_c.step(judge, arenas).outcome.impulse[0, :, gaps.KINDS.index("robot")]
         if len(row) == 2:
             assert not pushed.any()
         else:  # robots 0 and 2 overlap by 4 mm; robot 1 touches, and has nothing of their force
@@ -724,7 +723,7 @@ def test_stillness_begins_anew_with_every_two_centimetres(tmp_path: Path) -> Non
     assert 5 * STRIDE > 0.02 > 4 * STRIDE
     seen = []
     for _ in range(2 * stride + 1):
-        arenas = evaluate_c.step(judge, arenas)
+        arenas = engine_c.step(judge, arenas)
         seen.append(arenas.outcome.still[0].tolist())
     assert [a for a, _ in seen] == [1, 2, 3, 4, 0, 1, 2, 3, 4, 0, 1]
     assert [b for _, b in seen] == list(range(1, 12))
@@ -745,7 +744,7 @@ def test_rays_and_contacts_are_those_of_the_shape(tmp_path: Path, shape: Any) ->
         )
         start = np.concatenate([place, random.uniform(-3, 3, (2, 1))], -1)
         levels.append(level._replace(start=start.astype(np.float32)))
-    arenas = evaluate_c.start(judge, levels)
+    arenas = engine_c.start(judge, levels)
     pose, side, box = (
         np.array([getattr(level, name) for level in levels], np.float64)
         for name in ("start", "side", "obstacle")
@@ -754,7 +753,7 @@ def test_rays_and_contacts_are_those_of_the_shape(tmp_path: Path, shape: Any) ->
     expected = infrared.distances(pose, side, box, 0.037, 0.04, np)
     gap = np.stack([gaps.gaps(*each, 0.037, np) for each in zip(pose, side, box, strict=True)])
     assert np.abs(gap).min() > 1e-6
-    touching = evaluate_c.touching(judge, arenas.data)
+    touching = engine_c.touching(judge, arenas.data)
     np.testing.assert_array_equal(touching, gap <= 0.0)
     # A robot sinks 4 mm into things at most; deeper, two rays do not tell what they are inside of.
     real = gap.min(axis=(1, 2)) > -0.004

@@ -13,7 +13,7 @@ import steering
 from policies import EMBODIMENT
 from sentences import refusal
 
-from swarmjax import cells, evaluate, evaluate_judge, evaluate_mjx, policy_file
+from swarmjax import policy_file
 from swarmjax.config import (
     AlgoConfig,
     EvaluateConfig,
@@ -22,9 +22,12 @@ from swarmjax.config import (
     StageConfig,
     TrainConfig,
 )
-from swarmjax.evaluate import Evaluation
-from swarmjax.evaluate_mjx import Outcomes
-from swarmjax.measures import MEASURES
+from swarmjax.evaluate import __main__ as evaluate
+from swarmjax.evaluate import cells, engine_mjx
+from swarmjax.evaluate import judge as evaluate_judge
+from swarmjax.evaluate.__main__ import Evaluation
+from swarmjax.evaluate.engine_mjx import Outcomes
+from swarmjax.evaluate.measures import MEASURES
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.ppo.normalizer import Normalizer
 from swarmjax.task import env, level, observation
@@ -55,7 +58,7 @@ def world() -> World:
 
 @pytest.fixture(scope="module")
 def judge(world: World) -> Run:
-    return jax.jit(partial(evaluate_mjx.outcomes, world, steps=STEPS))
+    return jax.jit(partial(engine_mjx.outcomes, world, steps=STEPS))
 
 
 @pytest.fixture(scope="module", params=STAGES, ids=lambda stage: stage.name)
@@ -65,7 +68,7 @@ def stage(request: pytest.FixtureRequest) -> StageConfig:
 
 @pytest.fixture(scope="module")
 def levels(world: World, stage: StageConfig) -> Level:
-    return evaluate_mjx.draw_levels(world, stage, SEED, EPISODES)
+    return engine_mjx.draw_levels(world, stage, SEED, EPISODES)
 
 
 def _arrays(drives: tuple) -> dict[str, np.ndarray]:
@@ -185,7 +188,7 @@ def test_agrees_with_mujoco_c(
 
 def test_each_learner_drives_its_own_robot(tmp_path: Path, judge: Run, world: World) -> None:
     drives = (STEER, STAY, STEER)
-    levels = evaluate_mjx.draw_levels(world, STAGES[1], SEED, EPISODES)
+    levels = engine_mjx.draw_levels(world, STAGES[1], SEED, EPISODES)
     found = judge(_learners(*drives), levels)
     expected = _by_c(tmp_path, STAGES[1], drives)
     assert np.asarray(found.targets_reached).max() == pytest.approx(2 / 3)  # the second stays
@@ -198,7 +201,7 @@ def test_each_learner_drives_its_own_robot(tmp_path: Path, judge: Run, world: Wo
 
 @pytest.mark.slow
 def test_seeds_side_by_side_are_judged_as_each_alone(judge: Run, world: World) -> None:
-    levels = evaluate_mjx.draw_levels(world, STAGES[0], SEED, EPISODES)
+    levels = engine_mjx.draw_levels(world, STAGES[0], SEED, EPISODES)
     one, two = _learners(STEER), _learners(STAY)
     both = jax.tree.map(lambda a, b: jnp.stack([a, b]), one, two)
     found = jax.vmap(judge, in_axes=(0, None))(both, levels)
@@ -212,7 +215,7 @@ def test_seeds_side_by_side_are_judged_as_each_alone(judge: Run, world: World) -
 
 
 def test_an_episode_whose_physics_breaks_ends_alone(judge: Run, world: World) -> None:
-    levels = evaluate_mjx.draw_levels(world, STAGES[0], SEED, EPISODES)
+    levels = engine_mjx.draw_levels(world, STAGES[0], SEED, EPISODES)
     expected = judge(_learners(STEER), levels)
     start = levels.start.copy()
     start[3, 0, 0] = np.nan
@@ -230,7 +233,7 @@ def test_a_stage_that_does_not_fit_is_refused(world: World) -> None:
     many = StageConfig(name="many", robots=4, side=1.0)
     boxes = StageConfig(name="boxes", robots=1, side=1.0, obstacles=3)
     for stage, key, count in ((many, "robots", 4), (boxes, "obstacles", 3)):
-        sentence = refusal(evaluate_mjx.draw_levels, world, stage, 0, 1)
+        sentence = refusal(engine_mjx.draw_levels, world, stage, 0, 1)
         assert f"{key} is {count}" in sentence
         assert f"sim.max_{key}={count}" in sentence
 
@@ -282,7 +285,7 @@ def test_the_engines_of_the_command_agree(
 
 def test_boxes_beyond_what_the_engine_is_compiled_for_are_refused() -> None:
     config = EvaluateConfig(policy="p", stage=STAGES[0], engine="mjx")
-    sentence = refusal(evaluate_mjx.load, config, np.array([[0.2, 0.05]]), 2)
+    sentence = refusal(engine_mjx.load, config, np.array([[0.2, 0.05]]), 2)
     assert sentence.startswith("stage s1: a box is 0.4 m long, but engine=mjx takes up to 0.3 m")
 
 
@@ -290,9 +293,9 @@ def test_an_engine_that_breaks_down_is_reported(tmp_path: Path) -> None:
     path = steering.write(tmp_path / "policy.npz")
     config = EvaluateConfig(policy=str(path), stage=STAGES[0], robot=RobotConfig(), episodes=3)
     (cell,) = cells.load(config).cells
-    world = evaluate_mjx.load(config, cell.half, 3)
+    world = engine_mjx.load(config, cell.half, 3)
     start = cell.levels.start.copy()
     start[1, 0, 0] = np.nan
     levels = cell.levels._replace(start=start)
-    sentence = refusal(evaluate_mjx.play, world, levels, policy_file.read(path), 3)
+    sentence = refusal(engine_mjx.play, world, levels, policy_file.read(path), 3)
     assert sentence.startswith("the physics of 1 of 3 episodes broke down")

@@ -11,8 +11,10 @@ import pytest
 from policies import saved
 from sentences import refusal
 
-from swarmjax import command, config, export, export_folder, policy_file
+from swarmjax import command, config, policy_file
 from swarmjax.config import ConfigError, ExportConfig, TrainConfig
+from swarmjax.export import __main__ as export
+from swarmjax.export import folder as export_folder
 
 FORMATS = {"npz": "policy.npz", "onnx": "policy.onnx", "c": "policy_c", "webots": "swarmjax_epuck"}
 

@@ -13,8 +13,11 @@ import policies
 import pytest
 from policies import Arrays, saved, several
 
-from swarmjax import export_c, export_folder, export_onnx, policy
+from swarmjax import policy
 from swarmjax.config import AlgoConfig
+from swarmjax.export import c as export_c
+from swarmjax.export import folder as export_folder
+from swarmjax.export import onnx as export_onnx
 from swarmjax.policy import Policy
 from swarmjax.ppo import networks, normalizer
 

@@ -11,8 +11,10 @@ import policies
 import pytest
 from policies import saved, several
 
-from swarmjax import epuck, export_c, export_folder, policy
+from swarmjax import epuck, policy
 from swarmjax.config import AlgoConfig, RobotConfig
+from swarmjax.export import c as export_c
+from swarmjax.export import folder as export_folder
 from swarmjax.policy import Policy
 from swarmjax.sim import drive
 

@@ -8,7 +8,8 @@ import policies
 import pytest
 from policies import saved, several
 
-from swarmjax import export_onnx, policy
+from swarmjax import policy
+from swarmjax.export import onnx as export_onnx
 
 onnx = pytest.importorskip("onnx", reason="needs the package onnx")
 runtime = pytest.importorskip("onnxruntime", reason="needs the package onnxruntime")

@@ -15,9 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from policies import saved, several
 
-from swarmjax import epuck, export, policy, webots_controller
-from swarmjax import export_webots as webots
+from swarmjax import epuck, policy
 from swarmjax.config import RealismConfig, RobotConfig, TaskConfig
+from swarmjax.export import __main__ as export
+from swarmjax.export import webots, webots_controller
 from swarmjax.policy import Policy
 from swarmjax.sim import drive, response
 from swarmjax.task import electronics as task_electronics

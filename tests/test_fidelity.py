@@ -12,8 +12,9 @@ from sentences import refusal
 from benchmarks import fidelity, fidelity_body, fidelity_infrared, fidelity_motion, pages, rig
 from benchmarks.fidelity_row import Row, beside
 from benchmarks.rig import Rig
-from swarmjax import config, evaluate_judge
+from swarmjax import config
 from swarmjax.config import RobotConfig
+from swarmjax.evaluate import judge as evaluate_judge
 
 BODIES = pytest.mark.parametrize("body", ["planar", "wheeled"])
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from swarmjax import measures
-from swarmjax.measures import MEASURES, Outcome
+from swarmjax.evaluate import measures
+from swarmjax.evaluate.measures import MEASURES, Outcome
 
 STEP, STEPS = 0.1, 30  # s; control steps of an episode
 

@@ -10,8 +10,9 @@ from sentences import refusal
 
 from benchmarks import cpu_paper_way, mujoco_arena
 from benchmarks.mujoco_arena import Arena
-from swarmjax import evaluate_c, policy
+from swarmjax import policy
 from swarmjax.config import EvaluateConfig
+from swarmjax.evaluate import engine_c
 from swarmjax.task import observation, reward
 
 STEPS = 150
@@ -24,9 +25,9 @@ def settings() -> EvaluateConfig:
 
 def test_an_arena_does_what_the_judge_does(settings: EvaluateConfig, tmp_path: Path) -> None:
     trained = policy.load(steering.write(tmp_path / "p.npz"))
-    judge = evaluate_c.load(settings, trained)
-    levels = [evaluate_c.draw_level(judge.stage, judge.spacing, 3, n) for n in range(5, 7)]
-    judged = evaluate_c.simulate(judge, levels)
+    judge = engine_c.load(settings, trained)
+    levels = [engine_c.draw_level(judge.stage, judge.spacing, 3, n) for n in range(5, 7)]
+    judged = engine_c.simulate(judge, levels)
     arena = Arena(settings, first=5)
     for n in range(2):
         seen, over, steps = arena.reset(), False, 0

@@ -7,7 +7,7 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from swarmjax import paths
+from swarmjax.evaluate import shortest_path
 
 HULL, REACH = 0.037, 0.05
 # One right angle around a corner, along points outside of it: 0.8 mm.
@@ -18,7 +18,7 @@ def _shortest(
     start: list[float], target: list[float], boxes: list[list[float]], side: float = 2.0
 ) -> float:
     """Of one robot, m."""
-    found = paths.shortest(
+    found = shortest_path.shortest(
         np.array([side]),
         np.array([[start]]),
         np.array([[target]]),
@@ -154,5 +154,5 @@ def _free_places(random: np.random.Generator, boxes: np.ndarray) -> tuple[np.nda
     """Two places of the arena that no box covers."""
     while True:
         place = random.uniform(-0.55, 0.55, (2, 2))
-        if len(paths._free(place, boxes, HULL + 0.01, 0.55)) == 2:
+        if len(shortest_path._free(place, boxes, HULL + 0.01, 0.55)) == 2:
             return place[0], place[1]

@@ -14,8 +14,10 @@ import policies
 import pytest
 from policies import Arrays, forge, saved, several
 
-from swarmjax import command, evaluate, export, policy, policy_file
+from swarmjax import command, policy, policy_file
 from swarmjax.config import EvaluateConfig, ExportConfig
+from swarmjax.evaluate import __main__ as evaluate
+from swarmjax.export import __main__ as export
 from swarmjax.policy import MAX_BYTES, PolicyError
 
 

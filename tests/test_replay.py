@@ -13,10 +13,12 @@ import replays
 import steering
 from sentences import refusal
 
-from swarmjax import cells, command, config, policy_file, replay
+from swarmjax import command, config, policy_file
 from swarmjax.config import CellConfig, ReplayConfig, StageConfig
+from swarmjax.evaluate import cells
 from swarmjax.policy import PolicyError
-from swarmjax.replay import Pick
+from swarmjax.replay import __main__ as replay
+from swarmjax.replay.__main__ import Pick
 
 ROOT = Path(replay.__file__).resolve().parents[1]
 QUICK = (*replays.SMALL, "steps=40", "workers=1")

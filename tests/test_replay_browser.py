@@ -11,8 +11,10 @@ import pytest
 import replays
 import steering
 
-from swarmjax import config, policy_file, replay_pack, replay_page
-from swarmjax.replay_record import Recording
+from swarmjax import config, policy_file
+from swarmjax.replay import pack as replay_pack
+from swarmjax.replay import page as replay_page
+from swarmjax.replay.record import Recording
 
 pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 from selenium.webdriver.common.action_chains import ActionChains

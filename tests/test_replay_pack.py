@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from sentences import refusal
 
-from swarmjax import replay_pack
 from swarmjax.config import ConfigError
-from swarmjax.replay_record import Recording
+from swarmjax.replay import pack as replay_pack
+from swarmjax.replay.record import Recording
 
 
 def _unfold(planes: bytes, rows: int, columns: int, width: int) -> np.ndarray:

@@ -8,7 +8,8 @@ from html.parser import HTMLParser
 import replays
 import steering
 
-from swarmjax import config, policy_file, replay_page
+from swarmjax import config, policy_file
+from swarmjax.replay import page as replay_page
 
 HOSTILE = "</script><script>document.title='in'</script><img src=x onerror=alert(1)>&amp;"
 

@@ -12,10 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sentences import refusal
 
-from swarmjax import cells, config, evaluate_c, policy_file, replay_record
+from swarmjax import config, policy_file
 from swarmjax.config import RewardConfig, TaskConfig
+from swarmjax.evaluate import cells, engine_c
 from swarmjax.policy import PolicyError
-from swarmjax.replay_record import Steps
+from swarmjax.replay import record as replay_record
+from swarmjax.replay.record import Steps
 from swarmjax.sim import infrared
 from swarmjax.task import reward
 
@@ -92,7 +94,7 @@ def test_a_recording_is_what_the_judge_saw(steer):
     settings = config.load_replay([f"policy={steer}", *words])
     levels = cells.split(cells.load(settings.evaluation).cells[0].levels)
     for number, recording in zip(settings.levels, found, strict=True):
-        alone = evaluate_c.simulate(judge, [levels[number]])
+        alone = engine_c.simulate(judge, [levels[number]])
         assert len(recording.pose) == alone.clock[0] + 1
         np.testing.assert_array_equal(recording.arrival, alone.arrival[0])
         np.testing.assert_array_equal(recording.contacts[-1], alone.contacts[0])

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import replays
 
-from swarmjax import config, replay_video
+from swarmjax import config
 from swarmjax.config import ConfigError, ReplayConfig
+from swarmjax.replay import video as replay_video
 
 ROOT = Path(replay_video.__file__).resolve().parents[1]
 

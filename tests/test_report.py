@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from runs import row, write
 
-from swarmjax import command, report
+from swarmjax import command
 from swarmjax.config import ReportConfig
+from swarmjax.report import __main__ as report
 
 
 def _run(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:

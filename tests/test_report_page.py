@@ -8,8 +8,9 @@ from pathlib import Path
 
 from runs import row, write
 
-from swarmjax import report_page, report_rows
-from swarmjax.report_rows import History
+from swarmjax.report import page as report_page
+from swarmjax.report import rows as report_rows
+from swarmjax.report.rows import History
 
 FIGURES = {"mix": b"\x89PNG-mix", "success": b"\x89PNG-success"}
 

@@ -8,8 +8,8 @@ import pytest
 from runs import CONFIG, row, write
 from sentences import refusal
 
-from swarmjax import report_rows
 from swarmjax.config import CurriculumConfig, StageConfig
+from swarmjax.report import rows as report_rows
 
 NAN = np.nan
 

@@ -7,8 +7,11 @@ from pathlib import Path
 import pytest
 from sentences import refusal
 
-from swarmjax import command, compose, reproduce, reproduce_page, reproduce_rows
+from swarmjax import command, compose
 from swarmjax.config import ReproduceConfig, load_reproduce
+from swarmjax.reproduce import __main__ as reproduce
+from swarmjax.reproduce import page as reproduce_page
+from swarmjax.reproduce import rows as reproduce_rows
 
 # Eight updates of 64 control steps; the world is the paper's.
 TINY = [

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 from sentences import refusal
 
-from swarmjax import config, reproduce_arms
+from swarmjax import config
 from swarmjax.config import ARMS, ReproduceConfig, TrainConfig, load_train
+from swarmjax.reproduce import arms as reproduce_arms
 from swarmjax.run.trainer import Stop
 
 OUT = Path("somewhere") / "a=b, c"

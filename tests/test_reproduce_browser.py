@@ -9,7 +9,7 @@ import chromium
 import pytest
 from reproductions import whole
 
-from swarmjax import reproduce_page
+from swarmjax.reproduce import page as reproduce_page
 
 pytestmark = chromium.needed
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from reproductions import log, reproduction
 
-from swarmjax import reproduce_claims as claims
-from swarmjax.reproduce_claims import CLAIMS, Outcome, Reading
-from swarmjax.reproduce_measures import NUMBER, SHARE
-from swarmjax.reproduce_rows import ARMS, EXPANDED, LAST, Reproduction
+from swarmjax.reproduce import claims
+from swarmjax.reproduce.claims import CLAIMS, Outcome, Reading
+from swarmjax.reproduce.measures import NUMBER, SHARE
+from swarmjax.reproduce.rows import ARMS, EXPANDED, LAST, Reproduction
 
 BY_NAME = {claim.name: claim for claim in CLAIMS}
 

@@ -10,10 +10,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 from reproductions import log, reproduction, whole
 
-from swarmjax import reproduce_figures as figures
-from swarmjax import reproduce_measures as measures
-from swarmjax import reproduce_rows
-from swarmjax.reproduce_rows import LAST
+from swarmjax.reproduce import figures, measures
+from swarmjax.reproduce import rows as reproduce_rows
+from swarmjax.reproduce.rows import LAST
 
 PAIR = ("curriculum", "baseline")
 

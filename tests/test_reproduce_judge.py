@@ -8,7 +8,7 @@ import pytest
 import steering
 from steering import STAY, STEER, STRIDE
 
-from swarmjax import cells, config, evaluate_c, policy, reproduce_judge
+from swarmjax import config, policy
 from swarmjax.config import (
     EvaluateConfig,
     ReproduceConfig,
@@ -18,7 +18,9 @@ from swarmjax.config import (
     TaskConfig,
     TrainConfig,
 )
-from swarmjax.reproduce_judge import Task
+from swarmjax.evaluate import cells, engine_c
+from swarmjax.reproduce import judge as reproduce_judge
+from swarmjax.reproduce.judge import Task
 
 RADIUS = TaskConfig().target_radius
 
@@ -31,9 +33,9 @@ def _play(tmp_path: Path, drive: tuple) -> tuple:
         policy=str(path), stage=stage, robot=RobotConfig(), steps=150, episodes=4
     )
     levels = cells.split(cells.draw_stage(settings, range(4)).levels)
-    judge = evaluate_c.load(settings, policy.load(path))
+    judge = engine_c.load(settings, policy.load(path))
     away = np.array([np.hypot(*(each.start[:, :2] - each.target).T) for each in levels])
-    return reproduce_judge.play(judge, levels), evaluate_c.simulate(judge, levels), away
+    return reproduce_judge.play(judge, levels), engine_c.simulate(judge, levels), away
 
 
 def test_episodes_are_those_of_the_judge(tmp_path: Path) -> None:

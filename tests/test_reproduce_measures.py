@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reproductions import log, reproduction
 
-from swarmjax import reproduce_measures as measures
-from swarmjax.reproduce_rows import LAST
-from swarmjax.statistics import Interval
+from swarmjax.evaluate.statistics import Interval
+from swarmjax.reproduce import measures
+from swarmjax.reproduce.rows import LAST
 
 THREE_ROBOTS = log(
     [True] * 3,

@@ -10,8 +10,9 @@ import pytest
 from reproductions import SEEDS, episode, row, whole, write
 from sentences import refusal
 
-from swarmjax import reproduce_claims, reproduce_page
-from swarmjax.reproduce_rows import ARMS, EXPANDED, LAST
+from swarmjax.reproduce import claims as reproduce_claims
+from swarmjax.reproduce import page as reproduce_page
+from swarmjax.reproduce.rows import ARMS, EXPANDED, LAST
 
 PAIR = ("curriculum", "baseline")
 HOSTILE = "</style><script>alert(1)</script>"

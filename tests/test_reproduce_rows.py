@@ -8,8 +8,9 @@ import pytest
 from reproductions import SEEDS, episode, row, whole, write
 from sentences import refusal
 
-from swarmjax import config, reproduce_rows
-from swarmjax.reproduce_rows import EXPANDED, LAST
+from swarmjax import config
+from swarmjax.reproduce import rows as reproduce_rows
+from swarmjax.reproduce.rows import EXPANDED, LAST
 
 PAIR = ("curriculum", "baseline")
 

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarmjax import command, config, export, train
+from swarmjax import command, config, train
 from swarmjax.config import TrainConfig
+from swarmjax.export import __main__ as export
 from swarmjax.run import checkpoint, warm_start
 from swarmjax.run.checkpoint import CheckpointError, Checkpoints, digest
 from swarmjax.run.warm_start import Source

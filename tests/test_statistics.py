@@ -11,8 +11,15 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from scipy import stats
 
-from swarmjax import statistics
-from swarmjax.statistics import bootstrap, curve, cvar, iqm, paired, probability_of_improvement
+from swarmjax.evaluate import statistics
+from swarmjax.evaluate.statistics import (
+    bootstrap,
+    curve,
+    cvar,
+    iqm,
+    paired,
+    probability_of_improvement,
+)
 
 ROUNDING = 1e-12  # of sums of numbers up to 100 in double precision, some in another order
 FINITE = st.floats(-100, 100, width=32)

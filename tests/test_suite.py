@@ -9,10 +9,11 @@ import pytest
 import steering
 import yaml
 
-from swarmjax import cells, command, compose, config, suite
-from swarmjax.cells import Cell
+from swarmjax import command, compose, config, suite
 from swarmjax.config import StageConfig, SuiteConfig
-from swarmjax.evaluate_run import Trial
+from swarmjax.evaluate import cells
+from swarmjax.evaluate.cells import Cell
+from swarmjax.evaluate.trials import Trial
 
 TEXT = """# What it is,
 # in two lines.

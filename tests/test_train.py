@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarmjax import command, config, export, policy, train
+from swarmjax import command, config, policy, train
 from swarmjax.config import ExportConfig, TrainConfig
 from swarmjax.curriculum import engine as curriculum
+from swarmjax.export import __main__ as export
 from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import CheckpointError, Checkpoints, digest
 

@@ -12,8 +12,9 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from swarmjax import config, export
+from swarmjax import config
 from swarmjax.config import ConfigError, TrainConfig
+from swarmjax.export import __main__ as export
 from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import CheckpointError, Leaves
 from swarmjax.training.loop import TrainState

@@ -8,8 +8,9 @@ import jax
 import numpy as np
 import pytest
 
-from swarmjax import export, policy
+from swarmjax import policy
 from swarmjax.config import TrainConfig, load_train
+from swarmjax.export import __main__ as export
 from swarmjax.ppo import learner as ppo
 from swarmjax.run.checkpoint import to_leaves
 from swarmjax.training import loop, seeds

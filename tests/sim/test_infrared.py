@@ -11,9 +11,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from swarmjax import evaluate_c, evaluate_rays
 from swarmjax.config import EvaluateConfig, RobotConfig, StageConfig
-from swarmjax.evaluate_judge import Judge
+from swarmjax.evaluate import engine_c
+from swarmjax.evaluate import rays as evaluate_rays
+from swarmjax.evaluate.judge import Judge
 from swarmjax.policy import Policy
 from swarmjax.sim import infrared
 from swarmjax.task import observation
@@ -262,7 +263,7 @@ def _judge(stage: StageConfig) -> Judge:
         meta={"observation": observation.describe("metric")},
         digest="",
     )
-    return evaluate_c.load(EvaluateConfig(policy="", stage=stage, robot=RobotConfig()), policy)
+    return engine_c.load(EvaluateConfig(policy="", stage=stage, robot=RobotConfig()), policy)
 
 
 ROBOTS, BOXES, ARENAS = 5, 2, 200
@@ -305,9 +306,7 @@ def test_distances_are_those_of_mujoco_at_1000_random_poses(xp: ModuleType) -> N
     judge = _judge(StageConfig(name="test", robots=ROBOTS, side=SIDE, obstacles=BOXES))
     pose, box = _scenes()
     data = np.empty(ARENAS, object)
-    data[:] = [
-        evaluate_c.place(judge, judge.model, *scene) for scene in zip(pose, box, strict=True)
-    ]
+    data[:] = [engine_c.place(judge, judge.model, *scene) for scene in zip(pose, box, strict=True)]
     seen_by_mujoco, _ = evaluate_rays.cast_rays(
         judge.scene, data, pose.astype(float), box.astype(float)
     )

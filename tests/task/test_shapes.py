@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from swarmjax.config import Shape, StageConfig
-from swarmjax.evaluate_judge import draw_level
+from swarmjax.evaluate.judge import draw_level
 from swarmjax.task import shapes
 from swarmjax.task import stage as task_stage
 from swarmjax.task.level import Level, Spacing

@@ -1,0 +1,1 @@
+"""Judges policies on levels that they never saw."""

@@ -1,0 +1,194 @@
+"""`python -m swarmjax.evaluate policy=FILE suite=stages`: judges policies on levels never seen.
+
+`cells.py` says which levels, `trials.py` runs the episodes, `summary.py` sums them up; here they
+are put together, and the result is written and shown.
+"""
+
+import json
+import os
+import sys
+from collections.abc import Sequence
+from functools import partial
+from glob import glob
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.console import Console
+from rich.progress import Progress
+
+from swarmjax import command, config
+from swarmjax.config import ConfigError, EvaluateConfig
+from swarmjax.evaluate import cells, judge, summary
+from swarmjax.evaluate import table as evaluate_table
+from swarmjax.evaluate import trials as evaluate_run
+from swarmjax.evaluate.cells import Suite
+from swarmjax.evaluate.trials import Entrant, Trial
+from swarmjax.settings import show
+
+PLAIN_WIDTH = 160  # columns of a table that goes to a file
+
+
+class Evaluation(NamedTuple):
+    """What an evaluation found.
+
+    Attributes:
+        result: Plain data for JSON; docs/interface.md lists it.
+        entrants: The policies, those of both sides of a comparison.
+        trials: What they came to, a cell each; rows as `entrants`.
+    """
+
+    result: dict[str, Any]
+    entrants: list[Entrant]
+    trials: list[Trial]
+
+
+def evaluate(settings: EvaluateConfig, progress: Progress | None = None) -> Evaluation:
+    """Judges policies.
+
+    Args:
+        settings: Of the evaluation.
+        progress: To show how far it is; None shows nothing.
+
+    Returns:
+        What it found.
+
+    Raises:
+        PolicyError: If a policy is unsound, or does not fit the levels.
+        ConfigError: If a file is missing, a suite unsound, or the physics breaks down.
+    """
+    sides = [evaluate_run.read_policies(each) for each in _sides(settings)]
+    entrants = [each for side in sides for each in side]
+    for stage in cells.stages(settings):  # before levels are drawn, which takes a while
+        for path, trained in entrants:
+            judge.check_policy(stage, path, trained)
+    suite = cells.load(settings)
+    total = len(entrants) * sum(len(cell.episodes) for cell in suite.cells)
+    progress = progress or Progress(disable=True)
+    bar = progress.add_task("episodes", total=total)
+    report = partial(progress.advance, bar)
+    trials = evaluate_run.run(settings, suite.cells, entrants, report)
+    return Evaluation(_sum_up(settings, suite, sides, trials), entrants, trials)
+
+
+def _sum_up(
+    settings: EvaluateConfig, suite: Suite, sides: list[list[Entrant]], trials: list[Trial]
+) -> dict[str, Any]:
+    if settings.compare is None:
+        return summary.result(settings, suite.name, sides[0], trials)
+    first, second = sides
+    part = len(first)
+    pair = ([_rows(t, slice(part)) for t in trials], [_rows(t, slice(part, None)) for t in trials])
+    return summary.comparison(settings, suite.name, (first, second), pair)
+
+
+def _rows(trial: Trial, rows: slice) -> Trial:
+    """Keeps some of the policies of a trial."""
+    found = {name: table[rows] for name, table in trial.found.items()}
+    return trial._replace(found=found, arrival=trial.arrival[rows])
+
+
+def _sides(settings: EvaluateConfig) -> list[list[str]]:
+    """Lists the files to judge: of one recipe, or of the two that are compared."""
+    if settings.policy is not None:
+        return [list_files("policy", settings.policy)]
+    parts = (settings.compare or "").split(",")
+    if len(parts) != 2 or not all(parts):
+        raise ConfigError(
+            f"compare is {show(settings.compare)}: give two files or patterns, as in a.npz,b.npz."
+        )
+    sides = [list_files("compare", part) for part in parts]
+    first, second = map(len, sides)
+    if first != second:
+        raise ConfigError(
+            f"compare is {show(settings.compare)}, which is {first} against {second}: give as many "
+            "policies on both sides, those of the same seeds in the same order."
+        )
+    return sides
+
+
+def list_files(key: str, text: str) -> list[str]:
+    """Lists the files that a word of the command line names.
+
+    Args:
+        key: Of the word.
+        text: Paths and patterns such as `runs/a-seed*.npz`, with commas between them.
+
+    Returns:
+        Paths, those of a pattern in alphabetical order.
+
+    Raises:
+        ConfigError: If a pattern matches nothing, or a file is named twice.
+    """
+    found: list[str] = []
+    for part in [text] if os.path.isfile(text) else text.split(","):
+        matches = sorted(glob(part)) if set(part) & set("*?[") else [part]
+        if not matches or not part:
+            raise ConfigError(f"{key} is {show(text)}, and {show(part)} matches no file.")
+        found += matches
+    for file in found:
+        if found.count(file) > 1:
+            raise ConfigError(f"{key} is {show(text)}, which names {file} twice: give it once.")
+    return found
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    settings = config.load_evaluate(arguments)
+    out = None if settings.out is None else Path(settings.out)
+    if out is not None:
+        _check_out(out)
+    progress = Progress(console=Console(stderr=True), transient=True)
+    progress.disable = not progress.console.is_terminal
+    try:
+        with progress:
+            found = evaluate(settings, progress)
+    except KeyboardInterrupt:
+        sys.stderr.write("swarmjax.evaluate: interrupted, nothing was written.\n")
+        return command.INTERRUPTED
+    if out is not None:
+        _write(out, found, settings.steps * settings.task.control_step)
+    console = Console()
+    if not console.is_terminal:
+        console.width = PLAIN_WIDTH
+    evaluate_table.show(console, found.result)
+    return 0
+
+
+def _check_out(path: Path) -> None:
+    """Makes the folder of the result, before there is one to lose."""
+    is_file = path.suffix == ".json"
+    folder = path.parent if is_file else path
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(path, error.strerror) from None
+    if is_file and path.is_dir():
+        raise _unwritable(path, "it is a folder")
+    if not os.access(path if path.exists() else folder, os.W_OK):
+        raise _unwritable(path, "permission denied")
+
+
+def _write(path: Path, found: Evaluation, limit: float) -> None:
+    """Writes a JSON file, or a folder with all there is; `limit` is that of an episode, s."""
+    text = json.dumps(found.result, indent=2, allow_nan=False) + "\n"
+    try:
+        if path.suffix == ".json":
+            path.write_text(text)
+            return
+        (path / "result.json").write_text(text)
+        evaluate_table.write_levels(path / "levels.csv", found.entrants, found.trials)
+        if "policies" in found.result:
+            from swarmjax.evaluate import figures  # Matplotlib, a second in every process
+
+            for name, content in figures.draw(found.result, found.trials, limit).items():
+                (path / f"{name}.png").write_bytes(content)
+    except OSError as error:
+        raise _unwritable(path, error.strerror) from None
+
+
+def _unwritable(path: Path, reason: str | None) -> ConfigError:
+    return ConfigError(f"out is {path}, which cannot be written: {reason}.")
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("evaluate", main, EvaluateConfig))

@@ -1,0 +1,348 @@
+"""Cells: sets of levels that policies are judged on, drawn from numbers or read from a file.
+
+A suite is a list of cells with a digest over the levels of each, so that whoever draws them knows
+that they are the same to the last bit. Levels of a suite are drawn for the nominal e-puck.
+"""
+
+import io
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from swarmjax import config as settings
+from swarmjax import epuck, policy, policy_file
+from swarmjax.config import CellConfig, ConfigError, EvaluateConfig, Shape, StageConfig, TaskConfig
+from swarmjax.evaluate import judge
+from swarmjax.settings import build, show, to_dict
+from swarmjax.task import level, shapes
+from swarmjax.task import stage as task_stage
+from swarmjax.task.level import Level
+
+FORMAT = 1
+_TARGET_RADIUS = TaskConfig().target_radius
+MAX_BYTES = 2**30  # of all levels of a file; those of a thousand of s6 take 0.2 MB
+
+
+class Cell(NamedTuple):
+    """Levels of one kind.
+
+    Attributes:
+        name: Of the cell.
+        stage: Its numbers.
+        shape: Of the obstacles.
+        realism: Name of a preset, or None for that of the command.
+        seed: That the levels were drawn with.
+        episodes: [E] their numbers.
+        levels: [E], obstacles as the boxes that they are put together of, of the same sizes in all.
+    """
+
+    name: str
+    stage: StageConfig
+    shape: Shape
+    realism: str | None
+    seed: int
+    episodes: np.ndarray
+    levels: Level
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over the names, types, shapes and bytes of the level's arrays."""
+        return policy.digest(_arrays(self))
+
+    @property
+    def half(self) -> np.ndarray:
+        """[M, 2] half edges of the boxes, m."""
+        return self.levels.obstacle[0, :, 3:]
+
+
+class Suite(NamedTuple):
+    """Cells under a name; None if they are one stage's."""
+
+    name: str | None
+    cells: tuple[Cell, ...]
+
+
+def load(config: EvaluateConfig) -> Suite:
+    """Draws or reads the levels that an evaluation is about.
+
+    Args:
+        config: Of the evaluation.
+
+    Returns:
+        The suite that it names, or one cell of its stage.
+
+    Raises:
+        ConfigError: If the suite is unsound, or made for smaller robots or other targets.
+    """
+    if config.suite is None:
+        return Suite(None, (draw_stage(config, range(config.episodes)),))
+    if config.robot.hull_radius > epuck.HULL_RADIUS:
+        raise ConfigError(
+            f"robot.hull_radius is {show(config.robot.hull_radius)}, but suites are drawn for "
+            f"{epuck.HULL_RADIUS}: give at most that."
+        )
+    if config.task.target_radius != _TARGET_RADIUS:
+        raise ConfigError(
+            f"task.target_radius is {show(config.task.target_radius)}, but suites are drawn for "
+            f"{_TARGET_RADIUS}: give that."
+        )
+    if Path(config.suite).suffix == ".npz":
+        return read(Path(config.suite))
+    return draw(config.suite)
+
+
+def stages(config: EvaluateConfig) -> list[StageConfig]:
+    """Lists the stages of an evaluation's levels, before any is drawn; none of a file of levels."""
+    if config.suite is None:
+        return [config.stage]
+    if Path(config.suite).suffix == ".npz":
+        return []
+    return [cell.stage for cell in settings.read_suite(config.suite).cells]
+
+
+def draw(choice: str) -> Suite:
+    """Draws the levels of a suite and holds them to their digests.
+
+    Args:
+        choice: A name of configs/suites/, or the path of a .yaml file.
+
+    Returns:
+        The suite.
+
+    Raises:
+        ConfigError: If the file is unsound, or a digest is missing or off.
+    """
+    file = settings.read_suite(choice)
+    found = []
+    for each in file.cells:
+        if each.digest is None:
+            raise ConfigError(
+                f"cell {each.name} of suite {file.name} has no digest: draw it with "
+                f"python -m swarmjax.suite suite={choice} write=true."
+            )
+        found.append(draw_cell(each))
+        _check_digest(found[-1], each.digest, f"suite {file.name}")
+    return Suite(file.name, tuple(found))
+
+
+def draw_stage(config: EvaluateConfig, numbers: Sequence[int]) -> Cell:
+    """Draws levels of an evaluation's stage, for its robot and targets.
+
+    Args:
+        config: Of the evaluation; its suite is not read.
+        numbers: [E] of the levels.
+
+    Returns:
+        The cell, under the stage's name.
+    """
+    stage, shape = config.stage, config.shape
+    radii = (config.robot.hull_radius, config.task.target_radius)
+    levels = _draw(stage, shape, config.seed, numbers, radii)
+    return Cell(stage.name, stage, shape, None, config.seed, np.array(numbers), levels)
+
+
+def draw_cell(cell: CellConfig) -> Cell:
+    """Draws the levels of a cell of a suite, whatever its digest."""
+    numbers, radii = cell.episodes or range(cell.levels), (epuck.HULL_RADIUS, _TARGET_RADIUS)
+    levels = _draw(cell.stage, cell.shape, cell.seed, numbers, radii)
+    episodes = np.array(numbers)
+    return Cell(cell.name, cell.stage, cell.shape, cell.realism, cell.seed, episodes, levels)
+
+
+def _draw(
+    stage: StageConfig,
+    shape: Shape,
+    seed: int,
+    numbers: Sequence[int],
+    radii: tuple[float, float],
+) -> Level:
+    """Draws levels of these numbers, for hulls and targets of these radii, m."""
+    one = task_stage.select(task_stage.stack([stage]), np.intp(0))
+    spacing = level.Spacing(stage.robots, stage.obstacles, *radii)
+    draw = judge.draw_level
+    drawn = [shapes.expand(draw(one, spacing, seed, each), shape) for each in numbers]
+    return Level(*(np.stack(fields) for fields in zip(*drawn, strict=True)))
+
+
+def split(levels: Level) -> list[Level]:
+    """Takes stacked levels [E] apart."""
+    return [Level(*each) for each in zip(*levels, strict=True)]
+
+
+def _check_digest(cell: Cell, expected: str, where: str) -> None:
+    if cell.digest != expected:
+        raise ConfigError(
+            f"cell {cell.name} of {where} has the digest {cell.digest[:12]}..., but "
+            f"{expected[:12]}... is written down: these are other levels."
+        )
+
+
+def _arrays(cell: Cell) -> dict[str, np.ndarray]:
+    return {"episode": cell.episodes, **cell.levels._asdict()}
+
+
+# --- files
+
+
+def write(path: Path, suite: Suite) -> None:
+    """Writes levels for other tools, whole or not at all; docs/evaluation.md lists the fields.
+
+    Args:
+        path: Of the .npz file.
+        suite: The levels.
+
+    Raises:
+        ConfigError: If it cannot be written.
+    """
+    arrays = {f"{c.name}/{name}": x for c in suite.cells for name, x in _arrays(c).items()}
+    keys = ("name", "shape", "realism", "seed", "digest")
+    about = [
+        {"stage": to_dict(cell.stage), **{key: getattr(cell, key) for key in keys}}
+        for cell in suite.cells
+    ]
+    meta = json.dumps({"format": FORMAT, "suite": suite.name, "cells": about})
+    try:
+        with policy_file.replacing(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **{"meta": np.array(meta), **arrays})
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be written: {error.strerror or error}.") from None
+
+
+def read(path: Path) -> Suite:
+    """Reads levels that `write` or another tool has written, and checks all of them.
+
+    Args:
+        path: Of the .npz file.
+
+    Returns:
+        The suite.
+
+    Raises:
+        ConfigError: If anything about it is unsound.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise ConfigError(f"suite {path} is {size} bytes: {MAX_BYTES} are read at most.")
+        content = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"suite {path} cannot be read: {error.strerror or error}.") from None
+    try:
+        return _parse(_unpack(content))
+    except ConfigError as error:
+        raise ConfigError(f"suite {path}: {error}") from None
+
+
+def _unpack(content: bytes) -> dict[str, np.ndarray]:
+    """Reads the arrays of an archive, none of them pickled, and none larger than it may be."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > MAX_BYTES:
+            raise ValueError(f"it unpacks to more than {MAX_BYTES} bytes")
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            return dict(arrays)
+    except Exception as error:  # whatever a damaged file makes zipfile and NumPy raise
+        reason = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
+        raise ConfigError(f"it cannot be read: {reason}.") from None
+
+
+def _parse(arrays: dict[str, np.ndarray]) -> Suite:
+    meta = _parse_meta(arrays.pop("meta", None))
+    cells = [_parse_cell(about, arrays) for about in meta["cells"]]
+    if arrays:
+        raise ConfigError(f"{sorted(arrays)[0]} is not known: no cell of it is listed.")
+    return Suite(str(meta["suite"]), tuple(cells))
+
+
+def _parse_meta(array: np.ndarray | None) -> dict[str, Any]:
+    """Reads what the file says of itself."""
+    try:
+        meta = json.loads(str(array))
+    except (ValueError, RecursionError):
+        raise ConfigError("meta is missing or no JSON: it is no suite of this project.") from None
+    if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+        raise ConfigError(f"meta.format is not {FORMAT}: it is no suite that this version reads.")
+    cells = meta.get("cells")
+    if not isinstance(meta.get("suite"), str) or not isinstance(cells, list) or not cells:
+        raise ConfigError("meta.suite or meta.cells is missing: give a name and a list.")
+    names = [cell.get("name") if isinstance(cell, dict) else None for cell in cells]
+    if len(set(map(str, names))) < len(names):
+        raise ConfigError("meta.cells names a cell more than once: give each name once.")
+    return meta
+
+
+def _parse_cell(about: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Cell:
+    """Takes a cell's arrays out of those of the file."""
+    if not isinstance(about, Mapping):
+        raise ConfigError(f"meta.cells holds {show(about)}: give keys and values.")
+    name = str(about.get("name"))
+    numbers = arrays.get(f"{name}/episode")
+    # The same checks as of a suite's file.
+    size = 0 if numbers is None else numbers.size
+    cell = build(CellConfig, {"levels": size, **about}, f"cell {name}: ")
+    if cell.digest is None:
+        raise ConfigError(f"cell {name}: digest is missing.")
+    count, robots = cell.levels, cell.stage.robots
+    boxes = arrays.get(f"{name}/obstacle")
+    obstacles = boxes.shape[1] if boxes is not None and boxes.ndim == 3 else 0
+    expected = {
+        "episode": (np.int64, (count,)),
+        "side": (np.float32, (count,)),
+        "present": (np.bool_, (count, robots)),
+        "start": (np.float32, (count, robots, 3)),
+        "target": (np.float32, (count, robots, 2)),
+        "obstacle_present": (np.bool_, (count, obstacles)),
+        "obstacle": (np.float32, (count, obstacles, 5)),
+        "seed": (np.uint32, (count,)),
+    }
+    fields = {key: _take(arrays, f"{name}/{key}", *form) for key, form in expected.items()}
+    episodes = fields.pop("episode")
+    levels = Level(**fields)
+    _check_levels(name, levels, cell.stage)
+    found = Cell(name, cell.stage, cell.shape, cell.realism, cell.seed, episodes, levels)
+    _check_digest(found, cell.digest, "the file")
+    return found
+
+
+def _take(
+    arrays: dict[str, np.ndarray], name: str, dtype: type, shape: tuple[int, ...]
+) -> np.ndarray:
+    """Takes one array out of a file's, which must be just this."""
+    if name not in arrays:
+        raise ConfigError(f"{name} is missing.")
+    array = arrays.pop(name)
+    if array.dtype != dtype or array.shape != shape:
+        raise ConfigError(
+            f"{name} is {array.dtype} {list(array.shape)}: expected {np.dtype(dtype)} "
+            f"{list(shape)}."
+        )
+    if not np.isfinite(array).all():
+        raise ConfigError(f"{name} holds numbers that are not finite.")
+    return array
+
+
+def _check_levels(name: str, levels: Level, stage: StageConfig) -> None:
+    """Refuses levels that no arena can be set up for."""
+    half = 0.5 * levels.side[:, None, None]
+    low, high = (np.float32(end) for end in stage.sides)
+    place, boxes = np.abs(levels.obstacle[..., :2]), levels.obstacle[..., 3:]
+    beyond = half + np.hypot(boxes[..., :1], boxes[..., 1:])  # of the circle about a box
+    rules = {
+        f"side is outside {show(stage.sides)} m": (levels.side < low) | (levels.side > high),
+        "present is not all true": ~levels.present,
+        "start lies outside the walls": np.abs(levels.start[..., :2]) > half,
+        "target lies outside the walls": np.abs(levels.target) > half,
+        "obstacle has half edges of 0 or less": boxes <= 0.0,
+        "obstacle has half edges that differ from level to level": boxes != boxes[:1],
+        "obstacle lies outside the walls": levels.obstacle_present[..., None] & (place > half),
+        "obstacle is not present, but stands inside the walls": ~levels.obstacle_present
+        & (place < beyond).all(axis=-1),
+    }
+    for what, broken in rules.items():
+        if broken.any():
+            raise ConfigError(f"cell {name}: {what}.")

@@ -1,0 +1,408 @@
+"""Episodes in MuJoCo's C engine: the independent judge of policies.
+
+The policy is NumPy, the engine is not the one that trained, its solver converges, and the
+infrared sensors are MuJoCo's rays on the real shapes. Only the rules of the task are shared with
+training; `task/env.py` is what a step here mirrors. No JAX.
+
+Episode n of a seed starts from the same level whatever else is asked for, and every arena is
+computed on its own, so that a result does not depend on how the work is split up.
+"""
+
+import copy
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from swarmjax import policy, policy_file
+from swarmjax.config import ConfigError
+from swarmjax.evaluate import measures, rays
+from swarmjax.evaluate.judge import Judge
+from swarmjax.evaluate.judge import draw_level as draw_level
+from swarmjax.evaluate.judge import load as load
+from swarmjax.evaluate.measures import Outcome
+from swarmjax.sim import drive as sim_drive
+from swarmjax.sim import gaps, noise
+from swarmjax.sim import model as sim_model
+from swarmjax.sim.noise import Stream
+from swarmjax.task import electronics, level, observation
+from swarmjax.task import factors as task_factors
+from swarmjax.task.electronics import Memory, Sight
+from swarmjax.task.factors import Factors
+
+
+class Arenas(NamedTuple):
+    """Arenas between two control steps. Of these, MuJoCo edits `data` in place.
+
+    Attributes:
+        model: [A] of `MjModel`, all the same one unless robots differ from the nominal one.
+        data: [A] of `MjData`, positions up to date.
+        factors: [A] of the episodes.
+        memory: [A] of the robots' electronics.
+        target: [A, R, 2] x (m), y (m).
+        obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+        seed: [A] uint32 of the levels.
+        pose: [A, R, 3] x (m), y (m), yaw (rad).
+        observation: [A, R, O].
+        apart: [A, R, 3] for how long there was no contact of each kind, s.
+        anchor: [A, R, 2] place near which a robot has stayed of late, m.
+        outcome: Since the start.
+    """
+
+    model: np.ndarray
+    data: np.ndarray
+    factors: Factors
+    memory: Memory
+    target: np.ndarray
+    obstacle: np.ndarray
+    seed: np.ndarray
+    pose: np.ndarray
+    observation: np.ndarray
+    apart: np.ndarray
+    anchor: np.ndarray
+    outcome: Outcome
+
+
+def simulate(judge: Judge, levels: Sequence[level.Level]) -> Outcome:
+    """Runs episodes side by side, each until all its robots have arrived or the time is out.
+
+    Args:
+        judge: What the arenas share.
+        levels: What they start from.
+
+    Returns:
+        What they came to, in their order.
+
+    Raises:
+        ConfigError: If the physics of an episode breaks down.
+    """
+    rows, arenas = np.arange(len(levels)), start(judge, levels)
+    total = Outcome(*(np.zeros_like(field) for field in arenas.outcome))
+    for _ in range(judge.config.steps):
+        arenas = step(judge, arenas)
+        for whole, part in zip(total, arenas.outcome, strict=True):
+            whole[rows] = part
+        running = ~arenas.outcome.arrived.all(axis=-1)
+        if not running.all():
+            rows, arenas = rows[running], _select(arenas, running)
+        if not len(rows):
+            break
+    return total
+
+
+def _select(tree: Any, rows: Any) -> Any:
+    """Keeps some of the arenas, in tuples of arrays however deep."""
+    if tree is None:
+        return None
+    if isinstance(tree, np.ndarray):
+        return tree[rows]
+    return type(tree)(*(_select(part, rows) for part in tree))
+
+
+def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
+    """Starts episodes.
+
+    Args:
+        judge: What the arenas share.
+        levels: [A], with the robots of the judge's stage, and boxes of the sizes it has.
+
+    Returns:
+        The arenas at rest, observed.
+    """
+    pose, target, obstacle, seed, side = (
+        np.stack([getattr(each, name) for each in levels])
+        for name in ("start", "target", "obstacle", "seed", "side")
+    )
+    pose, target, obstacle = (x.astype(np.float64) for x in (pose, target, obstacle))
+    realism, robot, boxes = judge.config.realism, judge.config.robot, obstacle.shape[1]
+    factors = task_factors.draw(seed, realism, robot, judge.spacing.robots, boxes, np)
+    model = _models(judge, factors, len(levels))
+    data = np.empty(len(levels), object)
+    data[:] = [place(judge, *each) for each in zip(model, pose, obstacle, side, strict=True)]
+    outcome = _no_outcome(len(levels), judge.spacing.robots)
+    sight = look(judge, data, factors, pose, target, obstacle)
+    memory, seen = electronics.begin(judge.electronics, factors, sight, outcome.clock, np)
+    return Arenas(
+        model=model,
+        data=data,
+        factors=factors,
+        memory=memory,
+        target=target,
+        obstacle=obstacle,
+        seed=seed,
+        pose=pose,
+        observation=seen,
+        apart=np.full(outcome.contacts.shape, gaps.CONTACT_PAUSE),
+        anchor=pose[..., :2],
+        outcome=outcome,
+    )
+
+
+def _no_outcome(count: int, robots: int) -> Outcome:
+    """Returns what episodes have come to that have just begun."""
+    none = np.zeros((count, robots), np.int64)
+    by_kind = np.zeros((count, robots, len(gaps.KINDS)), np.int64)
+    return Outcome(
+        clock=none[:, 0],
+        arrived=none.astype(bool),
+        arrival=none,
+        contacts=by_kind,
+        touched=by_kind,
+        impulse=by_kind.astype(np.float64),
+        sensed=none,
+        moving=none,
+        path=none.astype(np.float64),
+        still=none,
+    )
+
+
+def _models(judge: Judge, factors: Factors, count: int) -> np.ndarray:
+    """Returns the models [A] of arenas, each with the robots that its episode has."""
+    models = np.full(count, judge.model, object)
+    chassis = electronics.chassis(factors)
+    if all(part is None for part in chassis):
+        return models
+    body = sim_model.BODIES[judge.config.robot.body]
+    for i in range(count):
+        models[i] = copy.copy(judge.model)
+        mine = _select(chassis, i)
+        changes = body.changes(mine, judge.ids.robots, judge.config.robot, judge.model)
+        for name, (rows, values) in changes.items():
+            getattr(models[i], name)[rows] = values
+        # What MuJoCo derives from them: it reads the inertia of a planar robot from there.
+        mujoco.mj_setConst(models[i], mujoco.MjData(models[i]))
+    return models
+
+
+def place(
+    judge: Judge,
+    model: mujoco.MjModel,
+    pose: np.ndarray,
+    obstacle: np.ndarray,
+    side: np.float32 | None = None,
+) -> mujoco.MjData:
+    """Sets an arena up, at rest.
+
+    Args:
+        judge: What the arenas share.
+        model: Of the arena.
+        pose: [R, 3] x (m), y (m), yaw (rad).
+        obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m; those the model was compiled for).
+        side: Of the arena, m; the stage's if there is none.
+
+    Returns:
+        The arena, its positions up to date.
+    """
+    data = mujoco.MjData(model)
+    length = np.float64(judge.stage.side if side is None else side)
+    where, turn = sim_model.fixture_poses(length, obstacle, np)
+    data.mocap_pos[judge.ids.fixture_mocap] = where
+    data.mocap_quat[judge.ids.fixture_mocap] = turn
+    data.qpos = sim_model.BODIES[judge.config.robot.body].qpos(pose, np)
+    mujoco.mj_step1(model, data)
+    return data
+
+
+def step(judge: Judge, arenas: Arenas) -> Arenas:
+    """Moves arenas on by one control step; what happens in it is what `task.env.step` says.
+
+    Args:
+        judge: What the arenas share.
+        arenas: Their state before.
+
+    Returns:
+        Their state after.
+
+    Raises:
+        ConfigError: If a position is not finite.
+    """
+    task, active = judge.config.task, ~arenas.outcome.arrived
+    memory, pose, impulse = _drive(judge, arenas, active)
+    sight = look(judge, arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)
+    arrives = active & (sight.distance <= task.target_radius)
+    touches = touching(judge, arenas.data)
+    gap = np.where(touches, 0.0, np.inf)
+    begins, apart = gaps.count_contacts(gap, arenas.apart, task.control_step, np)
+    clock = arenas.outcome.clock + 1
+    memory, seen = electronics.sense(judge.electronics, memory, arenas.factors, sight, clock, np)
+    step = _Step(active, arrives, begins, touches, impulse, sight.ray < task.sensor_range)
+    anchor, outcome = _tally(arenas, pose, step)
+    return arenas._replace(
+        memory=memory, pose=pose, observation=seen, apart=apart, anchor=anchor, outcome=outcome
+    )
+
+
+class _Step(NamedTuple):
+    """What happened in a control step: [A, R], with three kinds of contact or K rays each.
+
+    `active` was on its way before it; `near` are the rays that met something.
+    """
+
+    active: np.ndarray
+    arrives: np.ndarray
+    begins: np.ndarray
+    touches: np.ndarray
+    impulse: np.ndarray
+    near: np.ndarray
+
+
+def _tally(arenas: Arenas, pose: np.ndarray, step: _Step) -> tuple[np.ndarray, Outcome]:
+    """Adds a control step to what episodes have come to; returns it with the new anchors."""
+    before, clock = arenas.outcome, arenas.outcome.clock + 1
+    driven = np.linalg.norm(pose[..., :2] - arenas.pose[..., :2], axis=-1)
+    away = np.linalg.norm(pose[..., :2] - arenas.anchor, axis=-1) > measures.STILL_RADIUS
+    return np.where(away[..., None], pose[..., :2], arenas.anchor), Outcome(
+        clock=clock,
+        arrived=before.arrived | step.arrives,
+        arrival=np.where(step.arrives, clock[:, None], before.arrival),
+        contacts=before.contacts + step.begins,
+        touched=before.touched + step.touches,
+        impulse=before.impulse + step.impulse,
+        sensed=before.sensed + (step.active & step.near.any(axis=-1)),
+        moving=before.moving + step.active,
+        path=before.path + np.where(step.active, driven, 0.0),
+        still=np.where(away, 0, before.still + 1),
+    )
+
+
+def _drive(
+    judge: Judge, arenas: Arenas, active: np.ndarray
+) -> tuple[Memory, np.ndarray, np.ndarray]:
+    """Lets the robots that are on their way drive.
+
+    Returns:
+        Memory, new poses [A, R, 3], and impulses [A, R, 3] (N s) by kind of contact.
+    """
+    wanted = sim_drive.command(_act(judge, arenas), judge.drive, np)
+    memory, wheels = electronics.drive(
+        judge.electronics,
+        arenas.memory,
+        arenas.factors,
+        wanted,
+        judge.drive,
+        arenas.outcome.clock,
+        np,
+    )
+    wheels = np.where(active[..., None], wheels, 0.0)
+    body, robot = sim_model.BODIES[judge.config.robot.body], judge.config.robot
+    ctrl = body.ctrl(wheels, electronics.chassis(arenas.factors), robot, np)
+    pushes: list[_Pushes] = []
+    for each in zip(arenas.model, arenas.data, ctrl, strict=True):
+        pushes += _advance(judge, *each)
+    qpos = np.stack([data.qpos for data in arenas.data])
+    if not np.isfinite(qpos).all():
+        raise ConfigError(
+            "the physics broke down, with positions that are not finite: give substeps of more "
+            f"than {judge.substeps}, or a robot nearer to the real one."
+        )
+    return memory, body.pose(qpos, np), _impulses(judge, pushes, len(arenas.data))
+
+
+def _act(judge: Judge, arenas: Arenas) -> np.ndarray:
+    """Lets the policy act, [A, R, U]; what is drawn follows from the level and the clock."""
+    if judge.config.action == "mean":
+        return policy.act(judge.policy, arenas.observation)
+    shape = (arenas.pose.shape[1], len(policy_file.ACTION_NAMES))
+    normal = noise.normal(arenas.seed, arenas.outcome.clock, Stream.ACTION, shape, np)
+    return policy.act(judge.policy, arenas.observation, normal)
+
+
+class _Pushes(NamedTuple):
+    """Contacts [N] that push, of one arena in one physics step: geoms [N, 2], normal forces, N."""
+
+    geom: np.ndarray
+    force: np.ndarray
+
+
+def _advance(
+    judge: Judge, model: mujoco.MjModel, data: mujoco.MjData, ctrl: np.ndarray
+) -> list[_Pushes]:
+    """Moves one arena on by a control step; returns the contacts of each physics step."""
+    data.ctrl = ctrl
+    pushes = []
+    # The halves of mj_step, the other way round: the positions that the rays of this control
+    # step need are those that the next one starts from. In between forces are those of the
+    # contacts that are listed. Contacts of hulls are without friction: their one row of the
+    # solver is the normal force.
+    for _ in range(judge.substeps):
+        mujoco.mj_step2(model, data)
+        # One at a distance of exactly 0 is listed, but not among those that are solved for.
+        solved = data.contact.efc_address >= 0
+        force = data.efc_force[data.contact.efc_address[solved]]
+        pushes.append(_Pushes(data.contact.geom[solved], force))
+        mujoco.mj_step1(model, data)
+    return pushes
+
+
+def _impulses(judge: Judge, pushes: list[_Pushes], arenas: int) -> np.ndarray:
+    """Adds forces of contacts up, [A, R, 3] N s, in the order of `gaps.KINDS`.
+
+    Args:
+        judge: What the arenas share.
+        pushes: [A * substeps], those of an arena one after the other.
+        arenas: A.
+
+    Returns:
+        [A, R, 3]; robots that touch each other both have the impulse.
+    """
+    counts = [len(each.force) for each in pushes]
+    arena = np.repeat(np.arange(len(pushes)) // judge.substeps, counts)
+    first, second = np.concatenate([each.geom for each in pushes]).T
+    force = np.concatenate([each.force for each in pushes])
+    shape = (arenas, judge.spacing.robots, len(gaps.KINDS))
+    total = np.zeros(math.prod(shape))
+    for mine, other in ((first, second), (second, first)):
+        hull = np.flatnonzero(judge.geom_robot[mine] >= 0)
+        where = (arena[hull], judge.geom_robot[mine[hull]], judge.geom_kind[other[hull]])
+        flat = np.ravel_multi_index(where, shape)
+        total += np.bincount(flat, weights=force[hull], minlength=len(total))
+    return total.reshape(shape) * judge.model.opt.timestep
+
+
+def touching(judge: Judge, data: np.ndarray) -> np.ndarray:
+    """Tells which robots touch anything, by the contacts that MuJoCo found.
+
+    Args:
+        judge: What the arenas share.
+        data: [A] of `MjData`, positions up to date.
+
+    Returns:
+        [A, R, 3] bool, in the order of `gaps.KINDS`.
+    """
+    pairs = [each.contact.geom for each in data]
+    arena = np.repeat(np.arange(len(data)), [len(pair) for pair in pairs])
+    first, second = np.concatenate(pairs).T
+    found = np.zeros((len(data), judge.spacing.robots, len(gaps.KINDS)), bool)
+    for mine, other in ((first, second), (second, first)):
+        hull = judge.geom_robot[mine] >= 0
+        found[arena[hull], judge.geom_robot[mine[hull]], judge.geom_kind[other[hull]]] = True
+    return found
+
+
+def look(
+    judge: Judge,
+    data: np.ndarray,
+    factors: Factors,
+    pose: np.ndarray,
+    target: np.ndarray,
+    obstacle: np.ndarray,
+) -> Sight:
+    """Finds out what there is to be sensed.
+
+    Args:
+        judge: What the arenas share.
+        data: [A] of `MjData`, positions up to date.
+        factors: [A] of the episodes.
+        pose: [A, R, 3] x (m), y (m), yaw (rad).
+        target: [A, R, 2] x (m), y (m).
+        obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+
+    Returns:
+        What the sensors have before them.
+    """
+    mount, shades = electronics.mount(factors), electronics.reflectance(factors)
+    ray, geom = rays.cast_rays(judge.scene, data, pose, obstacle, mount)
+    bright = None if shades is None else rays.brightness(judge.scene, shades, geom)
+    return Sight(ray, bright, *observation.to_target(pose, target, np))

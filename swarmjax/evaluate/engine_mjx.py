@@ -1,0 +1,384 @@
+"""Judges policies where they are trained: many arenas at once, on the device.
+
+The levels are those of `swarmjax.evaluate`, drawn by the same function from the same seed, and so
+are the rules and the figures. The engine is not: this is the one that trained, with its analytic
+sensors and its few solver steps, and MuJoCo C stays the judge that results are published by. It
+costs little, which is what a study needs that asks again and again while its policies learn.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from swarmjax.config import (
+    AlgoConfig,
+    ConfigError,
+    EvaluateConfig,
+    SimConfig,
+    StageConfig,
+    TrainConfig,
+)
+from swarmjax.evaluate import judge, measures
+from swarmjax.evaluate.measures import Outcome
+from swarmjax.policy import Policy
+from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.learner import LearnerState
+from swarmjax.sim import noise, physics
+from swarmjax.sim.noise import Stream
+from swarmjax.task import electronics, env, level
+from swarmjax.task import stage as task_stage
+from swarmjax.task.env import EnvState, World
+from swarmjax.task.level import Level, Spacing
+from swarmjax.training import rollout
+
+LARGEST_BOX = 0.3  # m; the largest that a stage takes
+_ACTIVATIONS = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}
+
+
+class Outcomes(NamedTuple):
+    """What episodes came to, [E] each; the first four as `measures.per_level` names them.
+
+    Attributes:
+      targets_reached: share of targets reached, 0..1.
+      all_reached: 1 where every robot arrived, else 0.
+      contacts_per_robot: contacts of all kinds, a robot.
+      episode_time_s: until all robots arrived or the time was out, s.
+      broken: 1 where the physics ceased to be finite, which ended the episode there, else 0.
+    """
+
+    targets_reached: Array
+    all_reached: Array
+    contacts_per_robot: Array
+    episode_time_s: Array
+    broken: Array
+
+
+def draw_levels(world: World, stage: StageConfig, seed: int, episodes: int) -> Level:
+    """Draws the levels that `swarmjax.evaluate` starts from, with room for the world's robots.
+
+    Args:
+      world: the compiled environment, of a config with this stage or one of obstacles as large.
+      stage: of the levels.
+      seed: of the evaluation.
+      episodes: E.
+
+    Returns:
+      [E] levels, as NumPy arrays; robots and obstacles that the stage lacks are parked outside.
+
+    Raises:
+      ConfigError: if the stage has more robots or obstacles than the world is compiled for.
+    """
+    for key in ("robots", "obstacles"):
+        value, most = getattr(stage, key), getattr(world.spacing, key)
+        if value > most:
+            raise ConfigError(
+                f"stage {stage.name}: {key} is {value}, but sim.max_{key} is {most}: give "
+                f"sim.max_{key}={value} or more."
+            )
+    one = task_stage.select(task_stage.stack([stage]), np.intp(0))
+    spacing = world.spacing._replace(robots=stage.robots, obstacles=stage.obstacles)
+    drawn = [
+        _make_room(judge.draw_level(one, spacing, seed, episode), world.spacing)
+        for episode in range(episodes)
+    ]
+    return Level(*(np.stack(fields) for fields in zip(*drawn, strict=True)))
+
+
+def _make_room(drawn: Level, spacing: Spacing) -> Level:
+    """Adds absent robots and obstacles to a level, and parks them."""
+    robots = spacing.robots - len(drawn.present)
+    obstacles = spacing.obstacles - len(drawn.obstacle_present)
+
+    def widened(x: np.ndarray, more: int, fill: ArrayLike = 0) -> np.ndarray:
+        return np.concatenate([x, np.full((more, *x.shape[1:]), fill, x.dtype)])
+
+    wider = drawn._replace(
+        present=widened(drawn.present, robots),
+        start=widened(drawn.start, robots),
+        target=widened(drawn.target, robots),
+        obstacle_present=widened(drawn.obstacle_present, obstacles),
+        # Whatever is parked has edges too; these nobody meets.
+        obstacle=widened(drawn.obstacle, obstacles, (0, 0, 0, level.MARGIN, level.MARGIN)),
+    )
+    return level.park(wider, np)
+
+
+def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
+    """Compiles the environment for levels of one kind, in physics steps of the judge's length.
+
+    Args:
+      config: of the evaluation.
+      half: [M, 2] half edges of the boxes in the levels, m.
+      arenas: how many levels are judged together.
+
+    Returns:
+      The world; a policy's limits and encoding are not in it yet.
+
+    Raises:
+      ConfigError: if a box is larger than the engine may be compiled for.
+    """
+    stage = config.stage if config.stage.level == "fixed" else _largest(config.stage, half)
+    return env.load(
+        TrainConfig(
+            stage=(stage,),
+            robot=config.robot,
+            task=config.task,
+            realism=config.realism,
+            algo=AlgoConfig(rollout=1, minibatches=1),
+            sim=SimConfig(
+                max_robots=stage.robots,
+                max_obstacles=len(half),
+                substeps=judge.substeps(config),
+            ),
+            arenas=arenas,
+            budget=arenas,
+        )
+    )
+
+
+def _largest(stage: StageConfig, half: np.ndarray) -> StageConfig:
+    """A stage with as many robots and boxes as large: all that the program depends on."""
+    largest = 2.0 * float(half.max(initial=0.05))  # without boxes any will do
+    if largest > LARGEST_BOX:
+        raise ConfigError(
+            f"stage {stage.name}: a box is {largest:g} m long, but engine=mjx takes up to "
+            f"{LARGEST_BOX:g} m: give engine=c."
+        )
+    return StageConfig(name=stage.name, robots=stage.robots, side=4.0, obstacle_size=largest)
+
+
+def play(
+    world: World, levels: Level, trained: Policy, steps: int, *, sampled: bool = True
+) -> Outcome:
+    """Runs an episode of each level by a policy file's policy.
+
+    Args:
+      world: of `load`.
+      levels: [E] with all robots and obstacles that the world has room for.
+      trained: the policy.
+      steps: control steps of an episode.
+      sampled: draw the actions from the policy; otherwise they are its mean.
+
+    Returns:
+      [E] what they came to, as NumPy arrays; impulses are nan, since contacts are analytic here.
+
+    Raises:
+      ConfigError: if the physics of an episode breaks down.
+    """
+    run = _program(
+        world,
+        steps,
+        trained.encoding,
+        (trained.max_speed, trained.max_turn_rate),
+        trained.meta["activation"],
+        trained.meta["observation"]["limit"],
+        sampled,
+    )
+    weights = trained.layers, trained.mean, trained.std
+    outcome, broken = run(weights, trained.log_std, levels)
+    if np.any(broken):
+        raise ConfigError(
+            f"the physics of {int(np.sum(broken))} of {len(levels.side)} episodes broke down, with "
+            f"positions that are not finite: give substeps of more than {world.physics.substeps}."
+        )
+    return Outcome(**{name: np.asarray(field) for name, field in outcome.items()})
+
+
+@functools.lru_cache(maxsize=4)
+def _program(
+    world: World,
+    steps: int,
+    encoding: electronics.Encoding,
+    limits: tuple[float, float],
+    activation: str,
+    limit: float,
+    sampled: bool,
+) -> Callable[[Any, ArrayLike, Level], tuple[dict[str, Array], Array]]:
+    """The compiled program of policies that differ in their weights alone."""
+    config, (speed, turn_rate) = world.config, limits
+    mine = replace(
+        world,
+        drive=world.drive._replace(max_speed=speed, max_turn_rate=turn_rate),
+        electronics=electronics.load(config.task, config.realism, encoding),
+    )
+
+    def play(weights: Any, log_std: Array, levels: Level) -> tuple[dict[str, Array], Array]:
+        mean = partial(_mean_action, activation, limit, weights)
+        act = partial(_act, mean, log_std if sampled else None)
+        arenas, counts, broken = _run(mine, act, levels, steps)
+        return _outcome(arenas, counts), broken
+
+    return jax.jit(play)
+
+
+def _act(mean: Callable[[Array], Array], log_std: Array | None, arenas: EnvState) -> Array:
+    """What the judge's robots do, [E, R, U]: drawn by the same numbers as there, if at all."""
+    action = mean(arenas.observation)
+    if log_std is None:
+        return action
+    shape = action.shape[1:]
+    normal = noise.normal(arenas.level.seed, arenas.clock, Stream.ACTION, shape, jnp)
+    return action + jnp.exp(log_std[: len(action[0])]) * normal
+
+
+def _mean_action(activation: str, limit: float, weights: Any, observation: Array) -> Array:
+    """What `policy.act` says without noise, [E, R, U]: in full precision, where a GPU has less."""
+    layers, mean, std = weights
+    robots = slice(observation.shape[-2])
+    x = jnp.clip((observation - mean[robots]) / std[robots], -limit, limit)
+    *hidden, last = layers
+    for layer in hidden:
+        x = _ACTIVATIONS[activation](_dense(x, layer, robots))
+    return _dense(x, last, robots)
+
+
+def _dense(x: Array, layer: tuple[ArrayLike, ArrayLike], robots: slice) -> Array:
+    """One dense layer [E, R, in] -> [E, R, out] of one learner, or of one for each robot."""
+    kernel, bias = (jnp.asarray(part)[robots] for part in layer)
+    kernel = jnp.broadcast_to(kernel, (x.shape[-2], *kernel.shape[1:]))
+    return jnp.einsum("eri,rio->ero", x, kernel, precision=jax.lax.Precision.HIGHEST) + bias
+
+
+def outcomes(world: World, learners: LearnerState, levels: Level, steps: int) -> Outcomes:
+    """Runs an episode of each level, every robot driven by the mean of its policy.
+
+    Pure: `jit` it with `world` and `steps` bound, and `vmap` it over the seeds of `learners`. With
+    `impl=warp` the world must be loaded for as many arenas as are judged together (E, or E for
+    every seed), since that is what MJX-Warp's memory of contacts is sized for. Its
+    `task.step_limit` is not read.
+
+    Args:
+      world: the compiled environment.
+      learners: [L].
+      levels: [E].
+      steps: control steps of an episode, at least 1.
+
+    Returns:
+      [E] what they came to. An episode whose physics breaks ends there, its robots where they
+      were.
+    """
+    arenas, _, broken = _run(world, partial(_mode, world, learners), levels, steps)
+    return _sum_up(arenas, broken, world.config.task.control_step)
+
+
+def _mode(world: World, learners: LearnerState, arenas: EnvState) -> Array:
+    """The learners' most likely actions [E, R, U]."""
+    seen = rollout.to_learners(arenas.observation, len(jax.tree.leaves(learners)[0]))
+    action = jax.vmap(partial(ppo.mode, config=world.config.algo))(learners, observation=seen)
+    return rollout.to_arenas(action)
+
+
+class _Counts(NamedTuple):
+    """What `Outcome` has and training has no use for, [E, R, ...]; `anchor` as in the judge."""
+
+    arrival: Array
+    touched: Array
+    path: Array
+    anchor: Array
+    still: Array
+
+
+def _run(
+    world: World, act: Callable[[EnvState], Array], levels: Level, steps: int
+) -> tuple[EnvState, _Counts, Array]:
+    """Runs an episode of each level; returns how the arenas end, and which of them broke."""
+    robots, obstacles = world.spacing.robots, world.spacing.obstacles
+    chex.assert_shape(levels.present, (None, robots))
+    chex.assert_shape(levels.obstacle, (len(levels.side), obstacles, 5))
+    levels = jax.tree.map(jnp.asarray, levels)
+    zero = jnp.zeros((), jnp.int32)
+    arenas = jax.vmap(lambda each: env.reset(world, each, zero, zero))(levels)
+    unpack = partial(physics.unpack, world.physics)
+    arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
+    none = jnp.zeros(levels.present.shape, jnp.int32)
+    touched = jnp.zeros(arenas.apart.shape, jnp.int32)
+    counts = _Counts(none, touched, none.astype(jnp.float32), levels.start[..., :2], none)
+    unbroken = jnp.zeros(len(levels.side), bool)
+    step = partial(_step, world, act)
+    (arenas, counts, broken), _ = jax.lax.scan(step, (arenas, counts, unbroken), length=steps)
+    return arenas, counts, broken
+
+
+def _step(
+    world: World,
+    act: Callable[[EnvState], Array],
+    carry: tuple[EnvState, _Counts, Array],
+    _: None,
+) -> tuple[tuple[EnvState, _Counts, Array], None]:
+    """Moves the arenas [E] on by a control step whose episodes are not over."""
+    arenas, counts, broken = carry
+    action = act(arenas)
+    moved, came = jax.vmap(partial(env.step, world))(arenas, action)
+    over = broken | _all_arrived(arenas)
+    broken = broken | (~over & ~came.sound)
+    stays = over | broken
+    held = replace(arenas, sim=jax.vmap(physics.pack)(arenas.sim))
+    counted = _count(world, counts, arenas, moved)
+    counts = _Counts(
+        *(
+            jnp.where(stays.reshape(-1, *[1] * (new.ndim - 1)), old, new)
+            for old, new in zip(counts, counted, strict=True)
+        )
+    )
+    return (rollout.restart(moved, held, stays), counts, broken), None
+
+
+def _count(world: World, counts: _Counts, before: EnvState, after: EnvState) -> _Counts:
+    """Adds a control step up, as the judge does."""
+    poses = jax.vmap(partial(physics.poses, world.physics))
+    start, place = poses(before.sim)[..., :2], poses(after.sim)[..., :2]
+    driven = jnp.linalg.norm(place - start, axis=-1)
+    active = before.level.present & ~before.arrived
+    away = jnp.linalg.norm(place - counts.anchor, axis=-1) > measures.STILL_RADIUS
+    return _Counts(
+        arrival=jnp.where(after.arrived & active, after.clock[:, None], counts.arrival),
+        touched=counts.touched + ((after.apart == 0.0) & before.level.present[..., None]),
+        path=counts.path + jnp.where(active, driven, 0.0),
+        anchor=jnp.where(away[..., None], place, counts.anchor),
+        still=jnp.where(away, 0, counts.still + 1),
+    )
+
+
+def _outcome(arenas: EnvState, counts: _Counts) -> dict[str, Array]:
+    """Puts together what the judge's `Outcome` holds, of arenas whose robots are all present."""
+    return {
+        "clock": arenas.clock,
+        "arrived": arenas.arrived,
+        "arrival": counts.arrival,
+        "contacts": arenas.episode.contacts,
+        "touched": counts.touched,
+        "impulse": jnp.full(counts.touched.shape, jnp.nan),
+        "sensed": arenas.episode.sensed,
+        "moving": arenas.episode.moving,
+        "path": counts.path,
+        "still": counts.still,
+    }
+
+
+def _all_arrived(arenas: EnvState) -> Array:
+    """Returns [E] whether every robot of the arena has arrived."""
+    return jnp.all(arenas.arrived | ~arenas.level.present, axis=-1)
+
+
+def _sum_up(arenas: EnvState, broken: Array, control_step: float) -> Outcomes:
+    """Sums episodes up as `measures.per_level` does."""
+    present = arenas.level.present
+    robots = jnp.sum(present, axis=-1)
+    reached = jnp.sum(present & arenas.arrived, axis=-1)
+    contacts = jnp.sum(arenas.episode.contacts, axis=(-2, -1))
+    return Outcomes(
+        targets_reached=reached / robots,
+        all_reached=(reached == robots).astype(jnp.float32),
+        contacts_per_robot=contacts / robots,
+        episode_time_s=arenas.clock * jnp.float32(control_step),
+        broken=broken.astype(jnp.float32),
+    )

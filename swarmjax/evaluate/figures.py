@@ -1,0 +1,89 @@
+"""The plots of an evaluation, with Matplotlib."""
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, PercentFormatter
+
+from swarmjax.evaluate.trials import Trial
+
+_DOTS = 110  # an inch
+_MARK, _WORST = "#0b4f9e", "#c04000"
+_ROW = 0.32  # inches of a cell
+
+
+def draw(result: Mapping[str, Any], trials: Sequence[Trial], limit: float) -> dict[str, bytes]:
+    """Draws the plots of an evaluation.
+
+    Args:
+        result: As `evaluate_summary.result` makes it.
+        trials: What policies came to, a cell each.
+        limit: Length of an episode, s.
+
+    Returns:
+        PNG files by name, `measures` and `times`; the same evaluation gives the same files.
+    """
+    files = {}
+    for name, figure in (("measures", intervals(result)), ("times", times(trials, limit))):
+        content = io.BytesIO()
+        figure.savefig(content, format="png", dpi=_DOTS, metadata={"Software": None})
+        files[name] = content.getvalue()
+    return files
+
+
+def intervals(result: Mapping[str, Any]) -> Figure:
+    """Draws targets and contacts of each cell: the mean with its interval, and the worst levels."""
+    cells = result["cells"]
+    figure = Figure(figsize=(8.6, 1.5 + _ROW * len(cells)), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    _mark(left, cells, "targets_reached")
+    left.set(xlabel="targets reached", xlim=(None, 1.005))
+    left.xaxis.set_major_locator(MaxNLocator(4))
+    left.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+    _mark(right, cells, "contacts_per_robot")
+    right.set(xlabel="contacts per robot and episode", xlim=(0, None))
+    left.set_yticks(range(len(cells)), [cell["cell"] for cell in cells])
+    left.set_ylim(len(cells) - 0.5, -0.5)
+    figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    return figure
+
+
+def _mark(axes: Axes, cells: Sequence[Mapping[str, Any]], name: str) -> None:
+    """Draws a row for each cell: intervals as bars."""
+    found = [cell["measures"][name] for cell in cells]
+    rows = np.arange(len(cells))
+    for key, mark, colour, shift in (("mean", "o", _MARK, -0.12), ("iqm", "|", "0.35", 0.12)):
+        middle = np.array([each[key] for each in found])
+        ends = np.array([each[f"{key}_interval"] or [each[key]] * 2 for each in found])
+        # An interval of percentiles need not hold the estimate: its bar is drawn by itself.
+        label = f"{key if key == 'mean' else 'IQM'}, 95 %"
+        axes.hlines(rows + shift, ends[:, 0], ends[:, 1], color=colour)
+        axes.plot(middle, rows + shift, mark, color=colour, label=label)
+    worst = [each["cvar"] for each in found]
+    axes.plot(worst, rows, "x", color=_WORST, label="worst 5 % of the levels")
+    axes.grid(axis="x", alpha=0.3)
+
+
+def times(trials: Sequence[Trial], limit: float) -> Figure:
+    """Draws which share of the robots has arrived by when, a curve for each cell."""
+    figure = Figure(figsize=(8.6, 4.2), layout="constrained")
+    axes = figure.subplots()
+    colours = colormaps["viridis"](np.linspace(0.0, 0.9, len(trials)))
+    for trial, colour in zip(trials, colours, strict=True):
+        arrival = np.sort(trial.arrival.ravel())
+        share = np.arange(1, len(arrival) + 1) / len(arrival)
+        there = np.isfinite(arrival)
+        steps = np.concatenate([[0.0], arrival[there], [limit]])
+        reached = np.concatenate([[0.0], share[there], [there.mean()]])
+        axes.step(steps, reached, where="post", color=colour, label=trial.cell.name)
+    axes.set(xlim=(0, limit), ylim=(0, 1.02), xlabel="time since the start, s")
+    axes.set_ylabel("robots that have arrived")
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+    axes.grid(alpha=0.3)
+    axes.legend(loc="lower right", ncols=1 + len(trials) // 9)
+    return figure

@@ -1,0 +1,191 @@
+"""The judge: what all arenas of an evaluation in MuJoCo's C engine share. No JAX."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from swarmjax import config as settings
+from swarmjax.config import EvaluateConfig, StageConfig
+from swarmjax.evaluate.rays import Scene
+from swarmjax.policy import Policy, PolicyError
+from swarmjax.sim import drive as sim_drive
+from swarmjax.sim import gaps
+from swarmjax.sim import model as sim_model
+from swarmjax.task import electronics as task_electronics
+from swarmjax.task import factors as task_factors
+from swarmjax.task import level, observation, shapes
+from swarmjax.task import stage as task_stage
+from swarmjax.task.electronics import Electronics
+
+SOLVER_ITERATIONS = 100  # MuJoCo's own default: until its tolerance of 1e-8 is met
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Judge:
+    """What all arenas of an evaluation share.
+
+    Attributes:
+        config: Of the evaluation.
+        policy: Who drives.
+        stage: Of the levels, fields [].
+        spacing: Sizes that levels are drawn with.
+        drive: The robot's drive, with the range of commands that the policy was trained for.
+        electronics: What lies between policy and world; it observes as the policy was trained to.
+        model: One arena, compiled.
+        ids: Rows of its moving bodies.
+        scene: What infrared rays are cast in.
+        geom_robot: Of each of its geoms the robot whose contact geom it is, else -1.
+        geom_kind: Of each of its geoms the index in `gaps.KINDS` of what it belongs to.
+        substeps: Physics steps of a control step.
+    """
+
+    config: EvaluateConfig
+    policy: Policy
+    stage: task_stage.Stage
+    spacing: level.Spacing
+    drive: sim_drive.Drive
+    electronics: Electronics
+    model: mujoco.MjModel
+    ids: sim_model.Ids
+    scene: Scene
+    geom_robot: np.ndarray
+    geom_kind: np.ndarray
+    substeps: int
+
+
+def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None) -> Judge:
+    """Compiles the arena of a stage, with no more robots and obstacles than it has.
+
+    Args:
+        config: Of the evaluation.
+        trained: The policy to judge.
+        half: [M, 2] half edges of the boxes in the levels to come, m; None: as the stage and its
+            `shape` have them.
+
+    Returns:
+        The judge.
+
+    Raises:
+        PolicyError: If the policy observes something else, or has too few learners.
+    """
+    check_policy(config.stage, config.policy, trained)
+    stage = task_stage.select(task_stage.stack([config.stage]), np.intp(0))
+    robots, obstacles = config.stage.robots, config.stage.obstacles
+    spacing = level.Spacing(robots, obstacles, config.robot.hull_radius, config.task.target_radius)
+    example = shapes.expand(draw_level(stage, spacing, config.seed, 0), config.shape)
+    compiled, ids = _compile(config, example.obstacle[:, 3:] if half is None else half)
+    geom_robot, geom_kind = _geoms(compiled, ids)
+    electronics = task_electronics.load(config.task, config.realism, trained.encoding)
+    return Judge(
+        config=config,
+        policy=trained,
+        stage=stage,
+        spacing=spacing,
+        drive=sim_drive.from_config(config.robot)._replace(
+            max_speed=trained.max_speed, max_turn_rate=trained.max_turn_rate
+        ),
+        electronics=electronics,
+        model=compiled,
+        ids=ids,
+        scene=Scene(
+            model=compiled,
+            ids=ids,
+            hull_radius=config.robot.hull_radius,
+            side=config.stage.sides[0],
+            reach=electronics.reach,
+        ),
+        geom_robot=geom_robot,
+        geom_kind=geom_kind,
+        substeps=substeps(config),
+    )
+
+
+def substeps(config: EvaluateConfig) -> int:
+    """Physics steps of a control step: half as long as in training, where nothing else is given.
+
+    A wheel that slips while its robot is blocked hops, since MuJoCo's contacts, like all convex
+    ones, separate surfaces that slide: by 1.3 mm in steps of 16 ms, by 0.8 mm from 8 ms down.
+    """
+    finer = 2 if config.robot.body == "wheeled" and config.substeps is None else 1
+    return finer * settings.substeps(config.robot, config.substeps)
+
+
+def _compile(config: EvaluateConfig, half: np.ndarray) -> tuple[mujoco.MjModel, sim_model.Ids]:
+    """Compiles the arena for boxes of these half edges [M, 2]."""
+    largest = task_stage.largest_half([config.stage])
+    size = sim_model.ArenaSize(config.stage.robots, len(half), largest)
+    timestep = config.task.control_step / substeps(config)
+    robot = task_factors.largest(config.robot, config.realism)
+    spec = sim_model.build(robot, size, timestep, ray_geoms=True)
+    spec.option.iterations = SOLVER_ITERATIONS
+    # Rather numbers that are not finite than a robot put back to where its world began.
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    # Compiled in rather than set later, so that MuJoCo derives its bounds from them.
+    for i, edges in enumerate(half):
+        spec.geom(f"obstacle{i}_box").size[:2] = edges
+    compiled = spec.compile()
+    return compiled, sim_model.ids(compiled, size)
+
+
+def _geoms(compiled: mujoco.MjModel, ids: sim_model.Ids) -> tuple[np.ndarray, np.ndarray]:
+    """Tells of each geom whose contact geom it is, and of what kind."""
+    robot = np.full(compiled.ngeom, -1)
+    kind = np.full(compiled.ngeom, gaps.KINDS.index("wall"))
+    kind[ids.obstacle_geom] = gaps.KINDS.index("obstacle")
+    for i in range(len(ids.hull_body)):
+        hull = compiled.geom(f"robot{i}_hull").id
+        robot[hull], kind[hull] = i, gaps.KINDS.index("robot")
+    return robot, kind
+
+
+def check_policy(stage: StageConfig, path: str | None, trained: Policy) -> None:
+    """Refuses a policy that does not fit a stage.
+
+    Args:
+        stage: The stage.
+        path: Of the policy.
+        trained: The policy.
+
+    Raises:
+        PolicyError: If it observes something else, or has too few learners.
+    """
+    layout = trained.meta["observation"]
+    for key, expected in observation.describe(trained.encoding).items():
+        found = layout[key]
+        if found != expected:
+            raise PolicyError(
+                f"{path} was trained on other observations than this robot makes: its "
+                f"meta.observation.{key} is {_list(found)}, expected {_list(expected)}."
+            )
+    learners = len(trained.log_std)
+    if not trained.is_shared and stage.robots > learners:
+        raise PolicyError(
+            f"{path} holds a network for each of {learners} robots, but stage {stage.name} has "
+            f"{stage.robots}: give a shared policy, or a stage of 1 to {learners}."
+        )
+
+
+def _list(values: Any) -> str:
+    """Writes a few values in a sentence."""
+    return ", ".join(map(str, values)) if isinstance(values, list | tuple) else str(values)
+
+
+def draw_level(
+    stage: task_stage.Stage, spacing: level.Spacing, seed: int, episode: int
+) -> level.Level:
+    """Draws the level that an episode starts from.
+
+    Args:
+        stage: Fields [].
+        spacing: Sizes.
+        seed: Of the evaluation.
+        episode: Its number.
+
+    Returns:
+        The level, as NumPy arrays.
+    """
+    count = level.uniform_count(spacing)
+    uniforms = np.random.default_rng([seed, episode]).random(count, dtype=np.float32)
+    return level.sample(uniforms, stage, spacing, np)

@@ -1,0 +1,214 @@
+"""Sums an evaluation up: means, interquartile means, worst levels, each with its interval."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from swarmjax import provenance
+from swarmjax.config import EvaluateConfig
+from swarmjax.evaluate import judge, statistics
+from swarmjax.evaluate.cells import Cell
+from swarmjax.evaluate.measures import MEASURES, Measure
+from swarmjax.evaluate.statistics import LEAST_DRAWN, Interval, SharedDraw, Statistic
+from swarmjax.evaluate.trials import Entrant, Trial, specialise
+from swarmjax.settings import to_dict
+
+WORST = 0.05  # share of the levels that CVaR is the mean of
+Found = Mapping[str, np.ndarray]
+
+
+def result(
+    config: EvaluateConfig, suite: str | None, entrants: Sequence[Entrant], trials: Sequence[Trial]
+) -> dict[str, Any]:
+    """Puts everything that an evaluation found into plain data for JSON.
+
+    Args:
+        config: Of the evaluation.
+        suite: Its name, or None.
+        entrants: Policies of one recipe.
+        trials: What they came to, a cell each.
+
+    Returns:
+        The result; docs/interface.md lists it.
+    """
+    return {
+        **_about(config, suite),
+        "policies": [{"path": each.path, "digest": each.policy.digest} for each in entrants],
+        "cells": [
+            about_cell(config, trial) | {"measures": summarize(trial.found)} for trial in trials
+        ],
+        "pooled": _pool(trials),
+    }
+
+
+def comparison(
+    config: EvaluateConfig,
+    suite: str | None,
+    entrants: tuple[Sequence[Entrant], Sequence[Entrant]],
+    trials: tuple[Sequence[Trial], Sequence[Trial]],
+) -> dict[str, Any]:
+    """Puts a comparison of two recipes on the same levels into plain data for JSON.
+
+    Args:
+        config: Of the evaluation.
+        suite: Its name, or None.
+        entrants: Policies of the first and of the second.
+        trials: What they came to, a cell each.
+
+    Returns:
+        The result; docs/interface.md lists it.
+    """
+    pairs = list(zip(*trials, strict=True))
+    return {
+        **_about(config, suite),
+        "compared": [
+            [{"path": each.path, "digest": each.policy.digest} for each in side]
+            for side in entrants
+        ],
+        "cells": [
+            about_cell(config, a) | {"measures": compare(a.found, b.found)} for a, b in pairs
+        ],
+        "pooled": _pool(*trials),
+    }
+
+
+def _about(config: EvaluateConfig, suite: str | None) -> dict[str, Any]:
+    return {
+        "suite": suite,
+        "engine": config.engine,
+        "action": config.action,
+        "robot": to_dict(config.robot),
+        "task": to_dict(config.task),
+        "steps": config.steps,
+        "substeps": judge.substeps(config),
+        "versions": provenance.versions(),
+    }
+
+
+def about_cell(config: EvaluateConfig, trial: Trial) -> dict[str, Any]:
+    """Says which levels a trial was on, and how many of them nobody could solve.
+
+    Args:
+        config: Of the evaluation.
+        trial: On one cell.
+
+    Returns:
+        Plain data for JSON.
+    """
+    cell = trial.cell
+    return {
+        "cell": cell.name,
+        "stage": to_dict(cell.stage),
+        "shape": cell.shape,
+        "realism": to_dict(specialise(config, cell).realism),
+        "episodes": len(cell.episodes),
+        "seed": cell.seed,
+        "digest": cell.digest,
+        "unreachable": int(np.isinf(trial.shortest).any(axis=-1).sum()),
+    }
+
+
+def summarize(found: Found, strata: Sequence[int] | None = None) -> dict[str, dict[str, Any]]:
+    """Sums measures up.
+
+    Args:
+        found: [P, E] of each measure: policies of one recipe on the same levels.
+        strata: Numbers of levels, in their order, that stay together when levels are drawn anew.
+
+    Returns:
+        Of each measure `mean`, `iqm` and `cvar` (mean over the worst 5 % of the levels and
+        policies), each with `_interval`, null where there is too little for one.
+    """
+    return {name: _summary(table, MEASURES[name], strata) for name, table in found.items()}
+
+
+def _summary(table: np.ndarray, measure: Measure, strata: Sequence[int] | None) -> dict[str, Any]:
+    of: dict[str, Statistic] = {
+        "mean": np.mean,
+        "iqm": statistics.iqm,
+        "cvar": partial(statistics.cvar, share=WORST, lowest=measure.is_good),
+    }
+    found: dict[str, Any] = {}
+    for name, statistic in of.items():
+        found[name] = float(statistic(table, axis=(0, 1)))
+        found[f"{name}_interval"] = None
+        if _are_enough(table, strata):
+            drawn = statistics.bootstrap(table, statistic, draw=_draw(table), strata=strata)
+            found[f"{name}_interval"] = [drawn.low, drawn.high]
+    return found
+
+
+def _are_enough(table: np.ndarray, strata: Sequence[int] | None) -> bool:
+    """Whether levels [P, E] can be drawn anew: of a stratum of one nothing would spread."""
+    return min(strata or [table.shape[1]]) >= LEAST_DRAWN
+
+
+def _draw(table: np.ndarray) -> SharedDraw:
+    """What is drawn anew: all policies meet the same levels; of few, these policies are meant."""
+    return "runs_and_tasks" if len(table) >= LEAST_DRAWN else "tasks"
+
+
+def _join(found: Sequence[Found]) -> dict[str, np.ndarray]:
+    """Puts the levels of all cells side by side, of measures that all of them have."""
+    return {name: np.concatenate([each[name] for each in found], axis=1) for name in found[0]}
+
+
+def _pool(*sides: Sequence[Trial]) -> dict[str, Any] | None:
+    """Sums the levels of all cells up together, of one side or of two that are compared.
+
+    None of one cell, and where cells share levels: their figures are not independent, as intervals
+    of levels drawn in each cell by itself would have it.
+    """
+    cells = [trial.cell for trial in sides[0]]
+    if len(cells) < 2 or any(_share(*pair) for pair in combinations(cells, 2)):
+        return None
+    strata = [len(cell.episodes) for cell in cells]
+    found = [_join([trial.found for trial in side]) for side in sides]
+    if len(found) > 1:
+        return {"episodes": sum(strata), "measures": compare(found[0], found[1], strata)}
+    return {"episodes": sum(strata), "measures": summarize(found[0], strata)}
+
+
+def _share(a: Cell, b: Cell) -> bool:
+    """Whether cells have a level in common, whatever its obstacles' shape and the realism are."""
+    alike = a.seed == b.seed and replace(a.stage, name=b.stage.name) == b.stage
+    return alike and bool(np.isin(a.episodes, b.episodes).any())
+
+
+def compare(a: Found, b: Found, strata: Sequence[int] | None = None) -> dict[str, dict[str, Any]]:
+    """Compares two recipes level by level.
+
+    Args:
+        a: [P, E] of each measure of the first.
+        b: [P, E] of the second, on the same levels; the same row is the same seed.
+        strata: As of `summarize`.
+
+    Returns:
+        Of each measure that both have: the means `a` and `b`, `difference` of the means and
+        `difference_iqm` of the interquartile means (b - a), and `improvement`, how likely b is the
+        better one on a level; each of the last three with `_interval`.
+    """
+    return {name: _comparison(name, a[name], b[name], strata) for name in a if name in b}
+
+
+def _comparison(
+    name: str, a: np.ndarray, b: np.ndarray, strata: Sequence[int] | None
+) -> dict[str, Any]:
+    better, worse = (b, a) if MEASURES[name].is_good else (a, b)
+    found: dict[str, Any] = {"a": float(a.mean()), "b": float(b.mean())}
+    if not _are_enough(a, strata):
+        return found
+    paired = partial(statistics.paired, a, b, draw=_draw(a), strata=strata)
+    chance = statistics.probability_of_improvement(better, worse, draw=_draw(a), strata=strata)
+    parts: dict[str, Interval[float]] = {
+        "difference": paired(statistic=np.mean),
+        "difference_iqm": paired(statistic=statistics.iqm),
+        "improvement": chance,
+    }
+    for key, (estimate, low, high) in parts.items():
+        found |= {key: estimate, f"{key}_interval": [low, high]}
+    return found

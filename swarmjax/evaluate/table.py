@@ -1,0 +1,168 @@
+"""An evaluation as tables for a terminal, and level by level as CSV."""
+
+import csv
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from swarmjax.config import ConfigError
+from swarmjax.evaluate.measures import MEASURES, Measure
+from swarmjax.evaluate.trials import Entrant, Trial
+
+# What a table of several cells has room for: its heading, the measure, the statistic, and whether
+# its interval is shown.
+_COLUMNS = (
+    ("targets, %", "targets_reached", "mean", True),
+    ("worst 5 %", "targets_reached", "cvar", False),
+    ("all, %", "all_reached", "mean", True),
+    ("SPL, %", "spl", "mean", False),
+    ("time, s", "time_to_reach_s", "mean", False),
+    ("contacts", "contacts_per_robot", "mean", False),
+    ("with robots", "contacts_robot", "mean", True),
+    ("deadlocks, %", "deadlocks", "mean", False),
+)
+
+
+def show(console: Console, result: Mapping[str, Any]) -> None:
+    """Prints a result, plain where it is not for a terminal.
+
+    Args:
+        console: To print on.
+        result: As `evaluate_summary` makes it, of policies or of a comparison.
+    """
+    cells = result["cells"]
+    sides = result.get("compared", [result.get("policies")])
+    who = " against ".join(_names(side) for side in sides)
+    where = cells[0]["cell"] if result["suite"] is None else f"suite {result['suite']}"
+    episodes = sum(cell["episodes"] for cell in cells)
+    acting = ", each robot's most likely action" if result["action"] == "mean" else ""
+    _say(console, f"{who} on {where}, {episodes:,} episodes{acting}")
+    if "compared" in result:
+        for cell in cells:
+            _show_comparison(console, cell)
+        if result["pooled"] is not None:
+            _show_comparison(console, {"cell": "all", **result["pooled"]})
+    elif len(cells) == 1:
+        _show_cell(console, cells[0])
+    else:
+        _show_cells(console, result)
+    for cell in cells:
+        if cell["unreachable"]:
+            _say(
+                console,
+                f"{cell['unreachable']} of {cell['episodes']:,} levels of {cell['cell']} have a "
+                "target that no robot can reach.",
+            )
+
+
+def _names(side: Sequence[Mapping[str, str]]) -> str:
+    more = len(side) - 1
+    return f"{side[0]['path']}{f' and {more} more' if more else ''}"
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def _table(console: Console, *heads: str) -> Table:
+    table = Table(box=box.SIMPLE if console.is_terminal else None)
+    for i, head in enumerate(heads):
+        table.add_column(head, justify="right" if i else "left", no_wrap=True)
+    return table
+
+
+def _show_cell(console: Console, cell: Mapping[str, Any]) -> None:
+    """One cell: a row for each measure."""
+    table = _table(console, "", "mean", "95 %", "IQM", "95 %", "worst 5 %")
+    for name, found in cell["measures"].items():
+        measure = MEASURES[name]
+        mean, iqm, worst = (_number(found[key], measure) for key in ("mean", "iqm", "cvar"))
+        ends = [_interval(found[f"{key}_interval"], measure) for key in ("mean", "iqm")]
+        table.add_row(_label(measure), mean, ends[0], iqm, ends[1], worst)
+    console.print(table)
+
+
+def _show_cells(console: Console, result: Mapping[str, Any]) -> None:
+    """Several cells: a row for each, and one for all if they can be pooled."""
+    table = _table(console, "", "levels", *(column[0] for column in _COLUMNS))
+    pooled = [] if result["pooled"] is None else [{"cell": "all", **result["pooled"]}]
+    for cell in (*result["cells"], *pooled):
+        values = (_shown(cell["measures"], *column[1:]) for column in _COLUMNS)
+        table.add_row(cell["cell"], f"{cell['episodes']:,}", *values)
+    console.print(table)
+
+
+def _shown(found: Mapping[str, Any], name: str, key: str, with_ends: bool) -> str:
+    shown = _number(found[name][key], MEASURES[name])
+    interval = found[name][f"{key}_interval"] if with_ends else None
+    return shown if interval is None else f"{shown} {_interval(interval, MEASURES[name])}"
+
+
+def _show_comparison(console: Console, cell: Mapping[str, Any]) -> None:
+    """One cell of a comparison: a row for each measure."""
+    heads = ("a", "b", "b - a", "95 %", "b better, %", "95 %")
+    table = _table(console, f"{cell['cell']}, {cell['episodes']:,} levels", *heads)
+    for name, found in cell["measures"].items():
+        measure, share = MEASURES[name], MEASURES["targets_reached"]
+        row = [_number(found["a"], measure), _number(found["b"], measure)]
+        if "difference" in found:
+            row += [
+                _number(found["difference"], measure, "+"),
+                _interval(found["difference_interval"], measure, "+"),
+                _number(found["improvement"], share),
+                _interval(found["improvement_interval"], share),
+            ]
+        table.add_row(_label(measure), *row)
+    console.print(table)
+
+
+def _label(measure: Measure) -> str:
+    return f"{measure.label}, {measure.unit}" if measure.unit else measure.label
+
+
+def _interval(ends: Sequence[float] | None, measure: Measure, sign: str = "") -> str:
+    if ends is None:
+        return "-"
+    return "[" + ", ".join(_number(end, measure, sign) for end in ends) + "]"
+
+
+def _number(value: float, measure: Measure, sign: str = "") -> str:
+    if measure.unit == "%":
+        return f"{100 * value:{sign}.1f}"
+    return f"{value:{sign}.1f}" if measure.unit == "s" else f"{value:{sign}.3f}"
+
+
+def write_levels(path: Path, entrants: Sequence[Entrant], trials: Sequence[Trial]) -> None:
+    """Writes a row for each policy and level.
+
+    Args:
+        path: Of the CSV file.
+        entrants: The policies, in the order of the trials' rows.
+        trials: What they came to, a cell each.
+
+    Raises:
+        ConfigError: If it cannot be written.
+    """
+    names = [name for name in MEASURES if name in trials[0].found]
+    try:
+        with path.open("w", newline="") as file:
+            rows = csv.writer(file, lineterminator="\n")
+            rows.writerow(["cell", "episode", "policy", "unreachable", *names])
+            for trial in trials:
+                rows.writerows(_rows(entrants, trial, names))
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be written: {error.strerror or error}.") from None
+
+
+def _rows(
+    entrants: Sequence[Entrant], trial: Trial, names: Sequence[str]
+) -> Iterator[list[object]]:
+    lost = (trial.shortest == float("inf")).sum(axis=-1).tolist()
+    for i, entrant in enumerate(entrants):
+        table = zip(*(trial.found[name][i].tolist() for name in names), strict=True)
+        for number, missing, values in zip(trial.cell.episodes, lost, table, strict=True):
+            yield [trial.cell.name, int(number), entrant.path, missing, *values]

@@ -1,0 +1,1 @@
+"""Policies in other forms: ONNX, C99, Webots."""

@@ -1,0 +1,1 @@
+"""Episodes as a page or a film."""

@@ -1,0 +1,230 @@
+"""`python -m swarmjax.replay policy=FILE[,FILE] level=N,... | worst=K`: episodes to look at.
+
+Runs them in MuJoCo's C engine, as `evaluate` does, and writes one HTML file that plays them in a
+browser; `video=FILE.mp4` renders them in 3-D as well. Two policies are shown side by side on the
+same levels. No JAX.
+"""
+
+import os
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from swarmjax import command, config
+from swarmjax.config import ConfigError, ReplayConfig
+from swarmjax.evaluate import cells
+from swarmjax.evaluate import judge as evaluate_judge
+from swarmjax.evaluate import trials as evaluate_run
+from swarmjax.evaluate.cells import Cell
+from swarmjax.evaluate.trials import Entrant, Trial
+from swarmjax.export import folder as export_folder
+from swarmjax.replay import page as replay_page
+from swarmjax.replay import record
+from swarmjax.replay import video as replay_video
+from swarmjax.replay.record import Episode
+
+
+class Pick(NamedTuple):
+    """An episode to replay: the index of its cell, and its row there."""
+
+    cell: int
+    row: int
+
+
+def replay(
+    settings: ReplayConfig, entrants: Sequence[Entrant], progress: Progress
+) -> list[Episode]:
+    """Records the episodes that are asked for.
+
+    Args:
+        settings: Of the replay.
+        entrants: Who drives.
+        progress: Shows how far it is.
+
+    Returns:
+        What became of each level, in the order in which they were named, or the worst first.
+
+    Raises:
+        PolicyError: If a policy does not fit a level's stage.
+        ConfigError: If there is no such level, or the physics breaks down.
+    """
+    chosen = _cells(settings)
+    _check_worst(settings, sum(len(cell.episodes) for cell in chosen))
+    for cell in chosen:
+        for each in entrants:
+            evaluate_judge.check_policy(cell.stage, *each)
+    picks = _named(settings, chosen)
+    if settings.worst is not None:
+        bar = progress.add_task("episodes", total=sum(len(cell.episodes) for cell in chosen))
+        report = partial(progress.advance, bar)
+        trials = evaluate_run.run(settings.evaluation, chosen, entrants[:1], report)
+        picks = worst(trials, settings.worst)
+    used = len({pick.cell for pick in picks})
+    bar = progress.add_task("steps", total=settings.steps * len(entrants) * used)
+    return _record(settings, entrants, chosen, picks, partial(progress.advance, bar))
+
+
+def _cells(settings: ReplayConfig) -> list[Cell]:
+    """Draws the levels that there are to choose from; of a stage no more than are named."""
+    if settings.suite is None and settings.worst is None:
+        return [cells.draw_stage(settings.evaluation, settings.levels)]
+    suite = cells.load(settings.evaluation)
+    if settings.cell is None:
+        return list(suite.cells)
+    found = [cell for cell in suite.cells if cell.name == settings.cell]
+    if not found:
+        names = ", ".join(cell.name for cell in suite.cells)
+        raise ConfigError(f"cell is {config.show(settings.cell)}: give one of {names}.")
+    return found
+
+
+def _check_worst(settings: ReplayConfig, count: int) -> None:
+    """Refuses to choose more levels than there are."""
+    if settings.worst is not None and settings.worst > count:
+        where = f"suite {settings.suite}" + (f", cell {settings.cell}," if settings.cell else "")
+        raise ConfigError(
+            f"worst is {settings.worst}, but {where} has {count} levels: give 1 to {count}."
+        )
+
+
+def _named(settings: ReplayConfig, chosen: Sequence[Cell]) -> list[Pick]:
+    """Finds the levels that are named; those of the first cell, which is the only one."""
+    if settings.worst is not None:
+        return []
+    if len(chosen) > 1:
+        names = ", ".join(cell.name for cell in chosen)
+        raise ConfigError(
+            f"suite {settings.suite} has several cells: give worst=5, or cell=NAME of {names}."
+        )
+    rows = {number: row for row, number in enumerate(chosen[0].episodes.tolist())}
+    for number in settings.levels:
+        if number not in rows:
+            raise ConfigError(
+                f"level is {number}, but cell {chosen[0].name} has the {len(rows)} levels "
+                f"{min(rows)} to {max(rows)}: give one of them."
+            )
+    return [Pick(0, rows[number]) for number in settings.levels]
+
+
+def worst(trials: Sequence[Trial], count: int) -> list[Pick]:
+    """Chooses the episodes that went worst for the first policy.
+
+    Args:
+        trials: What became of it on each cell.
+        count: How many to choose.
+
+    Returns:
+        Fewest targets reached first, then most contacts a robot, then longest, then the first.
+    """
+    picks = [Pick(i, j) for i, each in enumerate(trials) for j in range(len(each.cell.episodes))]
+    reached, contacts, time = (
+        np.concatenate([each.found[name][0] for each in trials])
+        for name in ("targets_reached", "contacts_per_robot", "episode_time_s")
+    )
+    return [picks[i] for i in np.lexsort([-time, -contacts, reached])[:count]]
+
+
+def _record(
+    settings: ReplayConfig,
+    entrants: Sequence[Entrant],
+    chosen: Sequence[Cell],
+    picks: Sequence[Pick],
+    report: Callable[[int], None],
+) -> list[Episode]:
+    """Records episodes, those of one cell side by side."""
+    found = {}
+    for i in sorted({pick.cell for pick in picks}):
+        cell, mine = chosen[i], [pick for pick in picks if pick.cell == i]
+        levels = cells.split(cell.levels)
+        runs = []
+        for each in entrants:
+            judged = evaluate_run.specialise(settings.evaluation, cell, each.path)
+            judge = evaluate_judge.load(judged, each.policy, cell.half)
+            runs.append(record.record(judge, [levels[pick.row] for pick in mine], report))
+        for pick, by_policy in zip(mine, zip(*runs, strict=True), strict=True):
+            number = int(cell.episodes[pick.row])
+            label = f"level {number}" if len(chosen) == 1 else f"{cell.name}, level {number}"
+            found[pick] = Episode(label, number, list(by_policy))
+    return [found[pick] for pick in picks]
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    settings = config.load_replay(arguments)
+    entrants = evaluate_run.read_policies(settings.policies)
+    out, video = Path(settings.out), settings.video and Path(settings.video)
+    _check_out(out, [*settings.policies, settings.suite, settings.video])
+    if video:
+        _check_video(video, [*settings.policies, settings.suite])
+    progress = Progress(console=Console(stderr=True), transient=True)
+    progress.disable = not progress.console.is_terminal
+    words = shlex.join(["python", "-m", "swarmjax.replay", *arguments])
+    with progress:
+        episodes = replay(settings, entrants, progress)
+        page = replay_page.page(settings, [each.policy for each in entrants], episodes, words)
+        export_folder.write_file(out, page.encode())
+        if video:
+            bar = progress.add_task("pictures", total=replay_video.count(settings, episodes))
+            report = partial(progress.advance, bar)
+            _write("video", video, lambda: replay_video.write(video, settings, episodes, report))
+    labels = "; ".join(episode.label for episode in episodes)
+    sys.stdout.write(f"{out}: {labels}; {len(page) / 1e6:.2f} MB.\n")
+    if video:
+        sys.stdout.write(f"{video}: the same, {video.stat().st_size / 1e6:.2f} MB.\n")
+    return 0
+
+
+def _check_file(key: str, path: Path) -> None:
+    """Makes the folder of a file, before there is a replay to lose."""
+    _write(key, path, lambda: path.parent.mkdir(parents=True, exist_ok=True))
+    if path.is_dir():
+        raise _unwritable(key, path, "it is a folder")
+    if not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise _unwritable(key, path, "permission denied")
+
+
+def _check_out(path: Path, others: Sequence[str | None]) -> None:
+    """Refuses a page that cannot be written, or would be written over another file of these."""
+    if path.suffix != ".html":
+        raise ConfigError(f"out is {path}: give a name that ends with .html.")
+    _check_apart("out", path, others)
+    _check_file("out", path)
+
+
+def _check_apart(key: str, path: Path, others: Sequence[str | None]) -> None:
+    """Refuses to write over a file that the command reads or writes too."""
+    for other in others:
+        if other is not None and path.resolve() == Path(other).resolve():
+            raise ConfigError(f"{key} is {path}, which is given as another file: give a new name.")
+
+
+def _check_video(path: Path, others: Sequence[str | None]) -> None:
+    """Refuses a film that cannot be made or written, or would be written over one of these."""
+    if path.suffix != ".mp4":
+        raise ConfigError(f"video is {path}: give a name that ends with .mp4.")
+    _check_apart("video", path, others)
+    _check_file("video", path)
+    replay_video.check()
+
+
+def _write(key: str, path: Path, write: Callable[[], object]) -> None:
+    """Does what may fail for want of permission or room."""
+    try:
+        write()
+    except OSError as error:
+        raise _unwritable(key, path, error.strerror or str(error)) from None
+
+
+def _unwritable(key: str, path: Path, reason: str) -> ConfigError:
+    return ConfigError(f"{key} is {path}, which cannot be written: {reason}.")
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("replay", main, ReplayConfig))

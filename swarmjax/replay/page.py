@@ -1,0 +1,136 @@
+"""The page of a replay: one HTML file that needs nothing else and asks for nothing else."""
+
+import base64
+import hashlib
+from collections.abc import Sequence
+from html import escape
+from importlib import resources
+from string import Template
+
+from swarmjax import epuck, provenance
+from swarmjax.config import ReplayConfig
+from swarmjax.policy import Policy
+from swarmjax.replay import pack
+from swarmjax.replay.record import Episode
+from swarmjax.sim import gaps
+
+_SCRIPTS = ("replay_data.js", "replay_draw.js", "replay.js")
+
+
+def page(
+    settings: ReplayConfig,
+    policies: Sequence[Policy],
+    episodes: Sequence[Episode],
+    words: str,
+) -> str:
+    """Lays the page out.
+
+    Args:
+        settings: Of the replay.
+        policies: Who drives.
+        episodes: What became of each level.
+        words: The command that makes the page.
+
+    Returns:
+        HTML. What it says about files and settings is escaped or inside the packed data.
+    """
+    task = settings.task
+    header = {
+        "policies": list(settings.policies),
+        "about": _about(settings),
+        "facts": _facts(settings, policies, words),
+        "step": task.control_step,
+        "kinds": list(gaps.KINDS),
+        "sensors": epuck.SENSORS,
+        "hull": settings.robot.hull_radius,
+        "range": task.sensor_range,
+        "targetRadius": task.target_radius,
+    }
+    packed = pack.pack(header, episodes, task.sensor_range)
+    return fill(f"Replay of {' and '.join(settings.policies)} on {_levels(settings)}", packed)
+
+
+def fill(title: str, packed: bytes) -> str:
+    """Puts title and data into the template.
+
+    A policy of what the page may load or run stands in it: nothing but its own style and script,
+    by their digests.
+
+    Args:
+        title: Of the page.
+        packed: What `replay_pack.pack` returned.
+
+    Returns:
+        HTML.
+    """
+    files = resources.files("swarmjax.replay") / "templates"
+    style = (files / "replay.css").read_text(encoding="utf-8")
+    script = "\n".join((files / name).read_text(encoding="utf-8") for name in _SCRIPTS)
+    script = f'(() => {{\n"use strict";\n{script}}})();\n'
+    allowed = f"default-src 'none'; img-src data:; style-src {_hash(style)}; "
+    return Template((files / "replay.html").read_text(encoding="utf-8")).substitute(
+        title=escape(title),
+        policy=f"{allowed}script-src {_hash(script)}; base-uri 'none'; form-action 'none'",
+        style=style,
+        script=script,
+        data=base64.b64encode(packed).decode("ascii"),
+    )
+
+
+def _hash(text: str) -> str:
+    """Names a text in a policy of the page."""
+    digest = hashlib.sha256(text.encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+
+
+def _levels(settings: ReplayConfig) -> str:
+    """Names the levels as a whole."""
+    if settings.suite is None:
+        return settings.stage.name
+    return settings.suite if settings.cell is None else f"{settings.suite}, {settings.cell}"
+
+
+def _about(settings: ReplayConfig) -> str:
+    """Says in a line what is seen; cells of a suite may have a realism of their own."""
+    if settings.suite is None:
+        where = f"stage {_levels(settings)}, realism {settings.realism.name}"
+    else:
+        where = f"suite {_levels(settings)}"
+    return f"{where}, {settings.robot.body} robots, simulated by MuJoCo C"
+
+
+def _facts(settings: ReplayConfig, policies: Sequence[Policy], words: str) -> list[tuple[str, str]]:
+    """Says how the episodes came about and how exactly they are shown, a line each."""
+    names = zip(settings.policies, policies, strict=True)
+    length, angle = 1e3 * pack.LENGTH, pack.ANGLE
+    return [
+        *((f"policy {name}", f"SHA-256 {trained.digest}") for name, trained in names),
+        ("levels", _choice(settings)),
+        ("time", f"control steps of {settings.task.control_step:g} s, {settings.steps} at most"),
+        ("reward", "by the weights that the policy was trained with; nothing after arrival"),
+        (
+            "exactness",
+            f"positions to {length / 2:g} mm and headings to {angle / 2:g} rad of the simulated "
+            f"ones, rays to {500 * pack.RAY:g} mm, each reward term's sum to "
+            f"{pack.REWARD / 2:g}",
+        ),
+        ("versions", ", ".join(f"{name} {found}" for name, found in _versions().items())),
+        ("made by", words),
+    ]
+
+
+def _choice(settings: ReplayConfig) -> str:
+    """Says which levels they are."""
+    origin = f"of seed {settings.seed}" if settings.suite is None else f"of {_levels(settings)}"
+    if settings.worst is None:
+        return origin
+    count = f"the first {settings.episodes:,}" if settings.suite is None else "all"
+    return (
+        f"the {settings.worst} that {settings.policies[0]} did worst in among {count} {origin}, "
+        "the worst first: fewest targets reached, then most contacts, then longest"
+    )
+
+
+def _versions() -> dict[str, str]:
+    """What computed the episodes."""
+    return {k: v for k, v in provenance.versions().items() if k in ("swarmjax", "mujoco", "numpy")}

@@ -1,0 +1,250 @@
+"""Episodes as they went, step by step, recorded from the judge in MuJoCo's C engine. No JAX."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from swarmjax import config
+from swarmjax.config import RewardConfig
+from swarmjax.evaluate import engine_c
+from swarmjax.evaluate.engine_c import Arenas, Judge
+from swarmjax.policy import Policy, PolicyError
+from swarmjax.sim import gaps, infrared
+from swarmjax.task import electronics
+from swarmjax.task.level import Level
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """What stands still in an episode.
+
+    Attributes:
+        side: Of the arena, m.
+        target: [R, 2] x (m), y (m).
+        box: [B, 5] x (m), y (m), yaw (rad), half edges (m) of the boxes that obstacles are made of.
+        sensor: [R, K, 4] origin (m) and unit direction of each infrared ray, in the robot's frame.
+    """
+
+    side: float
+    target: np.ndarray
+    box: np.ndarray
+    sensor: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Recording:
+    """An episode. N is its control steps and one more: row 0 is the start.
+
+    Attributes:
+        scene: What stands still.
+        pose: [N, R, 3] x (m), y (m), yaw (rad).
+        ray: [N, R, K] from a sensor to what it meets, m; no more than the sensor's range.
+        distance: [N, R] to the target, m.
+        reward: By term [N, R], its weight included: what the step that led here earned, 0 at the
+            start and after arrival.
+        touching: [N, R, 3] whether the robot touches something of each kind of `gaps.KINDS`.
+        contacts: [N, R, 3] contacts so far of each kind.
+        arrival: [R] control steps until it arrived, 0 if it has not.
+    """
+
+    scene: Scene
+    pose: np.ndarray
+    ray: np.ndarray
+    distance: np.ndarray
+    reward: Mapping[str, np.ndarray]
+    touching: np.ndarray
+    contacts: np.ndarray
+    arrival: np.ndarray
+
+
+class Episode(NamedTuple):
+    """What became of one level.
+
+    Attributes:
+        label: What a person calls it.
+        level: Its number.
+        runs: One recording a policy.
+    """
+
+    label: str
+    level: int
+    runs: list[Recording]
+
+
+class Frame(NamedTuple):
+    """All arenas after a control step; of several frames, all with a leading axis N.
+
+    Attributes:
+        pose: [A, R, 3] x (m), y (m), yaw (rad).
+        ray: [A, R, K] as far as the electronics reach, m.
+        distance: [A, R] to the target, m.
+        touching: [A, R, 3] whether the robot touches something of each kind.
+        arrived: [A, R] whether the robot has arrived.
+        contacts: [A, R, 3] contacts so far of each kind.
+    """
+
+    pose: np.ndarray
+    ray: np.ndarray
+    distance: np.ndarray
+    touching: np.ndarray
+    arrived: np.ndarray
+    contacts: np.ndarray
+
+
+class Steps(NamedTuple):
+    """What the reward of control steps looks at, as in `task.reward.Step`; no JAX.
+
+    Attributes:
+        distance_before: [..., R] to the target, m.
+        distance: [..., R] after the step, m.
+        infrared: [..., R, K] ray lengths after the step, m.
+        sensor_range: m.
+        arrives: [..., R] whether the robot arrived in this step.
+        contact_begins: [..., R, 3] whether a contact of each kind began in this step.
+    """
+
+    distance_before: np.ndarray
+    distance: np.ndarray
+    infrared: np.ndarray
+    sensor_range: float
+    arrives: np.ndarray
+    contact_begins: np.ndarray
+
+
+def terms(steps: Steps, weights: RewardConfig) -> dict[str, np.ndarray]:
+    """Works the terms of the reward out, of which equation 3 of the paper has the first two.
+
+    Args:
+        steps: Control steps.
+        weights: Of the terms.
+
+    Returns:
+        [..., R] by name: each term times its weight; those of weight 0 are left out.
+    """
+    found = {
+        "progress": steps.distance_before - steps.distance,
+        "proximity": (steps.infrared < steps.sensor_range).any(axis=-1),
+        "arrival": steps.arrives,
+        "contact": steps.contact_begins.sum(axis=-1),
+        "robot_contact": steps.contact_begins[..., gaps.KINDS.index("robot")],
+        "time": np.ones_like(steps.distance),
+    }
+    weighted = {name: getattr(weights, name) * term for name, term in found.items()}
+    return {name: term for name, term in weighted.items() if getattr(weights, name)}
+
+
+def weights(trained: Policy, task: config.TaskConfig) -> RewardConfig:
+    """Returns the weights that a policy was trained with; those of `task` if it does not say.
+
+    Raises:
+        ConfigError: If its weights are no weights.
+        PolicyError: If what they should be in is no task.
+    """
+    stored = trained.meta["config"].get("task", {})
+    if not isinstance(stored, dict):
+        raise PolicyError(f"meta.config.task is {config.show(stored)}: expected an object.")
+    if "reward" not in stored:
+        return task.reward
+    return config.build(RewardConfig, stored["reward"], "the policy's config.task.reward.")
+
+
+def record(
+    judge: Judge, levels: Sequence[Level], report: Callable[[int], None] = lambda _: None
+) -> list[Recording]:
+    """Runs episodes side by side and keeps all that there is to see.
+
+    Args:
+        judge: What the arenas share.
+        levels: What they start from.
+        report: Told how many more control steps there were, one by one.
+
+    Returns:
+        Each episode up to the step in which the last robot arrived or the time was out.
+
+    Raises:
+        ConfigError: If the physics of an episode breaks down, or the policy's weights are none.
+        PolicyError: If the policy's task is none.
+    """
+    earning = weights(judge.policy, judge.config.task)
+    arenas = engine_c.start(judge, levels)
+    mount = electronics.mount(arenas.factors)
+    frames = [_look(judge, arenas)]
+    while len(frames) <= judge.config.steps and not frames[-1].arrived.all():
+        arenas = engine_c.step(judge, arenas)
+        frames.append(_look(judge, arenas))
+        report(1)
+    every = Frame(*(np.stack(field) for field in zip(*frames, strict=True)))
+    return [
+        _cut(
+            Frame(*(field[:, i] for field in every)),
+            _scene(level, _of_arena(mount, i)),
+            judge.config.task.sensor_range,
+            earning,
+        )
+        for i, level in enumerate(levels)
+    ]
+
+
+def _look(judge: Judge, arenas: Arenas) -> Frame:
+    """Sees where everything is."""
+    sight = engine_c.look(
+        judge, arenas.data, arenas.factors, arenas.pose, arenas.target, arenas.obstacle
+    )
+    return Frame(
+        pose=arenas.pose,
+        ray=sight.ray,
+        distance=sight.distance,
+        touching=engine_c.touching(judge, arenas.data),
+        arrived=arenas.outcome.arrived,
+        contacts=arenas.outcome.contacts,
+    )
+
+
+def _cut(frames: Frame, scene: Scene, reach: float, earning: RewardConfig) -> Recording:
+    """Makes a recording of the frames of one arena [N, ...], up to the end of its episode."""
+    over = frames.arrived.all(axis=-1)
+    frames = Frame(*(field[: over.argmax() + 1 if over.any() else None] for field in frames))
+    active = ~frames.arrived[:-1]
+    steps = Steps(
+        distance_before=frames.distance[:-1],
+        distance=frames.distance[1:],
+        infrared=frames.ray[1:],
+        sensor_range=reach,
+        arrives=active & frames.arrived[1:],
+        contact_begins=np.diff(frames.contacts, axis=0),
+    )
+    none = np.zeros_like(frames.distance[:1])
+    return Recording(
+        scene=scene,
+        pose=frames.pose,
+        ray=np.minimum(frames.ray, reach),
+        distance=frames.distance,
+        reward={
+            name: np.concatenate([none, np.where(active, term, 0.0)])
+            for name, term in terms(steps, earning).items()
+        },
+        touching=frames.touching,
+        contacts=frames.contacts,
+        arrival=frames.arrived.argmax(axis=0),  # 0 also where there is none: no one starts there
+    )
+
+
+def _scene(level: Level, mount: infrared.Mount | None) -> Scene:
+    """Keeps what stands still in an arena, and how its sensors sit."""
+    at_origin = np.zeros((len(level.target), 3))
+    origin, toward = infrared.rays(at_origin, np, mount)
+    return Scene(
+        side=float(level.side),
+        target=level.target.astype(float),
+        box=level.obstacle[level.obstacle_present].astype(float),
+        sensor=np.concatenate([origin, toward], axis=-1),
+    )
+
+
+def _of_arena(mount: infrared.Mount | None, i: int) -> infrared.Mount | None:
+    """Takes one arena's sensors."""
+    if mount is None:
+        return None
+    return infrared.Mount(*(None if part is None else part[i] for part in mount))

@@ -1,0 +1,329 @@
+"""A replay as a film: the scene in 3-D, drawn by MuJoCo's renderer and encoded by ffmpeg.
+
+The scene is made for the eye alone, of what was recorded: robots, walls and obstacles in their
+true sizes, targets as discs of their radius on the floor, lit infrared rays as lines.
+"""
+
+import math
+import os
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from swarmjax import epuck, policy_file
+from swarmjax.config import ConfigError, ReplayConfig
+from swarmjax.replay import pack
+from swarmjax.replay.record import Episode, Recording
+from swarmjax.sim.model import HALF_HEIGHT
+
+FRAME_RATE = 30  # 1/s
+HOLD = 1.0  # s for which the end of an episode stays
+HEIGHT = 720  # px; a picture is 16:9, of two beside each other 4:3 each
+ELEVATION = math.radians(58.0)  # of the camera
+FIELD_OF_VIEW = math.radians(40.0)  # of its height
+_MARGIN = 1.06  # around the arena
+_WALL = 0.015  # m; half of what is shown of a wall's thickness
+_RAY = 0.0022  # m; half the width of a ray
+_FLAT = 5e-4  # m; half height of a target
+_BOX, _CYLINDER = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
+_LIT = np.array([1.0, 0.45, 0.05, 1.0], np.float32)
+_TOUCHING = (0.9, 0.0, 0.1, 1.0)
+_HIDDEN = (0.0, 0.0, 0.0, 0.0)
+
+
+def check() -> None:
+    """Finds out whether films can be made here.
+
+    Raises:
+        ConfigError: If imageio or OpenGL is missing.
+    """
+    try:
+        import imageio_ffmpeg
+
+        imageio_ffmpeg.get_ffmpeg_exe()
+    except (ImportError, RuntimeError):
+        raise ConfigError(
+            "video needs imageio and its ffmpeg, which are not installed: "
+            "install the extra, as in uv sync --extra video."
+        ) from None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # GLFW warns of what is said below
+            mujoco.Renderer(mujoco.MjSpec().compile(), 16, 16).close()
+    except Exception:  # each platform's library raises errors of its own
+        raise ConfigError(
+            f"video needs OpenGL, which MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} does not find "
+            "here: set MUJOCO_GL=egl (Debian's libegl1) or MUJOCO_GL=osmesa (libosmesa6)."
+        ) from None
+
+
+def write(
+    path: Path,
+    settings: ReplayConfig,
+    episodes: Sequence[Episode],
+    report: Callable[[int], None] = lambda _: None,
+) -> None:
+    """Films episodes one after the other, two policies side by side.
+
+    Args:
+        path: Of the MP4 file.
+        settings: Of the replay.
+        episodes: What became of each level.
+        report: Told how many more pictures are done, one by one.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    import imageio.v2 as imageio
+
+    with policy_file.replacing(path) as temporary:
+        film: Any = imageio.get_writer(temporary, fps=FRAME_RATE, quality=7)
+        with film:
+            for picture in _pictures(settings, episodes):
+                film.append_data(picture)
+                report(1)
+
+
+def count(settings: ReplayConfig, episodes: Sequence[Episode]) -> int:
+    """Counts the pictures of a film.
+
+    Args:
+        settings: Of the replay.
+        episodes: What became of each level.
+
+    Returns:
+        How many pictures there are, `FRAME_RATE` a second.
+    """
+    return sum(len(rows(settings, each.runs)) for each in episodes)
+
+
+def rows(settings: ReplayConfig, runs: Sequence[Recording]) -> list[int]:
+    """Says which row of a level's recordings each picture shows.
+
+    Args:
+        settings: Of the replay: its control step (s), and its speed, seconds in a second of film.
+        runs: Recordings of the level, one a policy, [N, ...] each; N may differ.
+
+    Returns:
+        A row for each picture, from 0, of the longest recording; its last one for `HOLD` seconds.
+    """
+    last = max(len(run.pose) for run in runs) - 1
+    pace = settings.video_speed / (FRAME_RATE * settings.task.control_step)  # rows a picture
+    moving = [math.floor(k * pace) for k in range(math.ceil(last / pace))]
+    return moving + [last] * round(HOLD * FRAME_RATE)
+
+
+def _pictures(settings: ReplayConfig, episodes: Sequence[Episode]) -> Iterator[np.ndarray]:
+    """Draws the pictures [height, width, 3]."""
+    for _, _, runs in episodes:
+        width = HEIGHT * 16 // 9 if len(runs) == 1 else HEIGHT * 4 // 3
+        with ExitStack() as stack:
+            shots = [_Shot(settings, run, width) for run in runs]
+            for shot in shots:
+                stack.callback(shot.renderer.close)
+            for row in rows(settings, runs):
+                yield np.concatenate([shot.draw(row) for shot in shots], axis=1)
+
+
+class _Shot:
+    """The camera on one recording, and what is before it; MuJoCo edits all of it in place."""
+
+    def __init__(self, settings: ReplayConfig, recording: Recording, width: int) -> None:
+        self.recording = recording
+        self.model = build(settings, recording, width).compile()
+        self.data = mujoco.MjData(self.model)
+        self.renderer = mujoco.Renderer(self.model, HEIGHT, width)
+        self.camera = _camera(recording.scene.side, width / HEIGHT)
+        self.reach = settings.task.sensor_range
+        robots = range(recording.pose.shape[1])
+        self.rings = [self.model.geom(f"robot{i}_ring").id for i in robots]
+
+    def draw(self, row: int) -> np.ndarray:
+        """Draws one row of the recording, or its last one where it is over."""
+        row = min(row, len(self.recording.pose) - 1)
+        pose = self.recording.pose[row]
+        self.data.mocap_pos[:, :2] = pose[:, :2]
+        self.data.mocap_quat[:, 0] = np.cos(0.5 * pose[:, 2])
+        self.data.mocap_quat[:, 3] = np.sin(0.5 * pose[:, 2])
+        touching = self.recording.touching[row].any(axis=-1)
+        self.model.geom_rgba[self.rings] = np.where(touching[:, None], _TOUCHING, _HIDDEN)
+        mujoco.mj_forward(self.model, self.data)
+        self.renderer.update_scene(self.data, self.camera)
+        self._add_rays(row)
+        return self.renderer.render()
+
+    def _add_rays(self, row: int) -> None:
+        """Adds the rays that meet something."""
+        pose, ray = self.recording.pose[row], self.recording.ray[row]
+        sensor, scene = self.recording.scene.sensor, self.renderer.scene
+        cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=-2)
+        origin = pose[:, None, :2] + np.einsum("rij,rkj->rki", turn, sensor[..., :2])
+        end = origin + ray[..., None] * np.einsum("rij,rkj->rki", turn, sensor[..., 2:])
+        for i, k in np.argwhere(ray < self.reach):
+            if scene.ngeom == scene.maxgeom:
+                return
+            geom, capsule = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_CAPSULE
+            mujoco.mjv_initGeom(geom, capsule, np.zeros(3), np.zeros(3), np.zeros(9), _LIT)
+            ends = [np.append(point[i, k], epuck.SENSOR_HEIGHT) for point in (origin, end)]
+            mujoco.mjv_connector(geom, capsule, _RAY, *ends)
+            geom.emission = 0.8
+            scene.ngeom += 1
+
+
+def build(settings: ReplayConfig, recording: Recording, width: int) -> mujoco.MjSpec:
+    """Describes the scene of an episode, its robots as bodies that are moved by hand.
+
+    Args:
+        settings: Of the replay.
+        recording: Of the episode.
+        width: Of a picture, px.
+
+    Returns:
+        The spec; robot i is the mocap body i.
+    """
+    spec = mujoco.MjSpec()
+    _set_visuals(spec, width)
+    _add_floor(spec, recording.scene.side)
+    _add_fixtures(spec, recording)
+    colours = [_rgba(text) for text in pack.colours(recording.pose.shape[1])]
+    for (x, y), colour in zip(recording.scene.target, colours, strict=True):
+        size = [settings.task.target_radius, _FLAT, 0.0]
+        _add(spec.worldbody, _CYLINDER, size, [x, y, _FLAT], [*colour[:3], 0.45])
+    for i, colour in enumerate(colours):
+        _add_robot(spec, f"robot{i}", settings.robot.hull_radius, colour)
+    return spec
+
+
+def _set_visuals(spec: mujoco.MjSpec, width: int) -> None:
+    """Sets light, background and the size of a picture."""
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, HEIGHT
+    spec.visual.global_.fovy = math.degrees(FIELD_OF_VIEW)
+    spec.visual.quality.shadowsize = 4096
+    spec.visual.headlight.ambient = [0.4, 0.4, 0.4]
+    spec.visual.headlight.diffuse = [0.2, 0.2, 0.2]
+    spec.visual.headlight.specular = [0.0, 0.0, 0.0]
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.93, 0.94, 0.96],
+        rgb2=[0.80, 0.83, 0.87],
+        width=64,
+        height=64,
+    )
+    spec.worldbody.add_light(
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        pos=[0.0, 0.0, 3.0],
+        dir=[0.2, 0.3, -1.0],
+        diffuse=[0.4, 0.4, 0.4],
+        specular=[0.1, 0.1, 0.1],
+        castshadow=True,
+    )
+
+
+def _add_floor(spec: mujoco.MjSpec, side: float) -> None:
+    """Adds a floor of squares of 0.1 m."""
+    spec.add_texture(
+        name="floor",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.90, 0.91, 0.92],
+        rgb2=[0.84, 0.85, 0.87],
+        width=256,
+        height=256,
+    )
+    material = spec.add_material(name="floor", texrepeat=[10.0, 10.0], texuniform=True)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
+    plane = _add(
+        spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE, [0.5 * side, 0.5 * side, 1.0], [0] * 3
+    )
+    plane.material = "floor"
+
+
+def _add_fixtures(spec: mujoco.MjSpec, recording: Recording) -> None:
+    """Adds walls, through which one sees, and obstacles."""
+    half = 0.5 * recording.scene.side
+    for turn in range(4):
+        bearing = 0.5 * math.pi * turn
+        away = half + _WALL
+        place = [away * math.cos(bearing), away * math.sin(bearing), HALF_HEIGHT]
+        size = [_WALL, half + 2 * _WALL, HALF_HEIGHT]
+        _add(spec.worldbody, _BOX, size, place, [0.45, 0.5, 0.58, 0.3], bearing)
+    grey = [0.55, 0.57, 0.60, 1.0]
+    for x, y, yaw, *edges in recording.scene.box:
+        _add(spec.worldbody, _BOX, [*edges, HALF_HEIGHT], [x, y, HALF_HEIGHT], grey, yaw)
+
+
+def _add_robot(spec: mujoco.MjSpec, name: str, radius: float, colour: list[float]) -> None:
+    """Adds a robot: its hull, a lid with an arrow ahead, and a ring that shows that it touches."""
+    body = spec.worldbody.add_body(name=name, mocap=True)
+    half = 0.5 * (epuck.HULL_TOP - epuck.HULL_BOTTOM)
+    top = epuck.HULL_TOP
+    _add(body, _CYLINDER, [radius, half, 0], [0, 0, half + epuck.HULL_BOTTOM], colour)
+    _add(body, _CYLINDER, [0.8 * radius, 5e-4, 0], [0, 0, top], [0.15, 0.16, 0.18, 1.0])
+    white = [0.97, 0.97, 0.97, 1.0]
+    for side in (1.0, -1.0):
+        # Two bars that meet in a point ahead.
+        place = [0.18 * radius, side * 0.24 * radius, top + 1e-3]
+        _add(body, _BOX, [0.4 * radius, 0.09 * radius, 5e-4], place, white, -side * 0.65)
+    ring = _add(body, _CYLINDER, [1.2 * radius, 1e-3, 0], [0, 0, 2e-3], list(_HIDDEN))
+    ring.name = f"{name}_ring"
+
+
+def _add(
+    body: mujoco.MjsBody,
+    kind: mujoco.mjtGeom,
+    size: Sequence[float],
+    place: Sequence[float],
+    colour: Sequence[float] = (1.0, 1.0, 1.0, 1.0),
+    yaw: float = 0.0,
+) -> Any:
+    """Adds a geom that touches nothing."""
+    turn = [math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)]
+    return body.add_geom(
+        type=kind, size=size, pos=place, quat=turn, rgba=colour, contype=0, conaffinity=0
+    )
+
+
+def _rgba(colour: str) -> list[float]:
+    """Reads #rrggbb."""
+    return [int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5)] + [1.0]
+
+
+def _camera(side: float, aspect: float) -> mujoco.MjvCamera:
+    """Looks at the middle of an arena from so far that all of it is in the picture."""
+    camera = mujoco.MjvCamera()
+    camera.azimuth, camera.elevation = 90.0, -math.degrees(ELEVATION)
+    camera.lookat = [0.0, 0.0, 0.0]
+    camera.distance = camera_distance(side, aspect)
+    return camera
+
+
+def camera_distance(side: float, aspect: float) -> float:
+    """Works out how far the camera is from the middle of the floor.
+
+    Args:
+        side: Of the arena, m.
+        aspect: Width of a picture, in heights.
+
+    Returns:
+        The least distance from which the arena with its walls is in the picture, and a little
+        more, m. Of a corner p, with the directions ahead, right and up of the camera, the depth
+        is distance + p ahead, and p right and p up must be within the field of view at it.
+    """
+    half = 0.5 * side + 2 * _WALL
+    corners = np.array(
+        [[x, y, z] for x in (-half, half) for y in (-half, half) for z in (0.0, 2 * HALF_HEIGHT)]
+    )
+    ahead = np.array([0.0, math.cos(ELEVATION), -math.sin(ELEVATION)])
+    up = np.array([0.0, math.sin(ELEVATION), math.cos(ELEVATION)])
+    slope = math.tan(0.5 * FIELD_OF_VIEW) / _MARGIN
+    tall = np.abs(corners @ up) / slope
+    wide = np.abs(corners[:, 0]) / (slope * aspect)
+    return float((np.maximum(tall, wide) - corners @ ahead).max())

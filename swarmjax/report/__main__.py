@@ -1,0 +1,64 @@
+"""`python -m swarmjax.report run=DIR [out=DIR]`: what a run came to, as figures and one page.
+
+Writes `mix.png`, `success.png`, `grid.png` if the stages make a grid, and `report.html`, which
+holds them all. The run may be under way or have been killed: what it has not finished writing is
+left out. No JAX.
+"""
+
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from swarmjax import command, config
+from swarmjax.config import ConfigError, ReportConfig
+from swarmjax.report import page as report_page
+from swarmjax.report import rows
+
+PAGE = "report.html"
+
+
+def write(run: Path, out: Path, words: str) -> list[Path]:
+    """Writes the report of a run.
+
+    Args:
+      run: the run directory.
+      out: directory of the report, which is made.
+      words: the command that makes it, for the page.
+
+    Returns:
+      The files.
+
+    Raises:
+      ConfigError: if the run cannot be read, or `out` not be written.
+    """
+    history = rows.read(run)
+    from swarmjax.report import (
+        figures as report_figures,
+    )  # Matplotlib takes a second, which no refusal should
+
+    figures = report_figures.draw(history)
+    page = report_page.page(f"Report of {run}", words, history, figures)
+    files = {f"{name}.png": png for name, png in figures.items()} | {PAGE: page.encode()}
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name, content in files.items():
+            (out / name).write_bytes(content)
+    except OSError as error:
+        raise ConfigError(f"out is {out}, which cannot be written: {error.strerror}.") from None
+    return [out / name for name in files]
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    settings = config.load_report(arguments)
+    run = Path(settings.run)
+    out = Path(settings.out) if settings.out else run / "report"
+    words = shlex.join(["python", "-m", "swarmjax.report", *arguments])
+    files = write(run, out, words)
+    sys.stdout.write(f"{files[-1]}: the report of {run}, with {len(files) - 1} figures.\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("report", main, ReportConfig))

@@ -1,0 +1,240 @@
+"""The figures of a report, with Matplotlib.
+
+Shares are drawn on a scale that is read without colours too (Crameri et al. 2020, "The misuse of
+colour in science communication"): cividis and viridis rise evenly in lightness.
+"""
+
+import io
+import math
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import BoundaryNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
+
+from swarmjax.config import StageConfig
+from swarmjax.report import rows as report_rows
+from swarmjax.report.rows import History
+
+_DOTS = 110  # an inch
+_POINTS, _STRETCHES = 600, 200  # of a curve and of a band: about what the dots can show
+_NAMED = 24  # stages named along a strip of colours; more would touch
+_SEED, _ALL, _LIMIT = "0.62", "#0b4f9e", "#c04000"
+_STEPS = "arena control steps of a seed"
+
+type Cell = tuple[int, int, tuple[float, float]]  # robots, obstacles, side
+
+
+def draw(history: History) -> dict[str, bytes]:
+    """Draws the figures of a run.
+
+    Returns:
+      PNG files by name: `mix`, `success`, and `grid` if the stages make one. The same run gives
+      the same files: they do not hold Matplotlib's version.
+    """
+    files = {}
+    for name, make in (("mix", mix), ("success", success), ("grid", grid)):
+        figure, content = make(history), io.BytesIO()
+        if figure is not None:
+            figure.savefig(content, format="png", dpi=_DOTS, metadata={"Software": None})
+            files[name] = content.getvalue()
+    return files
+
+
+def mix(history: History) -> Figure:
+    """Draws on which stages the arenas were, stacked, as the mean over seeds."""
+    shares = history.mix.mean(axis=0)
+    steps, bands = _stretches(history.arena_steps, shares)
+    names = history.names
+    colours = colormaps["viridis"](np.linspace(0.0, 1.0, len(names)))
+    figure = Figure(figsize=(8.6, 4.2), layout="constrained")
+    axes = figure.subplots()
+    # What an update was trained on holds from the end of the one before.
+    axes.stackplot(
+        np.concatenate([[0], steps]),
+        np.concatenate([bands[:1], bands]).T,
+        colors=colours,
+        step="pre",
+        linewidth=0,
+        antialiased=False,  # or the ground shows between two bands
+    )
+    axes.set(xlim=(0, steps[-1]), ylim=(0, 1), xlabel=_STEPS)
+    seeds = len(history.seeds)
+    axes.set_ylabel("share of the arenas" + (f", mean of {seeds} seeds" if seeds > 1 else ""))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+    _name_colours(figure, axes, names)
+    return figure
+
+
+def success(history: History) -> Figure:
+    """Draws the success of each stage in a panel of its own: every seed, and their IQM."""
+    stages = len(history.names)
+    columns = min(stages, 3 if stages <= report_rows.MANY else 6 if stages <= 30 else 8)
+    rows = math.ceil(stages / columns)
+    figure = Figure(figsize=(max(8.6, 1.4 * columns), max(1.2 + 1.6 * rows, 4.2)))
+    figure.set_layout_engine("constrained")
+    panels = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
+    at = _at(len(history.updates), _POINTS)
+    steps = history.arena_steps[at]
+    lately = report_rows.trained_lately(history)[:, at]
+    mean = report_rows.together(history.success)[at]
+    for i, panel in enumerate(panels[:stages]):
+        for seed, there in zip(history.success[:, at, i], lately[..., i], strict=True):
+            _curve(panel, steps, seed, there, color=_SEED, lw=0.7)
+        _curve(panel, steps, mean[:, i], lately[..., i].any(axis=0), color=_ALL, lw=2.0)
+        _mark(panel, history, i)
+        panel.tick_params(labelbottom=i + columns >= stages)
+    for panel in panels[stages:]:
+        panel.set_visible(False)
+    _label_outer(figure, history)
+    _explain_lines(figure, history)
+    return figure
+
+
+def grid(history: History) -> Figure | None:
+    """Draws the last success of each cell, robots by side, a panel for each number of obstacles.
+
+    None if the stages of the run make no grid.
+    """
+    cells = cells_of(history.config.stage)
+    if cells is None:
+        return None
+    last, _ = report_rows.among(history.success[:, -1])
+    robots, obstacles, sides = (sorted(set(axis)) for axis in zip(*cells, strict=True))
+    columns = min(len(obstacles), 4)
+    rows = math.ceil(len(obstacles) / columns)
+    wide = 0.55 if all(low == high for low, high in sides) else 0.85
+    size = (1.6 + columns * (0.4 + wide * len(sides)), 0.9 + rows * (0.5 + 0.55 * len(robots)))
+    figure = Figure(figsize=size, layout="constrained")
+    panels = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
+    for panel, count in zip(panels, obstacles, strict=False):
+        table = np.full((len(robots), len(sides)), -1)
+        for (r, o, side), stage in cells.items():
+            if o == count:
+                table[robots.index(r), sides.index(side)] = stage
+        _heat(panel, table, last)
+        panel.set_title(f"{count} obstacle{'s' * (count != 1)}", fontsize=10)
+        panel.set_xticks(range(len(sides)), [report_rows.side_text(side) for side in sides])
+        panel.set_yticks(range(len(robots)), [str(r) for r in robots])
+    for panel in panels[len(obstacles) :]:
+        panel.set_visible(False)
+    figure.supxlabel("side of the arena (m)", fontsize=10)
+    figure.supylabel("robots", fontsize=10)
+    scale = ScalarMappable(Normalize(0.0, 1.0), "cividis")
+    bar = figure.colorbar(scale, ax=panels, format=PercentFormatter(1.0, symbol=" %"))
+    bar.set_label(f"{report_rows.measure(history)}, at last")
+    return figure
+
+
+def cells_of(stages: tuple[StageConfig, ...]) -> Mapping[Cell, int] | None:
+    """Finds the stage of each cell robots x obstacles x side; None if the stages make no grid.
+
+    They do if no two share a cell, two axes at least have several values, and at least half of all
+    cells are there: a grid lacks those that are too small for what they would hold.
+    """
+    cells = {(stage.robots, stage.obstacles, stage.sides): i for i, stage in enumerate(stages)}
+    lengths = [len(set(axis)) for axis in zip(*cells, strict=True)]
+    several = sum(length > 1 for length in lengths)
+    whole = len(cells) == len(stages) and 2 * len(cells) >= math.prod(lengths)
+    return cells if whole and several > 1 else None
+
+
+def _at(updates: int, points: int) -> np.ndarray:
+    """Indices of evenly spread points, the last one among them."""
+    return np.unique(np.linspace(updates - 1, 0, points).round().astype(int))
+
+
+def _stretches(steps: np.ndarray, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Means of shares [T, S] over stretches of updates, and the steps at which each ends."""
+    ends = _at(len(steps), _STRETCHES) + 1
+    means = [shares[low:high].mean(axis=0) for low, high in pairwise([0, *ends])]
+    return steps[ends - 1], np.array(means)
+
+
+def _name_colours(figure: Figure, axes: Axes, names: list[str]) -> None:
+    """Names the bands along a strip of their colours, in their order."""
+    count = len(names)
+    norm = BoundaryNorm(np.arange(count + 1) - 0.5, count)
+    strip = ScalarMappable(norm, colormaps["viridis"].resampled(count))
+    every = math.ceil(count / _NAMED)
+    ticks = list(range(count - 1, -1, -every))  # the last one is what the others lead to
+    bar = figure.colorbar(strip, ax=axes, ticks=ticks, spacing="uniform", aspect=30, pad=0.02)
+    bar.ax.set_yticklabels([names[i] for i in ticks], fontsize=9 if count <= 12 else 7)
+    bar.ax.tick_params(length=0)
+    bar.outline.set_visible(False)
+
+
+def _curve(
+    panel: Axes, steps: np.ndarray, share: np.ndarray, lately: np.ndarray, **style: Any
+) -> None:
+    """Draws a line where the stage was trained on, and dots where it was left behind."""
+    panel.plot(steps, np.where(lately, share, np.nan), **style)
+    panel.plot(steps, np.where(lately, np.nan, share), ":", **style)
+
+
+def _mark(panel: Axes, history: History, stage: int) -> None:
+    """Gives a panel its name, the last share, and the one that promotes."""
+    small = len(history.names) > report_rows.MANY
+    last, measured = report_rows.among(history.success[:, -1])
+    figure = f"{100 * last[stage]:.0f} %" if measured[stage] else "not measured"
+    panel.set_title(
+        f"{history.names[stage]}   {figure}", loc="left", fontsize=7 if small else 10, pad=3
+    )
+    promoting = _promoting(history)
+    if promoting is not None:
+        panel.axhline(promoting, color=_LIMIT, lw=0.8, ls="--")
+    panel.grid(visible=True, alpha=0.25)
+    panel.tick_params(labelsize=7 if small else 9)
+
+
+def _explain_lines(figure: Figure, history: History) -> None:
+    """Says above the panels what each kind of line is."""
+    seeds = len(history.seeds)
+    kinds = [Line2D([], [], color=_ALL, lw=2.0, label=f"interquartile mean of {seeds} seeds")]
+    if seeds == 1:
+        kinds = [Line2D([], [], color=_ALL, lw=2.0, label=f"seed {history.seeds[0]}")]
+    else:
+        kinds.append(Line2D([], [], color=_SEED, lw=0.7, label="each seed"))
+    if not report_rows.trained_lately(history)[~np.isnan(history.success)].all():
+        kinds.append(Line2D([], [], color=_ALL, ls=":", label="no longer trained on"))
+    if _promoting(history) is not None:
+        kinds.append(Line2D([], [], color=_LIMIT, lw=0.8, ls="--", label="promotes"))
+    figure.legend(handles=kinds, loc="outside upper right", ncols=4, fontsize=8, frameon=False)
+
+
+def _promoting(history: History) -> float | None:
+    """Success that promotes; None where nothing does."""
+    return history.config.curriculum.threshold if len(history.names) > 1 else None
+
+
+def _label_outer(figure: Figure, history: History) -> None:
+    """Labels the axes that all panels share."""
+    panel = figure.axes[0]
+    panel.set(xlim=(0, history.arena_steps[-1]), ylim=(0, 1.02))
+    panel.xaxis.set_major_locator(MaxNLocator(2 if len(history.names) > report_rows.MANY else 4))
+    panel.xaxis.set_major_formatter(EngFormatter(sep=""))
+    panel.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+    figure.supxlabel(_STEPS, fontsize=10)
+    figure.supylabel(report_rows.measure(history), fontsize=10)
+
+
+def _heat(panel: Axes, table: np.ndarray, last: np.ndarray) -> None:
+    """Draws the cells of a table of stages, -1 where there is none, with their numbers."""
+    values = np.where(table < 0, np.nan, last[table])
+    panel.set_facecolor("0.93")
+    panel.imshow(values, "cividis", Normalize(0.0, 1.0), aspect="auto", origin="lower")
+    for (row, column), stage in np.ndenumerate(table):
+        value = values[row, column]
+        if stage < 0 or np.isnan(value):
+            text, colour = ("" if stage < 0 else "-"), "black"
+        else:
+            text, colour = f"{100 * value:.0f}", "white" if value < 0.55 else "black"
+        panel.text(column, row, text, color=colour, ha="center", va="center", fontsize=9)

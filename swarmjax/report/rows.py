@@ -1,0 +1,333 @@
+"""What a run wrote down, read back as arrays for its report. No JAX.
+
+Axes: N seeds, T updates, S stages. What was not measured is nan here and null in the files.
+
+A last line without its newline is being written, or was as the run was killed: it is skipped, so
+that a run can be read at any time. Any other damage is refused, by its file, line and key.
+"""
+
+import json
+import math
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from swarmjax import config
+from swarmjax.config import ConfigError, TrainConfig
+from swarmjax.evaluate.statistics import iqm
+from swarmjax.run import recorder
+
+Row = dict[str, Any]
+
+# Of each stage its newest verdict, in the order of the stages.
+BY_STAGE = (
+    "success_by_stage",
+    "complete_by_stage",
+    "contacts_by_stage",
+    "return_by_stage",
+    "progress_by_stage",
+    "episodes_by_stage",
+)
+_LISTS = ("mix", "weights", *BY_STAGE)
+MANY = 9  # stages from which on each is drawn small
+SUMMARY = "summary.json"
+_NUMBERS = ("seed", "update", "arena_steps")
+# A verdict takes one cohort in which its episodes begin, and one in which the last of them end.
+_COHORTS_OF_A_VERDICT = 2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class History:
+    """What a run came to, at the updates that all of its seeds have written down.
+
+    Attributes:
+      config: that the run was trained with.
+      seeds: [N], rising.
+      updates: [T], rising, from 0.
+      arena_steps: [T] arena control steps of one seed by the end of the update.
+      mix: [N, T, S] share of the arenas that were on the stage, 0 to 1.
+      weights: [N, T, S] share of the arenas that the curriculum gave the stage, 0 to 1.
+      by_stage: [N, T, S] for each name of `BY_STAGE`.
+      seconds: of training by the last update; None if they were not written down.
+      decisions: of the curriculum, as they were written down, by seed and update.
+      summary: of the run, as it was written down; empty before its end.
+    """
+
+    config: TrainConfig
+    seeds: np.ndarray
+    updates: np.ndarray
+    arena_steps: np.ndarray
+    mix: np.ndarray
+    weights: np.ndarray
+    by_stage: dict[str, np.ndarray]
+    seconds: float | None
+    decisions: list[Row]
+    summary: Row
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the stages."""
+        return [stage.name for stage in self.config.stage]
+
+    @property
+    def success(self) -> np.ndarray:
+        """Share [N, T, S] by which the curriculum decides: of targets, or of whole episodes."""
+        by_targets = self.config.curriculum.success == "targets"
+        return self.by_stage["success_by_stage" if by_targets else "complete_by_stage"]
+
+
+def read(run: Path) -> History:
+    """Reads a run directory.
+
+    Raises:
+      ConfigError: if a file is missing or damaged, or holds no row of every seed.
+    """
+    trained = read_config(run)
+    stages = len(trained.stage)
+    by_seed: dict[int, dict[int, Row]] = {}
+    for where, raw in read_lines(run, recorder.METRICS):
+        row = _checked(raw, stages, where)
+        by_seed.setdefault(row["seed"], {})[row["update"]] = row
+    updates = sorted(set.intersection(*map(set, by_seed.values()))) if by_seed else []
+    if not updates:
+        raise ConfigError(f"{run / recorder.METRICS} has no update of every seed: train it first.")
+    summary = read_object(run / SUMMARY) if (run / SUMMARY).exists() else {}
+    return _history(trained, by_seed, updates, (_read_decisions(run), summary))
+
+
+def measure(history: History) -> str:
+    """Names the share by which the curriculum decides, `success`."""
+    by_targets = history.config.curriculum.success == "targets"
+    return "targets reached" if by_targets else "episodes in which all arrived"
+
+
+def trained_lately(history: History) -> np.ndarray:
+    """Tells whether [N, T, S] a stage's newest verdict is about the networks as they are.
+
+    It is until two cohorts (see `curriculum`) after the stage last had a share of the arenas: so
+    long may a verdict still come in. After that it is what the stage was left with.
+    """
+    task, algo = history.config.task, history.config.algo
+    lag = _COHORTS_OF_A_VERDICT * math.ceil(task.step_limit / algo.rollout)
+    updates = history.updates[None, :, None]
+    given = np.where(history.weights > 0.0, updates, -np.inf)
+    return updates - np.maximum.accumulate(given, axis=1) <= lag
+
+
+def together(values: np.ndarray) -> np.ndarray:
+    """Interquartile mean over seeds, where all of them have a value.
+
+    Where some have none, those that do would be the fast ones.
+
+    Args:
+      values: [N, ...] with nan where there is none.
+
+    Returns:
+      [...] with nan where a seed has none.
+    """
+    missing = np.isnan(values).any(axis=0)
+    return np.where(missing, np.nan, iqm(np.where(missing, 0.0, values), axis=0))
+
+
+def among(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Interquartile mean [S] over those seeds that have a value, and how many [S] they are.
+
+    Args:
+      values: [N, S] with nan where there is none; the mean is nan where no seed has one.
+    """
+    there = ~np.isnan(values)
+    mean = [iqm(v[t]) if t.any() else np.nan for v, t in zip(values.T, there.T, strict=True)]
+    return np.array(mean), there.sum(axis=0)
+
+
+def side_text(sides: tuple[float, float]) -> str:
+    """Writes the smallest and the largest side of a stage as one, or as a range, without unit."""
+    low, high = sides
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
+
+
+def _history(
+    trained: TrainConfig,
+    by_seed: dict[int, dict[int, Row]],
+    updates: list[int],
+    rest: tuple[list[Row], Row],
+) -> History:
+    """Lays the rows out by seed and update."""
+    seeds = sorted(by_seed)
+    rows = [[by_seed[seed][update] for update in updates] for seed in seeds]
+    lists = np.array([[row["lists"] for row in of_seed] for of_seed in rows])
+    columns = dict(zip(_LISTS, np.moveaxis(lists, 2, 0), strict=True))
+    mix = np.nan_to_num(columns["mix"])
+    return History(
+        config=trained,
+        seeds=np.array(seeds),
+        updates=np.array(updates),
+        arena_steps=np.array([row["arena_steps"] for row in rows[0]]),
+        mix=mix / np.maximum(mix.sum(axis=-1, keepdims=True), 1.0),
+        weights=np.nan_to_num(columns["weights"]),
+        by_stage={key: columns[key] for key in BY_STAGE},
+        seconds=rows[0][-1].get("train_s"),
+        decisions=rest[0],
+        summary=rest[1],
+    )
+
+
+def _checked(raw: Row, stages: int, where: str) -> Row:
+    """Takes out of a row what a report needs, its lists as one array [.., S] of float32."""
+    for key in (*_NUMBERS, *_LISTS):
+        if key not in raw:
+            raise ConfigError(
+                f"{where} has no {key}: the run is of a version that did not write it."
+            )
+    check_whole(raw, _NUMBERS, where)
+    check_numbers(raw, ("train_s",), where)
+    lists = [per_stage(raw[key], stages, f"{where} has {key}") for key in _LISTS]
+    return {key: raw[key] for key in (*_NUMBERS, "train_s") if key in raw} | {
+        "lists": np.array(lists)
+    }
+
+
+def check_whole(row: Row, keys: Sequence[str], where: str) -> None:
+    """Refuses a row that lacks whole numbers.
+
+    Args:
+      row: as it was written down.
+      keys: of the numbers.
+      where: names the row, for the sentence.
+
+    Raises:
+      ConfigError: if one is missing or of another type.
+    """
+    for key in keys:
+        if not isinstance(row.get(key), int) or isinstance(row[key], bool):
+            raise ConfigError(f"{where} has no whole number as {key}: it is damaged.")
+
+
+def check_numbers(row: Row, keys: Iterable[str], where: str) -> None:
+    """Refuses a row in which something else stands for a finite number; null or none may.
+
+    Args:
+      row: as it was written down.
+      keys: of the numbers.
+      where: names the row, for the sentence.
+
+    Raises:
+      ConfigError: if one is of another type, infinite or nan.
+    """
+    for key in keys:
+        if not _is_number_or_null(row.get(key)):
+            raise ConfigError(f"{where} has no number as {key}: it is damaged.")
+
+
+def per_stage(found: object, stages: int, what: str) -> np.ndarray:
+    """Takes a finite number or null for each stage.
+
+    Args:
+      found: as it was written down.
+      stages: how many there are.
+      what: names it, for the sentence.
+
+    Returns:
+      [S] float32 with nan for null.
+
+    Raises:
+      ConfigError: if it is anything else.
+    """
+    fits = isinstance(found, list) and len(found) == stages and all(map(_is_number_or_null, found))
+    if not fits:
+        raise ConfigError(f"{what} that is no list of {stages} numbers, one a stage.")
+    return np.array(found, np.float32)
+
+
+def _is_number_or_null(value: object) -> bool:
+    """Tells whether a value is None or fits a float; text and truth values are no numbers."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return value is None
+    return abs(value) <= sys.float_info.max  # no nan is
+
+
+def read_config(run: Path) -> TrainConfig:
+    """Reads the config of a run.
+
+    Raises:
+      ConfigError: if there is none, or it is refused.
+    """
+    path = run / "config.json"
+    if not path.exists():
+        raise ConfigError(f"{run} is no run directory: it has no config.json.")
+    stored = read_object(path)
+    try:
+        return config.build(TrainConfig, stored)
+    except ConfigError as error:
+        raise ConfigError(f"{path} does not fit: {error}") from None
+
+
+def read_object(path: Path) -> Row:
+    """Reads a file that holds one JSON object.
+
+    Raises:
+      ConfigError: if it cannot be read, or holds something else.
+    """
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path} cannot be read: {error}.") from None
+    if not isinstance(found, dict):
+        raise ConfigError(f"{path} holds no keys and values: it is damaged.")
+    return found
+
+
+def _read_decisions(run: Path) -> list[Row]:
+    """Reads the decisions of the curriculum, by seed and update."""
+    found = []
+    for where, row in read_lines(run, recorder.DECISIONS):
+        check_whole(row, ("seed", "update"), where)
+        check_numbers(row, ("targets_reached", "all_reached"), where)
+        weights = row.get("weights", {})
+        if not isinstance(weights, dict):
+            raise ConfigError(f"{where} has no shares by stage as weights: it is damaged.")
+        check_numbers(weights, weights, f"{where}, weights,")
+        found.append(row)
+    return sorted(found, key=lambda row: (row["seed"], row["update"]))
+
+
+def read_lines(run: Path, name: str) -> Iterator[tuple[str, Row]]:
+    """Reads a file of a JSON object a line, but for a last line that has no newline.
+
+    Args:
+      run: the run directory.
+      name: of the file.
+
+    Yields:
+      Words that name a line, and its object.
+
+    Raises:
+      ConfigError: if the file is missing or cannot be read, or a line holds something else.
+    """
+    path = run / name
+    if not path.exists():
+        raise ConfigError(f"{run} has no {name}: it holds no training yet.")
+    try:
+        with path.open() as file:
+            for number, line in enumerate(file, 1):
+                if not line.endswith("\n"):
+                    return
+                where = f"{path} in line {number}"
+                yield where, _object(line, where)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} cannot be read: {error}.") from None
+
+
+def _object(line: str, where: str) -> Row:
+    """Reads one line."""
+    try:
+        found = json.loads(line)
+    except ValueError:
+        found = None
+    if not isinstance(found, dict):
+        raise ConfigError(f"{where} is damaged: go on with the run, or take it out.")
+    return found

@@ -1,0 +1,125 @@
+"""The arms of a reproduction: what each one is, and its training by the ordinary trainer.
+
+Each has a run directory of its own in that of the reproduction, and goes on where it stopped.
+"""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from swarmjax import config, train
+from swarmjax.config import ARMS, Arm, ConfigError, ReproduceConfig, TrainConfig
+from swarmjax.export import __main__ as export
+from swarmjax.run import checkpoint, compile_cache, memory
+from swarmjax.run.checkpoint import CheckpointError
+from swarmjax.run.display import Display
+from swarmjax.run.trainer import Stop
+
+_EXPANDED, _MODERN = "_expanded", "modern_"
+_STAGES = {"curriculum": "paper_curriculum", "baseline": "paper6"}
+# Of the default 128 arenas of 32 control steps a million of them are 244 updates; of these 1,953.
+_FEW = ("arenas=16", "algo.rollout=32")
+
+
+def settings(given: ReproduceConfig, arm: Arm, out: Path) -> TrainConfig:
+    """Makes the config of an arm.
+
+    Args:
+      given: of the reproduction.
+      arm: which one.
+      out: directory of the reproduction.
+
+    Returns:
+      The config of a new run.
+
+    Raises:
+      ConfigError: if its numbers do not fit together.
+    """
+    kind = arm.removeprefix(_MODERN).removesuffix(_EXPANDED)
+    expanded = arm.endswith(_EXPANDED)
+    shared = [
+        f"stage={'paper_expanded' if expanded else _STAGES[kind]}",
+        f"budget={given.fine_tune if expanded else given.budget}",
+        *(f"{key}={getattr(given, key)}" for key in ("robot", "seed", "seeds", "seeds_by")),
+        f"sim.impl={given.impl}",
+        f"task.step_limit={given.step_limit}",
+        f"curriculum.threshold={given.threshold}",
+        f"run.dir={out / arm}",
+        "run.episodes=true",
+        "run.tensorboard=false",
+    ]
+    paper = config.load_train(
+        [
+            "algo=paper",
+            *shared,
+            *(f"algo.{key}={getattr(given, key)}" for key in ("rollout", "epochs", "time_out")),
+            *([f"start={out / kind}"] if expanded else []),
+        ]
+    )
+    if not arm.startswith(_MODERN):
+        return paper
+    modern = config.load_train(["realism=webots", *shared, *_FEW])
+    return replace(modern, task=paper.task)
+
+
+def run(made: TrainConfig, stop: Stop) -> bool:
+    """Trains an arm until it is done or somebody asks to stop.
+
+    Args:
+      made: its config, as `settings` made it.
+      stop: notices signals and the time.
+
+    Returns:
+      Whether its budget is spent.
+
+    Raises:
+      ConfigError: if the directory holds another run, or memory is short.
+      TrainingError: if a loss is no longer finite.
+    """
+    directory = Path(made.run.dir or "")
+    made = _go_on(made, directory)
+    with (
+        compile_cache.use(made.run.compile_cache),
+        memory.refusal(made),
+        Display(made.updates) as display,
+    ):
+        tally = train.carry_out(made, directory, stop, display)
+    return tally.update >= made.updates
+
+
+def _go_on(made: TrainConfig, directory: Path) -> TrainConfig:
+    """Lets an arm that has begun go on; one that was killed before it saved anything begins."""
+    if not (directory / "config.json").exists():
+        return made
+    stored = config.build(TrainConfig, export.read_config(directory), "stored ")
+    kept = replace(made, run=replace(made.run, dir=stored.run.dir), start=stored.start)
+    if kept != stored:
+        raise ConfigError(
+            f"{directory} holds a run of another config than this version makes of the "
+            "reproduction's: give another out."
+        )
+    try:
+        checkpoint.restore(directory)
+    except CheckpointError:
+        return made
+    return replace(made, resume=str(directory))
+
+
+def summaries(out: Path) -> dict[Arm, dict[str, Any]]:
+    """Reads what came of the arms that are done.
+
+    Args:
+      out: directory of the reproduction.
+
+    Returns:
+      The `summary.json` of each, in their order.
+    """
+    found = {}
+    for arm in ARMS:
+        path = out / arm / "summary.json"
+        if path.exists():
+            summary = json.loads(path.read_text())
+            if summary["budget_spent"]:
+                found[arm] = summary
+    return found

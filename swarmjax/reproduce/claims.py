@@ -1,0 +1,506 @@
+"""The claims in the paper's text, and what a reproduction says about each. No JAX.
+
+What would bear a claim out, and what would contradict it, is fixed here, before any data. A claim
+has a reading for each way in which the paper can be understood (docs/paper.md); every number is an
+interquartile mean over seeds with its 95 % bootstrap interval. A claim is reproduced if it holds by
+all of its readings, and not reproduced if the data contradict it by all of them; where an interval
+straddles, readings disagree or an arm is missing it is undecidable.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal, Protocol
+
+import numpy as np
+
+from swarmjax.evaluate import statistics
+from swarmjax.evaluate.statistics import Interval, iqm
+from swarmjax.reproduce import measures
+from swarmjax.reproduce.measures import NUMBER, PLACE, SHARE, Axis, Measure, Unit
+from swarmjax.reproduce.rows import EXPANDED, LAST, Reproduction
+
+GENERATED = 0.8  # share of targets that is the desired behaviour: what promotes from a stage, too
+FAILED = 0.5  # share of targets below which a swarm fails
+ABOUT = 0.5  # "approximately": within this share of the number
+_NOTE = (
+    "Numbers are interquartile means over seeds, with 95 % bootstrap intervals in brackets. Of "
+    "two, the first is the curriculum's and the second the baseline's."
+)
+_ROUNDING = 1e-9  # what means lose: that of 0.95, 0.95 and 0.95 is less than 0.95
+_PAIR = ("curriculum", "baseline")
+_TUNED = ("curriculum_expanded", "baseline_expanded")
+_MODERN = ("modern_curriculum", "modern_baseline")
+
+type Outcome = Literal["reproduced", "not reproduced", "undecidable"]
+# What the arms of a reading came to, [N] each, to whether the claim holds, and the numbers.
+type Test = Callable[..., tuple[bool | None, str]]
+
+
+class Values(Protocol):
+    """What an arm came to by seed: a function of `reproduce_measures` with its options set."""
+
+    def __call__(self, data: Reproduction, arm: str, /) -> np.ndarray:
+        """Returns [N]."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """One way in which a claim can be understood.
+
+    Attributes:
+      name: in words.
+      arms: finished ones that it needs.
+      values: of an arm.
+      test: of the values of the arms, in their order.
+    """
+
+    name: str
+    arms: tuple[str, ...]
+    values: Values
+    test: Test
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """What a reading of a claim came to.
+
+    Attributes:
+      reading: its name.
+      holds: whether the claim holds by it; None where that is open.
+      text: the numbers that say so.
+    """
+
+    reading: str
+    holds: bool | None
+    text: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Claim:
+    """A claim in the paper's text.
+
+    Attributes:
+      name: a key.
+      quote: of the paper, word for word.
+      where: the quote stands.
+      criterion: what bears the claim out, and what contradicts it.
+      figures: of the report, which show it.
+      readings: by all of which it must hold.
+    """
+
+    name: str
+    quote: str
+    where: str
+    criterion: str
+    figures: str
+    readings: tuple[Reading, ...]
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Arms that its readings need."""
+        return tuple(dict.fromkeys(arm for reading in self.readings for arm in reading.arms))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What became of a claim.
+
+    Attributes:
+      claim: that is judged.
+      outcome: of it.
+      reason: why it is undecidable; empty if it is not.
+      findings: of its readings.
+    """
+
+    claim: Claim
+    outcome: Outcome
+    reason: str
+    findings: tuple[Finding, ...]
+
+
+def at_least(*values: np.ndarray, least: float) -> tuple[bool | None, str]:
+    """Tests whether all arms come to a share: their intervals lie at or above it.
+
+    One that lies below contradicts it.
+    """
+    found = [_mean(each) for each in values]
+    text = " and ".join(SHARE.interval(each) for each in found)
+    if all(each.low >= least - _ROUNDING for each in found):
+        return True, text
+    return (False if any(each.high < least - _ROUNDING for each in found) else None), text
+
+
+def below(values: np.ndarray, *, limit: float) -> tuple[bool | None, str]:
+    """Tests whether an arm stays below a share: its interval does; one at or above contradicts."""
+    found = _mean(values)
+    text = SHARE.interval(found)
+    return _side(limit - found.high, limit - found.low, text, touching=True)
+
+
+def about(values: np.ndarray, *, number: float) -> tuple[bool | None, str]:
+    """Tests whether an arm's interval lies within `ABOUT` of a number; one outside contradicts."""
+    found, low, high = _mean(values), (1 - ABOUT) * number, (1 + ABOUT) * number
+    text = PLACE.interval(found)
+    if low <= found.low and found.high <= high:
+        return True, text
+    return (False if found.high < low or found.low > high else None), text
+
+
+def higher(ours: np.ndarray, theirs: np.ndarray, *, unit: Unit) -> tuple[bool | None, str]:
+    """Tests whether the first arm has more: the interval of the paired difference is above 0.
+
+    One that lies below 0 contradicts it.
+    """
+    more = statistics.paired(theirs[:, None], ours[:, None], iqm)
+    both = f"{unit.value(float(iqm(ours)))} against {unit.value(float(iqm(theirs)))}"
+    text = f"{both}, difference {unit.difference(more)}"
+    return _side(more.low, more.high, text)
+
+
+def lower(ours: np.ndarray, theirs: np.ndarray, *, unit: Unit) -> tuple[bool | None, str]:
+    """Tests whether the first arm has less, as `higher` does."""
+    holds, text = higher(ours, theirs, unit=unit)
+    return (None if holds is None else not holds), text
+
+
+def earlier(ours: np.ndarray, theirs: np.ndarray) -> tuple[bool | None, str]:
+    """Tests whether the first arm gets somewhere earlier, where inf is never.
+
+    It does if the interval of the probability that a seed of it does so lies above 0.5; one that
+    lies below contradicts it.
+    """
+    chance = statistics.probability_of_improvement(theirs[:, None], ours[:, None])
+    both = " against ".join(PLACE.value(float(iqm(each))) for each in (ours, theirs))
+    text = f"{both}, probability of being earlier {NUMBER.interval(chance)}"
+    return _side(chance.low - 0.5, chance.high - 0.5, text)
+
+
+def above_zero(values: np.ndarray) -> tuple[bool | None, str]:
+    """Tests whether a share is not 0: its interval is above; one that is 0 contradicts it."""
+    found = _mean(values)
+    return _side(found.low, found.high, SHARE.interval(found), touching=True)
+
+
+def crowded(values: np.ndarray) -> tuple[bool | None, str]:
+    """Tests whether the last to arrive senses no more than the first, which contradicts crowding.
+
+    More of it is what crowding would bring about, but no proof of it: the reading stays open.
+    """
+    found = _mean(values)
+    text = f"{NUMBER.difference(found)} steps"
+    if found.high <= _ROUNDING:
+        return False, text
+    return None, f"{text}, which crowding would bring about, and other things too"
+
+
+def judge(data: Reproduction) -> list[Verdict]:
+    """Judges every claim of the paper."""
+    return [verdict(data, claim) for claim in CLAIMS]
+
+
+def verdict(data: Reproduction, claim: Claim) -> Verdict:
+    """Judges a claim by all of its readings."""
+    findings = tuple(finding(data, reading) for reading in claim.readings)
+    held = {each.holds for each in findings}
+    outcome: Outcome = "undecidable"
+    reason = ""
+    if held == {True}:
+        outcome = "reproduced"
+    elif held == {False}:
+        outcome = "not reproduced"
+    elif data.lacking(claim.needs):
+        reason = "an arm is missing"
+    else:
+        reason = "readings disagree" if {True, False} <= held else "a reading is open"
+    return Verdict(claim=claim, outcome=outcome, reason=reason, findings=findings)
+
+
+def finding(data: Reproduction, reading: Reading) -> Finding:
+    """Says what a reading comes to; it is open where an arm or an episode is missing."""
+    lacking = data.lacking(reading.arms)
+    if lacking:
+        text = f"lacks {' and '.join(lacking)}"
+        return Finding(reading=reading.name, holds=None, text=text)
+    values = [reading.values(data, arm) for arm in reading.arms]
+    if any(np.isnan(each).any() for each in values):
+        text = "a seed has too few episodes for it"
+        return Finding(reading=reading.name, holds=None, text=text)
+    holds, text = reading.test(*values)
+    return Finding(reading=reading.name, holds=holds, text=text)
+
+
+def goals(data: Reproduction) -> list[Finding]:
+    """Says whether the modern trainer comes to what this project set itself, by mean actions."""
+    return [finding(data, goal) for goal in GOALS]
+
+
+def markdown(verdicts: Sequence[Verdict]) -> str:
+    """Tables verdicts, for a page of Markdown."""
+    rows = []
+    for each in verdicts:
+        reason = f", {each.reason}" if each.reason else ""
+        because = "<br>".join(map(finding_text, each.findings))
+        rows.append(
+            f'| "{each.claim.quote}" | {each.claim.where} | **{each.outcome}**{reason} | '
+            f"{because} | {each.claim.figures} |"
+        )
+    heads = ("the paper says", "where", "verdict", "because", "shown in")
+    return "\n".join([f"| {' | '.join(heads)} |", "|---" * len(heads) + "|", *rows, "", _NOTE, ""])
+
+
+def finding_text(found: Finding) -> str:
+    """Writes a finding in a line."""
+    return f"{found.reading}: {found.text} ({HELD[found.holds]})"
+
+
+HELD = {True: "holds", False: "contradicted", None: "open"}
+
+
+def _mean(values: np.ndarray) -> Interval[float]:
+    """Interquartile mean over seeds [N], with its interval."""
+    return statistics.bootstrap(values[:, None], iqm)
+
+
+def _side(low: float, high: float, text: str, *, touching: bool = False) -> tuple[bool | None, str]:
+    """Tells whether an interval lies above 0, below it (or at it, if `touching`), or straddles."""
+    if low > _ROUNDING:
+        return True, text
+    beyond = _ROUNDING if touching else -_ROUNDING
+    return (False if high < beyond else None), text
+
+
+def _by_mean(key: str, stage: str) -> tuple[str, Values]:
+    """Final policies by their mean actions."""
+    return "final policies, mean action", partial(measures.judged, key=key, stage=stage)
+
+
+def _by_sampling(of: Measure, stage: str) -> tuple[str, Values]:
+    """The end of training, by sampled actions."""
+    name = f"last {measures.WINDOW} episodes of training on {stage}, sampled actions"
+    return name, partial(measures.late, of=of, stage=stage)
+
+
+def _readings(arms: tuple[str, ...], test: Test, *sources: tuple[str, Values]) -> tuple:
+    """A reading for each source of values, of the same arms and by the same test."""
+    return tuple(Reading(name=name, arms=arms, values=v, test=test) for name, v in sources)
+
+
+def _steady(stage: str | None, *axes: Axis) -> tuple[tuple[str, Values], ...]:
+    """Where success becomes steady, by either reading of success."""
+    units = {"episode": "episode number", "steps": "arena steps"}
+    which = "all episodes" if stage is None else f"episodes on {stage}"
+    return tuple(
+        (
+            f"{name}, {which}, {units[axis]}",
+            partial(measures.steady_at, success=success, axis=axis, stage=stage),
+        )
+        for name, success in measures.SUCCESS.items()
+        for axis in axes
+    )
+
+
+def _rewarded() -> tuple[tuple[str, Values], ...]:
+    """Where the reward on the last stage is near its best, of robot 1 and of the swarm."""
+    kinds = {"robot 1": measures.first_reward, "mean of the robots": measures.mean_reward}
+    units: dict[Axis, str] = {"episode": "episode number", "steps": "arena steps"}
+    return tuple(
+        (
+            f"{name}, {unit}",
+            partial(measures.reward_reached, of=of, axis=axis, rivals=_PAIR, stage=LAST),
+        )
+        for name, of in kinds.items()
+        for axis, unit in units.items()
+    )
+
+
+def _expanded(test: Test, which: slice, key: str = "targets_reached") -> tuple[Reading, ...]:
+    """The 1.5 m arena, zero-shot and trained on, of some of the pair."""
+    source = partial(measures.judged, key=key, stage=EXPANDED)
+    return (
+        Reading(name="zero-shot at 1.5 m", arms=_PAIR[which], values=source, test=test),
+        Reading(name="trained on at 1.5 m", arms=_TUNED[which], values=source, test=test),
+    )
+
+
+_TARGETS = (
+    _by_mean("targets_reached", LAST),
+    _by_sampling(measures.targets, LAST),
+)
+_MORE_SHARE = partial(higher, unit=SHARE)
+_STEADY_IS = (
+    f"Steady is the first episode from which on {measures.WINDOW} episodes, and all to the end of "
+    f"the run, have at least {measures.STEADY:g} of successes, and no later {measures.WINDOW} less "
+    f"than {measures.KEPT:g}."
+)
+_DIFFERENCE = "The interval of the paired difference excludes 0, on the claim's side."
+
+CLAIMS = (
+    Claim(
+        name="both",
+        quote="both successfully generated the desired collective behavior",
+        where="section 4",
+        criterion=f"Share of targets reached on {LAST}: the intervals of curriculum and baseline "
+        f"lie at or above {GENERATED:g}. Contradicted if one lies below.",
+        figures="table of final policies, curves of the default trainer",
+        readings=_readings(_PAIR, partial(at_least, least=GENERATED), *_TARGETS),
+    ),
+    Claim(
+        name="six_hundred",
+        quote="approximately 600 episodes are required to achieve successful goal-reaching "
+        "attempts",
+        where="section 4, on Figure 6, PPO alone",
+        criterion=f"{_STEADY_IS} The interval of the baseline lies within 300 to 900. Contradicted "
+        "if it lies outside.",
+        figures="figure 6",
+        readings=_readings(("baseline",), partial(about, number=600.0), *_steady(None, "episode")),
+    ),
+    Claim(
+        name="three_hundred",
+        quote="the robot successfully attains the goal in approximately 300 episodes",
+        where="section 4, on Figure 6, with curriculum",
+        criterion=f"{_STEADY_IS} The interval of the curriculum lies within 150 to 450. "
+        "Contradicted if it lies outside.",
+        figures="figure 6",
+        readings=_readings(
+            ("curriculum",), partial(about, number=300.0), *_steady(None, "episode")
+        ),
+    ),
+    Claim(
+        name="faster_goal",
+        quote="the robot exhibits faster learning towards reaching the goal",
+        where="section 4, on Figure 6",
+        criterion=f"{_STEADY_IS} The probability that a seed of the curriculum is steady before "
+        "one of the baseline: the interval lies above 0.5. Contradicted if below.",
+        figures="figure 6",
+        readings=_readings(_PAIR, earlier, *_steady(None, "episode"), *_steady(LAST, "steps")),
+    ),
+    Claim(
+        name="faster_reward",
+        quote="reached the optimal value faster than the traditional PPO approach",
+        where="section 4, on Figure 7",
+        criterion=f"First place at which the rolling mean of {measures.WINDOW} cumulative rewards "
+        f"on {LAST} is 0.9 of the best one of any seed of either arm. The probability that a seed "
+        "of the curriculum is there first: the interval lies above 0.5. Contradicted if below.",
+        figures="figure 7",
+        readings=_readings(_PAIR, earlier, *_rewarded()),
+    ),
+    Claim(
+        name="higher_success",
+        quote="exhibited a higher success rate in reaching the targets",
+        where="section 5",
+        criterion=f"Share of targets reached on {LAST}, curriculum minus baseline. {_DIFFERENCE}",
+        figures="table of final policies, curves of the default trainer",
+        readings=_readings(_PAIR, _MORE_SHARE, *_TARGETS),
+    ),
+    Claim(
+        name="fewer_collisions",
+        quote="demonstrates enhanced obstacle avoidance abilities",
+        where="section 4, on Figure 8",
+        criterion=f"On {LAST}, curriculum minus baseline: share of robot steps with something "
+        f"within infrared range, and contacts per robot. {_DIFFERENCE}",
+        figures="figure 8, table of final policies",
+        readings=(
+            *_readings(
+                _PAIR,
+                partial(lower, unit=SHARE),
+                *(
+                    (f"infrared rule, {name}", values)
+                    for name, values in (
+                        _by_mean("sensed_share", LAST),
+                        _by_sampling(measures.sensed_share, LAST),
+                    )
+                ),
+            ),
+            *_readings(
+                _PAIR,
+                partial(lower, unit=NUMBER),
+                *(
+                    (f"contacts, {name}", values)
+                    for name, values in (
+                        _by_mean("contacts_per_robot", LAST),
+                        _by_sampling(measures.contacts, LAST),
+                    )
+                ),
+            ),
+        ),
+    ),
+    Claim(
+        name="collisions_remain",
+        quote="The collisions do not go to zero",
+        where="section 4, on Figure 8",
+        criterion=f"Share of robot steps with something within infrared range on {LAST}, "
+        "curriculum: the interval lies above 0. Contradicted if it is 0.",
+        figures="figure 8, table of final policies",
+        readings=_readings(
+            ("curriculum",),
+            above_zero,
+            _by_mean("sensed_share", LAST),
+            _by_sampling(measures.sensed_share, LAST),
+        ),
+    ),
+    Claim(
+        name="aggregation",
+        quote="because of the aggregation of the robots at the goal",
+        where="section 4, on Figure 8",
+        criterion="Control steps with something within infrared range, of the last robot to arrive "
+        f"minus the first one, over the last {measures.WINDOW} episodes on {LAST}, curriculum. "
+        "Contradicted if the interval does not exceed 0. More of them is what crowding would bring "
+        "about, but the data do not say what a ray met, so the claim cannot be reproduced by them.",
+        figures="figure 8",
+        readings=_readings(
+            ("curriculum",),
+            crowded,
+            ("last to arrive minus first", partial(measures.crowding, stage=LAST)),
+        ),
+    ),
+    Claim(
+        name="expanded_better",
+        quote="demonstrates more favorable outcomes",
+        where="section 4, on the arena of 1.5 m",
+        criterion=f"Share of targets reached on {EXPANDED}, curriculum minus baseline. "
+        f"{_DIFFERENCE}",
+        figures="figure 9",
+        readings=_expanded(_MORE_SHARE, slice(None)),
+    ),
+    Claim(
+        name="traditional_fails",
+        quote="The robots trained using traditional PPO fail to reach the predefined goals",
+        where="section 4, on Figure 9",
+        criterion=f"Share of targets reached on {EXPANDED}, baseline: the interval lies below "
+        f"{FAILED:g}. Contradicted if at or above.",
+        figures="figure 9",
+        readings=_expanded(partial(below, limit=FAILED), slice(1, 2)),
+    ),
+    Claim(
+        name="expanded_converges",
+        quote="the swarm's ability to converge and achieve the required collective behavior",
+        where="section 4, on Figure 9, with curriculum",
+        criterion=f"Share of targets reached on {EXPANDED}, curriculum: the interval lies at or "
+        f"above {GENERATED:g}. Contradicted if below.",
+        figures="figure 9",
+        readings=_expanded(partial(at_least, least=GENERATED), slice(0, 1)),
+    ),
+    Claim(
+        name="unseen",
+        quote="the ability to transfer learned knowledge to previously unseen environments",
+        where="section 5",
+        criterion=f"Share of targets that the curriculum's policies reach on {EXPANDED}, on which "
+        f"they were never trained: the interval lies at or above {GENERATED:g}. Contradicted if "
+        "below.",
+        figures="figure 9",
+        readings=_expanded(partial(at_least, least=GENERATED), slice(0, 1))[:1],
+    ),
+)
+
+GOALS = tuple(
+    Reading(
+        name=f"{arm}, at least {100 * least:.0f} % of the targets on {stage}",
+        arms=(arm,),
+        values=partial(measures.judged, key="targets_reached", stage=stage),
+        test=partial(at_least, least=least),
+    )
+    for arm in _MODERN
+    for stage, least in ((LAST, 0.95), (EXPANDED, 0.90))
+)

@@ -1,0 +1,156 @@
+"""Judges what a reproduction has trained, in MuJoCo's C engine: `evaluation.json`. No JAX.
+
+Every policy drives by its mean action on the last stage and on the 1.5 m arena, on levels that
+differ by the noise of their sensors alone.
+"""
+
+import json
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from swarmjax import compose, policy_file
+from swarmjax.config import ConfigError, EvaluateConfig, ReproduceConfig, StageConfig, TrainConfig
+from swarmjax.evaluate import cells, engine_c, trials
+from swarmjax.evaluate import judge as evaluate_judge
+from swarmjax.evaluate.engine_c import Arenas
+from swarmjax.evaluate.judge import Judge
+from swarmjax.evaluate.measures import Outcome
+from swarmjax.provenance import cores
+from swarmjax.reproduce.rows import EVALUATION, EXPANDED, LAST
+from swarmjax.settings import build
+from swarmjax.task import observation
+from swarmjax.task.level import Level
+
+STAGES = (LAST, EXPANDED)
+
+Row = dict[str, Any]
+
+
+class Task(NamedTuple):
+    """A policy to be judged on a stage."""
+
+    arm: str
+    seed: int
+    path: Path
+    stage: str
+
+
+def judge(
+    given: ReproduceConfig,
+    tasks: Sequence[Task],
+    report: Callable[[], None] = lambda: None,
+) -> list[Row]:
+    """Judges policies, over processes.
+
+    Args:
+      given: of the reproduction; says how many episodes, and how many processes.
+      tasks: what to judge.
+      report: told whenever one is done.
+
+    Returns:
+      A row of `evaluation.json` for each.
+
+    Raises:
+      PolicyError: if a policy is unsound.
+      ConfigError: if the physics breaks down.
+    """
+    workers = min(given.workers or cores(), max(1, len(tasks)))
+    found = []
+    for row in trials.work(partial(_judge, given.episodes), tasks, workers):
+        found.append(row)
+        report()
+    return found
+
+
+def _judge(episodes: int, task: Task) -> Row:
+    """Judges one policy on one stage."""
+    trained = policy_file.read(str(task.path))
+    config = build(TrainConfig, trained.meta["config"])
+    stage = build(StageConfig, compose.stages(compose.read_stage(task.stage), task.stage)[0])
+    evaluation = EvaluateConfig(
+        policy=str(task.path),
+        stage=stage,
+        robot=config.robot,
+        task=config.task,
+        realism=config.realism,
+        action="mean",
+        steps=config.task.step_limit,
+        episodes=episodes,
+    )
+    levels = cells.split(cells.draw_stage(evaluation, range(episodes)).levels)
+    outcome, nearer = play(evaluate_judge.load(evaluation, trained), levels)
+    weights = config.task.reward  # equation 3: it has no others
+    earned = weights.progress * nearer + weights.proximity * outcome.sensed
+    return {
+        "arm": task.arm,
+        "seed": task.seed,
+        "stage": task.stage,
+        "episodes": episodes,
+        "targets_reached": float(outcome.arrived.mean()),
+        "all_reached": float(outcome.arrived.all(axis=-1).mean()),
+        "sensed_share": float(outcome.sensed.sum() / outcome.moving.sum()),
+        "contacts_per_robot": float(outcome.contacts.sum(axis=-1).mean()),
+        "steps": float(outcome.clock.mean()),
+        "return": float(earned.mean()),
+    }
+
+
+def play(judge: Judge, levels: Sequence[Level]) -> tuple[Outcome, np.ndarray]:
+    """Runs episodes side by side, each until all its robots have arrived or the time is out.
+
+    Args:
+      judge: what the arenas share.
+      levels: [A] what they start from.
+
+    Returns:
+      What they came to, and how much nearer to its target each robot came before it arrived,
+      [A, R] m.
+
+    Raises:
+      ConfigError: if the physics of an episode breaks down.
+    """
+    arenas = engine_c.start(judge, levels)
+    total, nearer = arenas.outcome, np.zeros(arenas.outcome.arrived.shape)
+    for _ in range(judge.config.steps):
+        running = ~total.arrived.all(axis=-1)
+        if not running.any():
+            break
+        before, arenas = arenas, engine_c.step(judge, arenas)
+        gained = _distance(before) - _distance(arenas)
+        nearer += np.where(before.outcome.arrived, 0.0, gained)
+        total = Outcome(
+            *(_keep(running, *each) for each in zip(arenas.outcome, total, strict=True))
+        )
+    return total, nearer
+
+
+def _distance(arenas: Arenas) -> np.ndarray:
+    """Distances [A, R] to the targets, m."""
+    return observation.to_target(arenas.pose, arenas.target, np)[0]
+
+
+def _keep(running: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
+    """Takes what is new of the arenas that are running, [A, ...]."""
+    return np.where(running.reshape(running.shape + (1,) * (new.ndim - 1)), new, old)
+
+
+def read(out: Path) -> list[Row]:
+    """Reads the rows that are there already.
+
+    Args:
+      out: directory of the reproduction.
+
+    Raises:
+      ConfigError: if the file is damaged.
+    """
+    path = out / EVALUATION
+    if not path.exists():
+        return []
+    try:
+        return [*json.loads(path.read_text())["rows"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path} cannot be read ({error}): remove it to judge anew.") from None

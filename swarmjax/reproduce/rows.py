@@ -1,0 +1,250 @@
+"""What a reproduction of the paper wrote down, read back as arrays for its report. No JAX.
+
+Axes: N seeds, E episodes of a seed, R robots (most of any episode). An arm is one way to train; one
+that has not finished is left out, and the report says what lacks it. A finished arm that lacks an
+episode log, a seed or its evaluation is refused, by the file and the arm.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from swarmjax.config import ConfigError
+from swarmjax.evaluate.statistics import LEAST_DRAWN
+from swarmjax.report import rows as report_rows
+from swarmjax.report.rows import Row
+from swarmjax.run.recorder import EPISODES
+
+FACTS, EVALUATION = "reproduce.json", "evaluation.json"
+FORMAT = 2  # of both
+LAST, EXPANDED = "paper6", "paper_expanded"  # the stages that policies are judged on
+ARMS = {
+    "curriculum": "the paper's algorithm with its curriculum",
+    "baseline": "the paper's algorithm on the last stage from scratch",
+    "curriculum_expanded": "curriculum, trained on at 1.5 m",
+    "baseline_expanded": "baseline, trained on at 1.5 m",
+    "modern_curriculum": "the default trainer with the paper's curriculum",
+    "modern_baseline": "the default trainer on the last stage from scratch",
+}
+# Of a row of the evaluation, over its episodes.
+JUDGED = ("targets_reached", "all_reached", "sensed_share", "contacts_per_robot", "return")
+_COUNTS = ("seed", "update", "arena_steps", "steps", "robots")
+_BY_ROBOT = ("reached", "reward", "robot_steps", "sensed", "contacts")
+_MAPS = ("settings", "versions", "device", "commit", "seconds", "compile_s")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Log:
+    """Episodes of one seed, in the order in which they ended.
+
+    Attributes:
+      number: [E] of the episode in its run, from 1, rising.
+      arena_steps: [E] control steps over all arenas of the seed by its end.
+      stage: [E] name of its stage.
+      present: [E, R] whether the robot took part.
+      reached: [E, R] whether it reached its target; False where absent, as all below is 0.
+      reward: [E, R] sum over the episode, nothing discounted, m.
+      robot_steps: [E, R] control steps before it arrived.
+      sensed: [E, R] those with something within infrared range, the paper's rule of a collision.
+      contacts: [E, R] contacts that it began or met.
+    """
+
+    number: np.ndarray
+    arena_steps: np.ndarray
+    stage: np.ndarray
+    present: np.ndarray
+    reached: np.ndarray
+    reward: np.ndarray
+    robot_steps: np.ndarray
+    sensed: np.ndarray
+    contacts: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+    def on(self, stage: str | None) -> "Log":
+        """The episodes of one stage, with their numbers in the whole run; None for all."""
+        return self if stage is None else self.where(self.stage == stage)
+
+    def where(self, chosen: np.ndarray) -> "Log":
+        """The episodes of a mask [E]."""
+        return Log(**{name: values[chosen] for name, values in vars(self).items()})
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reproduction:
+    """What a reproduction came to.
+
+    Attributes:
+      facts: `reproduce.json` as it was written.
+      seeds: [N], rising.
+      logs: of each finished arm, N of them.
+      judged: of each finished arm and stage, for each name of `JUDGED`, [N].
+    """
+
+    facts: Row
+    seeds: tuple[int, ...]
+    logs: dict[str, tuple[Log, ...]]
+    judged: dict[tuple[str, str], dict[str, np.ndarray]]
+
+    def lacking(self, arms: Sequence[str]) -> list[str]:
+        """Those of some arms that have not finished."""
+        return [arm for arm in arms if arm not in self.logs]
+
+
+def read(out: Path) -> Reproduction:
+    """Reads the directory of a reproduction.
+
+    Raises:
+      ConfigError: if a file, a finished arm, a seed or an evaluation is missing or damaged.
+    """
+    facts = _read_facts(out)
+    seeds = tuple(sorted(facts["seeds"]))
+    finished = [arm for arm in ARMS if arm in facts["seconds"]]
+    if not finished:
+        raise ConfigError(f"{out / FACTS} names no finished arm: go on with the reproduction.")
+    return Reproduction(
+        facts=facts,
+        seeds=seeds,
+        logs={arm: _read_logs(out / arm, seeds) for arm in finished},
+        judged=_read_judged(out, finished, seeds),
+    )
+
+
+def _read_facts(out: Path) -> Row:
+    """Reads what the reproduction says about itself."""
+    path = out / FACTS
+    if not path.exists():
+        raise ConfigError(f"{out} is no reproduction: it has no {FACTS}.")
+    facts = report_rows.read_object(path)
+    _check_format(facts, path)
+    report_rows.check_whole(facts, ("budget", "fine_tune"), str(path))
+    seeds: Any = facts.get("seeds")
+    if not isinstance(seeds, list) or not all(map(_is_count, seeds)):
+        raise ConfigError(f"{path} has no list of whole numbers as seeds: it is damaged.")
+    if len(set(seeds)) < LEAST_DRAWN:
+        raise ConfigError(
+            f"{path} has {len(set(seeds))} seeds: an interval takes {LEAST_DRAWN} or more."
+        )
+    for key in _MAPS:
+        if not isinstance(facts.get(key), dict):
+            raise ConfigError(f"{path} has no keys and values as {key}: it is damaged.")
+    for key in ("seconds", "compile_s"):
+        report_rows.check_numbers(facts[key], facts[key], f"{path}, {key},")
+    return facts
+
+
+def _check_format(found: Row, path: Path) -> None:
+    if found.get("format") != FORMAT:
+        raise ConfigError(f"{path} has format {found.get('format')!r}, and {FORMAT} is read here.")
+
+
+def _read_logs(run: Path, seeds: Sequence[int]) -> tuple[Log, ...]:
+    """Reads the episodes of an arm, by seed."""
+    if not (run / EPISODES).exists():
+        raise ConfigError(f"{run} has no {EPISODES}: its arm is said to be finished.")
+    by_seed: dict[int, list[Row]] = {seed: [] for seed in seeds}
+    for where, row in report_rows.read_lines(run, EPISODES):
+        _check_episode(row, where)
+        if row["seed"] not in by_seed:
+            raise ConfigError(f"{where} has seed {row['seed']}, which is none of {FACTS}.")
+        rows = by_seed[row["seed"]]
+        if rows and row["update"] < rows[-1]["update"]:
+            raise ConfigError(f"{where} goes back to update {row['update']}: it is damaged.")
+        rows.append(row)
+    for seed, rows in by_seed.items():
+        if not rows:
+            raise ConfigError(f"{run / EPISODES} has no episode of seed {seed}.")
+    return tuple(_log(by_seed[seed]) for seed in seeds)
+
+
+def _check_episode(row: Row, where: str) -> None:
+    """Refuses an episode that lacks something, or whose lists have another length."""
+    report_rows.check_whole(row, _COUNTS, where)
+    if not isinstance(row.get("stage"), str):
+        raise ConfigError(f"{where} has no name as stage: it is damaged.")
+    for key in _BY_ROBOT:
+        found: Any = row.get(key)
+        fits = isinstance(found, list) and len(found) == row["robots"] > 0
+        if not fits or not all(map(_FITS[key], found)):
+            raise ConfigError(f"{where} has {key} that is no list of {row['robots']} values.")
+
+
+def _is_count(value: Any) -> bool:
+    """Tells whether a value is a whole number of 0 or more; truth values are none."""
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _is_finite(value: Any) -> bool:
+    """Tells whether a value is a finite number; truth values are none."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_number and bool(np.isfinite(value))
+
+
+_FITS = {
+    "reached": lambda value: isinstance(value, bool),
+    "reward": _is_finite,
+    "robot_steps": _is_count,
+    "sensed": _is_count,
+    "contacts": _is_count,
+}
+
+
+def _log(rows: list[Row]) -> Log:
+    """Lays the episodes of a seed out, by the arena steps at which they ended."""
+    rows = sorted(rows, key=lambda row: row["arena_steps"])
+    robots = np.array([row["robots"] for row in rows])
+    present = np.arange(robots.max()) < robots[:, None]
+    columns: dict[str, np.ndarray] = {}
+    for key in _BY_ROBOT:
+        flat = np.concatenate([row[key] for row in rows])
+        columns[key] = np.zeros(present.shape, flat.dtype)
+        columns[key][present] = flat
+    return Log(
+        number=np.arange(1, len(rows) + 1),
+        arena_steps=np.array([row["arena_steps"] for row in rows]),
+        stage=np.array([row["stage"] for row in rows]),
+        present=present,
+        **columns,
+    )
+
+
+def _read_judged(
+    out: Path, arms: Sequence[str], seeds: Sequence[int]
+) -> dict[tuple[str, str], dict[str, np.ndarray]]:
+    """Reads what the final policies of finished arms came to."""
+    path = out / EVALUATION
+    if not path.exists():
+        raise ConfigError(f"{out} has no {EVALUATION}: its policies are not judged yet.")
+    found = report_rows.read_object(path)
+    _check_format(found, path)
+    rows: dict[tuple[str, str, int], Row] = {}
+    if not isinstance(found.get("rows"), list):
+        raise ConfigError(f"{path} has no list of rows: it is damaged.")
+    for number, row in enumerate(found["rows"], 1):
+        _check_judged(row, f"{path}, row {number},")
+        rows[row["arm"], row["stage"], row["seed"]] = row
+    judged = {}
+    for arm, stage in ((arm, stage) for arm in arms for stage in (LAST, EXPANDED)):
+        for seed in seeds:
+            if (arm, stage, seed) not in rows:
+                raise ConfigError(f"{path} has no row of arm {arm}, seed {seed} on {stage}.")
+        of_arm = [rows[arm, stage, seed] for seed in seeds]
+        judged[arm, stage] = {key: np.array([row[key] for row in of_arm]) for key in JUDGED}
+    return judged
+
+
+def _check_judged(row: Any, where: str) -> None:
+    """Refuses a row of the evaluation that lacks something."""
+    if not isinstance(row, dict):
+        raise ConfigError(f"{where} holds no keys and values: it is damaged.")
+    report_rows.check_whole(row, ("seed", "episodes"), where)
+    for key in ("arm", "stage"):
+        if not isinstance(row.get(key), str):
+            raise ConfigError(f"{where} has no name as {key}: it is damaged.")
+    for key in JUDGED:
+        if not _is_finite(row.get(key)):
+            raise ConfigError(f"{where} has no number as {key}: it is damaged.")
