@@ -16,7 +16,7 @@ import numpy as np
 
 from swarmjax import command, config, epuck, policy_file, provenance
 from swarmjax.config import EvaluateConfig
-from swarmjax.evaluate import __main__ as evaluate
+from swarmjax.evaluate.evaluation import evaluate
 from swarmjax.task import observation
 
 # Action (speed, turn rate; -1..1) at bearing 0, and what each radian to the left or right adds:
@@ -83,7 +83,7 @@ def main(arguments: Sequence[str]) -> int:
             path = Path(folder) / f"{name}.npz"
             write(path, *actions)
             settings = config.load_evaluate([*arguments, f"policy={path}"])
-            result = evaluate.evaluate(settings).result
+            result = evaluate(settings).result
         del result["policies"]  # written a moment ago, to a folder that is gone
         line = {"benchmark": "baselines", "policy": name, **result, "commit": provenance.commit()}
         sys.stdout.write(json.dumps(line) + "\n")

@@ -23,9 +23,9 @@ from benchmarks import peers, steps_per_second
 from benchmarks.watched_run import MADE_WITH, Watched
 from swarmjax import command, config
 from swarmjax.evaluate import cells, trials
-from swarmjax.export import __main__ as export
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import Row
+from swarmjax.run.policy_export import POLICY
 from swarmjax.settings import Section, about
 
 SHARES = (0.90, 0.95)
@@ -70,7 +70,7 @@ def train(words: Sequence[str], run: Path, stop_at: float) -> tuple[dict[str, fl
 
 def judge(run: Path, stage: str, episodes: int) -> dict[str, Any]:
     """Share of targets that a run's policy reaches in MuJoCo C on wheels, and how it acts there."""
-    path = run / export.POLICY
+    path = run / POLICY
     settings = config.load_evaluate(
         [f"policy={path}", f"stage={stage}", "robot=wheeled", f"episodes={episodes}"]
     )

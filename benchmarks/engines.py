@@ -16,8 +16,8 @@ import numpy as np
 
 from swarmjax import command, config, provenance
 from swarmjax.config import ConfigError, EvaluateConfig
-from swarmjax.evaluate import __main__ as evaluate
 from swarmjax.evaluate import summary as evaluate_summary
+from swarmjax.evaluate.evaluation import evaluate
 from swarmjax.evaluate.trials import Trial
 
 SAME_TIME = 0.032  # s; arrivals may fall into neighbouring control steps
@@ -55,7 +55,7 @@ def results(words: Sequence[str]) -> Iterator[dict[str, Any]]:
     settings = config.load_evaluate(words)
     if settings.policy is None:
         raise ConfigError("compare cannot be given: the engines are compared, by policy=FILE.")
-    found = [evaluate.evaluate(replace(settings, engine=engine)) for engine in ("c", "mjx")]
+    found = [evaluate(replace(settings, engine=engine)) for engine in ("c", "mjx")]
     c, mjx = found
     cells = zip(c.result["cells"], mjx.result["cells"], c.trials, mjx.trials, strict=True)
     for about, other, trial, same in cells:

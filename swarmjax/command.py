@@ -45,5 +45,5 @@ def run(
 def _module(name: str) -> str:
     """The command as `python -m` names it: benchmarks are not part of the package."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
-    found = "" if spec is None else spec.name
+    found = "" if spec is None else spec.name.removesuffix(".__main__")
     return found if found.rpartition(".")[2] == name else f"swarmjax.{name}"

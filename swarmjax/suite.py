@@ -23,9 +23,10 @@ from rich.table import Table
 
 from swarmjax import command, compose, config, policy_file
 from swarmjax.config import CellConfig, ConfigError, EvaluateConfig, SuiteConfig
-from swarmjax.evaluate import __main__ as evaluate
 from swarmjax.evaluate import cells, trials
 from swarmjax.evaluate.cells import Cell, Suite
+from swarmjax.evaluate.evaluation import list_files
+from swarmjax.evaluate.table import PLAIN_WIDTH
 from swarmjax.evaluate.trials import Entrant, Trial
 
 _WIDTH = 100  # of a line of a suite's file
@@ -65,7 +66,7 @@ def main(arguments: Sequence[str]) -> int:
         cells.write(Path(settings.out), suite)
     console = Console()
     if not console.is_terminal:
-        console.width = evaluate.PLAIN_WIDTH
+        console.width = PLAIN_WIDTH
     _show(console, suite)
     return 0
 
@@ -75,7 +76,7 @@ def _renew(settings: SuiteConfig) -> Suite:
     file = config.read_suite(settings.suite)
     wanted = file.cells
     if settings.policies is not None:
-        entrants = trials.read_policies(evaluate.list_files("policies", settings.policies))
+        entrants = trials.read_policies(list_files("policies", settings.policies))
         wanted = tuple(_search(settings, each, entrants) for each in wanted)
     suite = Suite(file.name, tuple(cells.draw_cell(each) for each in wanted))
     path = compose.suite_path(settings.suite)

@@ -3,33 +3,22 @@
 With no argument it trains the default curriculum. `--help` lists every key.
 """
 
-import json
-import math
 import sys
-import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from datetime import datetime
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax
 
-from swarmjax import command, config, provenance
-from swarmjax.config import ConfigError, TrainConfig
-from swarmjax.curriculum import engine as curriculum
-from swarmjax.curriculum.engine import Schedule
-from swarmjax.export import __main__ as export
-from swarmjax.run import checkpoint, compile_cache, memory, warm_start
+from swarmjax import command, config
+from swarmjax.config import TrainConfig
+from swarmjax.run import compile_cache, memory
 from swarmjax.run.checkpoint import CheckpointError
 from swarmjax.run.display import Display
-from swarmjax.run.trainer import Stop, Tally, TrainingError, compile_chunk, measure, prepare, train
-from swarmjax.run.warm_start import Source
-from swarmjax.sim import physics
-from swarmjax.task import env
-from swarmjax.training import loop, seeds
-from swarmjax.training.loop import Program, TrainState
+from swarmjax.run.lifecycle import carry_out, dry_run, find_run
+from swarmjax.run.policy_export import POLICY, seed_path
+from swarmjax.run.settings import read_config
+from swarmjax.run.trainer import Stop, Tally, TrainingError, measure
 
 FAILED = 1
 
@@ -50,8 +39,8 @@ def main(arguments: Sequence[str]) -> int:
 def _run(settings: TrainConfig) -> int:
     """Does what the config says; returns the exit code."""
     if settings.run.dry:
-        return _dry_run(settings)
-    run = _find_run(settings)
+        return dry_run(settings)
+    run = find_run(settings)
     with Stop() as stop, Display(settings.updates) as display:
         try:
             tally = carry_out(settings, run, stop, display)
@@ -60,49 +49,6 @@ def _run(settings: TrainConfig) -> int:
             return FAILED
     sys.stdout.write(_closing(run, settings, tally) + "\n")
     return command.INTERRUPTED if stop.asked else 0
-
-
-def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) -> Tally:
-    """Trains as a config says, and writes what a run directory holds.
-
-    Args:
-      settings: the config; with `resume` it goes on.
-      run: the run directory, in which there is no other run.
-      stop: notices signals.
-      display: shows the run.
-
-    Returns:
-      What came of the run.
-
-    Raises:
-      ConfigError: if it cannot begin as the config says, or needs more memory than there is.
-      CheckpointError: if what it goes on with is damaged.
-      TrainingError: if a loss is no longer finite.
-    """
-    source = warm_start.read(settings)
-    program, schedule, init, template = _load(settings)
-    state, skipped = _first_state(program, lambda: init(schedule), template, source)
-    for sentence in skipped:
-        display.say(f"{sentence}: it was passed over.")
-    if source is not None:
-        display.say(f"starting with what {source.run} had learned after {source.update} updates")
-    display.say(f"{_opening(settings)}, into {run}; compiling")
-    for sentence in _short_budget(settings, schedule):
-        display.say(sentence)
-    compiled, state = prepare(program, schedule, state, memory.limit())
-    _open_run(run, settings)
-    state, tally = train(run, program, schedule, compiled, state, display, stop)
-    _write_results(run, program, state, tally)
-    return tally
-
-
-def _load(settings: TrainConfig) -> tuple[Program, Schedule, Any, TrainState]:
-    """Builds the program, the curriculum's numbers, what starts a run, and its state's shapes."""
-    program, schedule = loop.load(settings)
-    init = jax.jit(partial(seeds.init, program))  # traced once, for the shapes and for the state
-    template = init.eval_shape(schedule)
-    memory.check_state(settings, memory.size(template), memory.limit())
-    return program, schedule, init, template
 
 
 def _settings(arguments: Sequence[str]) -> tuple[TrainConfig, bool]:
@@ -116,147 +62,10 @@ def _settings(arguments: Sequence[str]) -> tuple[TrainConfig, bool]:
     if resumed in ("", "null"):
         auto = given.get("arenas", "").strip("'\"") == memory.AUTO
         return config.load_train(arguments, auto=auto), auto
-    settings = config.load_resume(export.read_config(Path(resumed)), arguments)
+    settings = config.load_resume(read_config(Path(resumed)), arguments)
     kept = given.get("run.dir", "null") in ("", "null") or settings.run.dir is None
     directory = settings.resume if kept else settings.run.dir
     return replace(settings, run=replace(settings.run, dir=directory)), False
-
-
-def _first_state(
-    program: Program, init: Callable[[], TrainState], template: TrainState, source: Source | None
-) -> tuple[TrainState, list[str]]:
-    """Starts from the seed, or from the newest sound checkpoint of the run that is resumed.
-
-    A start from the seed takes the networks and normalisers of `source`, if there is one.
-    """
-    settings = program.config
-    if settings.resume is None:
-        state = init()
-        if source is None:
-            return state, []
-        return warm_start.carry(source, state, settings), source.skipped
-    leaves, update, skipped = checkpoint.restore(Path(settings.resume))
-    if update > settings.updates:
-        raise ConfigError(
-            f"budget is {settings.budget}, but {settings.resume} has spent "
-            f"{update * settings.arenas * settings.algo.rollout} already: give at least that."
-        )
-    return checkpoint.from_leaves(leaves, template), skipped
-
-
-def _find_run(settings: TrainConfig) -> Path:
-    """Finds a run directory that can be written and holds no other run; writes nothing."""
-    every = seeds.numbers(settings)
-    seed = f"seed{every[0]}" if len(every) == 1 else f"seeds{every[0]}-{every[-1]}"
-    name = f"{datetime.now():%Y%m%d-%H%M%S}-{settings.stage_name}-{seed}"
-    run = Path(settings.run.dir) if settings.run.dir else Path("runs") / name
-    resumed = settings.resume is not None and Path(settings.resume).resolve() == run.resolve()
-    if (run / "config.json").exists() and not resumed:
-        raise ConfigError(
-            f"run.dir is {run}, which holds a run already: give another directory, or "
-            f"resume={run} to go on with it."
-        )
-    try:
-        there = next(path for path in (run, *run.resolve().parents) if path.exists())
-        tempfile.TemporaryFile(dir=there).close()
-    except OSError as error:
-        raise _unwritable(run, error) from None
-    return run
-
-
-def _open_run(run: Path, settings: TrainConfig) -> None:
-    """Makes the run directory and writes `config.json` into it."""
-    try:
-        run.mkdir(parents=True, exist_ok=True)
-        stored = config.to_dict(replace(settings, resume=None))
-        (run / "config.json").write_text(json.dumps(stored, indent=2) + "\n")
-    except OSError as error:
-        raise _unwritable(run, error) from None
-
-
-def _unwritable(run: Path, error: OSError) -> ConfigError:
-    return ConfigError(f"run.dir is {run}, which cannot be written: {error.strerror or error}.")
-
-
-def _dry_run(settings: TrainConfig) -> int:
-    """Compiles, says what it took and what a run needs, and stops."""
-    warm_start.read(settings)
-    program, schedule, _, template = _load(settings)
-    compiled = compile_chunk(program, schedule, template)
-    memory.check(settings, compiled.total_bytes, memory.limit())
-    state, work = compiled.state_bytes / 2**20, compiled.work_bytes / 2**20
-    sys.stdout.write(
-        f"{'\n'.join([_opening(settings), *_short_budget(settings, schedule)])}\n"
-        f"compiled in {compiled.seconds:.1f} s; memory: {state:.1f} MiB of state, "
-        f"{work:.1f} MiB to work with; nothing was trained (run.dry).\n"
-    )
-    return 0
-
-
-def _opening(settings: TrainConfig) -> str:
-    """Says what is about to be trained."""
-    names = ", ".join(stage.name for stage in settings.stage)
-    steps, every = settings.arenas * settings.algo.rollout, seeds.numbers(settings)
-    how = {"vmap": "side by side", "map": "in turn", "cores": "spread over cores"}[
-        settings.seeds_by
-    ]
-    several = f", seeds {every[0]} to {every[-1]} {how}" if len(every) > 1 else ""
-    return (
-        f"swarmjax: {settings.stage_name} ({names}), {settings.updates:,} updates of {steps:,} "
-        f"arena control steps ({settings.arenas:,} arenas){several} on {provenance.device()}"
-    )
-
-
-def _short_budget(settings: TrainConfig, schedule: Schedule) -> list[str]:
-    """Says where stages need more of the budget than they are to have, in no or one sentence."""
-    share = settings.curriculum.budget_share
-    if share is None:
-        return []
-    begins, latest = curriculum.last_begins(schedule), math.ceil(share * settings.updates)
-    if begins <= latest:
-        return []
-    when = f"begin as late as update {begins:,}" if begins < settings.updates else "never begin"
-    return [
-        f"the budget is short: a stage takes at least {schedule.cohort_updates} updates (one step "
-        f"limit), so that {settings.stage[-1].name}, the last, may {when}, where "
-        f"curriculum.budget_share={share} asks for {latest:,} at the "
-        "latest: give more budget, fewer arenas or fewer stages."
-    ]
-
-
-def _write_results(run: Path, program: Program, state: TrainState, tally: Tally) -> None:
-    """Writes the policies and `summary.json`."""
-    settings, every = program.config, seeds.numbers(program.config)
-    leaves = checkpoint.to_leaves(state)
-    for seed in every:
-        file = export.seed_path(run / export.POLICY, settings, seed)
-        export.write_policy(file, leaves, settings, tally.update, seed)
-    steps = tally.update * settings.arenas * settings.algo.rollout
-    train_s, transitions = tally.earlier_s + tally.seconds, tally.transitions
-    summary = {
-        "stage": settings.stage_name,
-        "stages": [stage.name for stage in settings.stage],
-        "seeds": list(every),
-        "updates": tally.update,
-        "budget_spent": tally.update >= settings.updates,
-        "arena_steps": steps,
-        "transitions": [transitions[seed] for seed in every],
-        "train_s": train_s,
-        "compile_s": tally.compile_s,
-        "arena_steps_per_s": settings.seeds * steps / train_s if train_s else None,
-        "transitions_per_s": sum(transitions.values()) / train_s if train_s else None,
-        "targets_reached": [tally.targets_reached[seed] for seed in every],
-        "decisions": [
-            [entry for entry in tally.decisions if entry["seed"] == seed] for seed in every
-        ],
-        "impl": physics.resolve_impl(settings.sim.impl),
-        "solver": env.resolve_solver(settings),
-        "gradient": loop.resolve_gradient(settings),
-        "device": provenance.device(),
-        "versions": provenance.versions(),
-        "commit": provenance.commit(),
-    }
-    (run / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
 
 
 def _closing(run: Path, settings: TrainConfig, tally: Tally) -> str:
@@ -266,7 +75,7 @@ def _closing(run: Path, settings: TrainConfig, tally: Tally) -> str:
             f"stopped after update {tally.update:,} of {settings.updates:,}, saved; go on with: "
             f"python -m swarmjax.train resume={run}"
         )
-    policy = export.seed_path(run / export.POLICY, settings, settings.seed)
+    policy = seed_path(run / POLICY, settings, settings.seed)
     stage = settings.stage[-1].name
     what = "the policy" if settings.seeds == 1 else f"each of {settings.seeds} policies"
     return f"done; judge {what} with: python -m swarmjax.evaluate policy={policy} stage={stage}"

@@ -15,11 +15,12 @@ from steering import SPEED, STAY, STEP
 
 from swarmjax import command, compose, config, policy
 from swarmjax.config import EvaluateConfig, RealismConfig, RobotConfig, StageConfig, TaskConfig
-from swarmjax.evaluate import __main__ as evaluate
+from swarmjax.evaluate import __main__ as evaluate_command
 from swarmjax.evaluate import cells, statistics
 from swarmjax.evaluate import summary as evaluate_summary
 from swarmjax.evaluate import trials as evaluate_run
 from swarmjax.evaluate.cells import Cell
+from swarmjax.evaluate.evaluation import evaluate, list_files
 from swarmjax.evaluate.measures import MEASURES
 from swarmjax.evaluate.trials import Trial
 from swarmjax.settings import build, to_dict
@@ -37,7 +38,7 @@ def _config(path: Path, **rest: Any) -> EvaluateConfig:
 
 
 def _measures(settings: EvaluateConfig) -> dict[str, Any]:
-    return evaluate.evaluate(settings).result["cells"][0]["measures"]
+    return evaluate(settings).result["cells"][0]["measures"]
 
 
 def test_a_result_does_not_depend_on_batches_and_workers(
@@ -175,7 +176,7 @@ def test_cells_that_share_levels_are_not_pooled(
 
 def test_long_lists_of_files_are_taken_apart() -> None:
     names = [f"policy{i}.npz" for i in range(1000)]  # no path may be as long as them together
-    assert evaluate.list_files("policy", ",".join(names)) == names
+    assert list_files("policy", ",".join(names)) == names
 
 
 # --- the command
@@ -188,7 +189,7 @@ def _plain(section: Any) -> dict[str, Any]:
 
 def _command(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
     monkeypatch.setattr(sys, "argv", ["evaluate", *words])
-    return command.run("evaluate", evaluate.main, EvaluateConfig)
+    return command.run("evaluate", evaluate_command.main, EvaluateConfig)
 
 
 def test_the_command_writes_the_result_and_prints_a_table(

@@ -22,11 +22,10 @@ from swarmjax.config import (
     StageConfig,
     TrainConfig,
 )
-from swarmjax.evaluate import __main__ as evaluate
 from swarmjax.evaluate import cells, engine_mjx
 from swarmjax.evaluate import judge as evaluate_judge
-from swarmjax.evaluate.__main__ import Evaluation
 from swarmjax.evaluate.engine_mjx import Outcomes
+from swarmjax.evaluate.evaluation import Evaluation, evaluate
 from swarmjax.evaluate.measures import MEASURES
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.ppo.normalizer import Normalizer
@@ -133,7 +132,7 @@ def _judge(path: Path, stage: StageConfig, engine: Literal["c", "mjx"], **rest: 
     """What the command finds, by one of its engines, with the planar body where nothing is said."""
     given = {"robot": RobotConfig(), "seed": SEED, "episodes": EPISODES, "steps": STEPS} | rest
     settings = EvaluateConfig(policy=str(path), stage=stage, engine=engine, workers=1, **given)
-    return evaluate.evaluate(settings)
+    return evaluate(settings)
 
 
 def test_levels_are_those_of_the_other_judge(

@@ -15,6 +15,8 @@ from swarmjax import command, config, policy_file
 from swarmjax.config import ConfigError, ExportConfig, TrainConfig
 from swarmjax.export import __main__ as export
 from swarmjax.export import folder as export_folder
+from swarmjax.run.policy_export import policy_meta
+from swarmjax.run.settings import read_config
 
 FORMATS = {"npz": "policy.npz", "onnx": "policy.onnx", "c": "policy_c", "webots": "swarmjax_epuck"}
 
@@ -74,7 +76,7 @@ def test_the_policy_says_what_it_was_trained_with(tmp_path: Path) -> None:
     trained = config.load_train(
         ["stage=s1", "robot=wheeled_v2", "realism=real", "task.control_step=0.064", "seed=4"]
     )
-    said = export.policy_meta(trained, update=7, seed=4)
+    said = policy_meta(trained, update=7, seed=4)
     assert said["robot"] == {
         "preset": "wheeled_v2",
         "body": "wheeled",
@@ -101,7 +103,7 @@ def test_the_policy_says_what_it_was_trained_with(tmp_path: Path) -> None:
 )
 def test_a_robot_is_named_by_the_file_that_has_its_numbers(words: list[str], name: str) -> None:
     trained = config.load_train(["stage=s1", *words])
-    assert export.policy_meta(trained, 0, 0)["robot"]["preset"] == name
+    assert policy_meta(trained, 0, 0)["robot"]["preset"] == name
 
 
 def test_export_refuses(
@@ -148,7 +150,7 @@ def test_export_says_what_onnx_needs(
 @pytest.mark.parametrize("content", ["[" * 100_000, "[]", "{", "\xff"])
 def test_a_config_that_is_none_is_refused(content: str, tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(content, encoding="latin-1")
-    sentence = refusal(export.read_config, tmp_path)
+    sentence = refusal(read_config, tmp_path)
     assert str(tmp_path / "config.json") in sentence
 
 

@@ -16,7 +16,7 @@ from policies import Arrays, forge, saved, several
 
 from swarmjax import command, policy, policy_file
 from swarmjax.config import EvaluateConfig, ExportConfig
-from swarmjax.evaluate import __main__ as evaluate
+from swarmjax.evaluate import __main__ as evaluate_command
 from swarmjax.export import __main__ as export
 from swarmjax.policy import MAX_BYTES, PolicyError
 
@@ -561,7 +561,10 @@ def test_unpickling_the_trap_would_leave_a_mark(tmp_path: Path) -> None:
 def test_commands_refuse_damaged_files_with_exit_code_2(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    commands = {"evaluate": (evaluate.main, EvaluateConfig), "export": (export.main, ExportConfig)}
+    commands = {
+        "evaluate": (evaluate_command.main, EvaluateConfig),
+        "export": (export.main, ExportConfig),
+    }
     path, mark = tmp_path / "policy.npz", tmp_path / "mark"
     saved(path)
     content, draw = path.read_bytes(), np.random.default_rng(2)

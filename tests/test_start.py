@@ -13,9 +13,9 @@ import pytest
 
 from swarmjax import command, config, train
 from swarmjax.config import TrainConfig
-from swarmjax.export import __main__ as export
 from swarmjax.run import checkpoint, warm_start
 from swarmjax.run.checkpoint import CheckpointError, Checkpoints, digest
+from swarmjax.run.settings import read_config
 from swarmjax.run.warm_start import Source
 from swarmjax.training import loop, seeds
 from swarmjax.training.loop import TrainState
@@ -179,7 +179,7 @@ def pair(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     lanes = {name: np.concatenate([leaf, leaf + 1]) for name, leaf in learned.items()}
     with Checkpoints(run, keep=1) as checkpoints:
         checkpoints.save(lanes, UPDATES)
-    stored = export.read_config(trained) | {"seeds": 2}
+    stored = read_config(trained) | {"seeds": 2}
     (run / "config.json").write_text(json.dumps(stored))
     return run
 
@@ -245,7 +245,7 @@ def test_a_started_run_resumes_without_the_run_it_started_from(
     shutil.rmtree(gone)
     assert train.main([f"resume={parts}"]) == 0
     for run in (whole, parts):
-        assert export.read_config(run)["start"] == str(gone)
+        assert read_config(run)["start"] == str(gone)
     assert digest(checkpoint.restore(parts)[0]) == digest(checkpoint.restore(whole)[0])
     assert [row["update"] for row in _rows(parts)] == list(range(UPDATES))
     assert _rows(parts) == _rows(whole)
@@ -329,7 +329,7 @@ def test_a_checkpoint_that_its_config_belies_is_refused(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    stored = export.read_config(trained)
+    stored = read_config(trained)
     stored["algo"]["hidden"] = [16]
     (tmp_path / "config.json").write_text(json.dumps(stored))
     (tmp_path / "checkpoints").symlink_to(trained / "checkpoints")

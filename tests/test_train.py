@@ -15,7 +15,7 @@ from swarmjax import command, config, policy, train
 from swarmjax.config import ExportConfig, TrainConfig
 from swarmjax.curriculum import engine as curriculum
 from swarmjax.export import __main__ as export
-from swarmjax.run import checkpoint
+from swarmjax.run import checkpoint, lifecycle
 from swarmjax.run.checkpoint import CheckpointError, Checkpoints, digest
 
 TINY = [
@@ -190,7 +190,7 @@ def test_several_seeds_resume_exactly(several: Path, tmp_path: Path) -> None:
 def test_a_budget_too_short_for_its_stages_is_said(updates: int, said: str) -> None:
     words = [*TINY, "stage=curriculum", "stage.sequence=[s1,s2]", "task.step_limit=8"]
     settings = config.load_train([*words, "arenas=4", "algo.rollout=4", f"budget={16 * updates}"])
-    sentence = " ".join(train._short_budget(settings, curriculum.schedule(settings)))
+    sentence = " ".join(lifecycle._short_budget(settings, curriculum.schedule(settings)))
     assert said in sentence
     assert bool(said) == bool(sentence)
 

@@ -13,6 +13,8 @@ from swarmjax.config import ConfigError
 from swarmjax.evaluate.measures import MEASURES, Measure
 from swarmjax.evaluate.trials import Entrant, Trial
 
+PLAIN_WIDTH = 160  # columns of a table that goes to a file
+
 # What a table of several cells has room for: its heading, the measure, the statistic, and whether
 # its interval is shown.
 _COLUMNS = (
@@ -32,7 +34,7 @@ def show(console: Console, result: Mapping[str, Any]) -> None:
 
     Args:
         console: To print on.
-        result: As `evaluate_summary` makes it, of policies or of a comparison.
+        result: As `summary` makes it, of policies or of a comparison.
     """
     cells = result["cells"]
     sides = result.get("compared", [result.get("policies")])

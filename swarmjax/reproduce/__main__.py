@@ -18,12 +18,12 @@ from rich.progress import Progress
 
 from swarmjax import command, config, policy_file, provenance
 from swarmjax.config import ConfigError, ReproduceConfig
-from swarmjax.export import __main__ as export
 from swarmjax.reproduce import arms, judge
 from swarmjax.reproduce import page as reproduce_page
 from swarmjax.reproduce.judge import Task
 from swarmjax.reproduce.rows import EVALUATION, FACTS, FORMAT
 from swarmjax.run.checkpoint import CheckpointError
+from swarmjax.run.policy_export import POLICY
 from swarmjax.run.trainer import Stop, TrainingError
 
 FAILED = 1
@@ -155,7 +155,7 @@ def _judge(out: Path, given: ReproduceConfig) -> None:
 def _tasks(out: Path, given: ReproduceConfig) -> list[Task]:
     """Lists what is judged of the arms that are done."""
     return [
-        Task(arm, seed, out / arm / export.POLICY.replace(".", f"-seed{seed}."), stage)
+        Task(arm, seed, out / arm / POLICY.replace(".", f"-seed{seed}."), stage)
         for arm, summary in arms.summaries(out).items()
         for seed in summary["seeds"]
         for stage in judge.STAGES

@@ -8,12 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from swarmjax import config, train
+from swarmjax import config
 from swarmjax.config import ARMS, Arm, ConfigError, ReproduceConfig, TrainConfig
-from swarmjax.export import __main__ as export
-from swarmjax.run import checkpoint, compile_cache, memory
+from swarmjax.run import checkpoint, compile_cache, lifecycle, memory
 from swarmjax.run.checkpoint import CheckpointError
 from swarmjax.run.display import Display
+from swarmjax.run.settings import read_config
 from swarmjax.run.trainer import Stop
 
 _EXPANDED, _MODERN = "_expanded", "modern_"
@@ -84,7 +84,7 @@ def run(made: TrainConfig, stop: Stop) -> bool:
         memory.refusal(made),
         Display(made.updates) as display,
     ):
-        tally = train.carry_out(made, directory, stop, display)
+        tally = lifecycle.carry_out(made, directory, stop, display)
     return tally.update >= made.updates
 
 
@@ -92,7 +92,7 @@ def _go_on(made: TrainConfig, directory: Path) -> TrainConfig:
     """Lets an arm that has begun go on; one that was killed before it saved anything begins."""
     if not (directory / "config.json").exists():
         return made
-    stored = config.build(TrainConfig, export.read_config(directory), "stored ")
+    stored = config.build(TrainConfig, read_config(directory), "stored ")
     kept = replace(made, run=replace(made.run, dir=stored.run.dir), start=stored.start)
     if kept != stored:
         raise ConfigError(

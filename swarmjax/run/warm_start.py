@@ -14,9 +14,9 @@ import numpy as np
 
 from swarmjax import config
 from swarmjax.config import ConfigError, TrainConfig
-from swarmjax.export import __main__ as export
 from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import CheckpointError, Leaves
+from swarmjax.run.settings import read_config
 from swarmjax.training.loop import TrainState
 
 _CARRIED = ("params", "normalizer")  # of a learner
@@ -109,7 +109,7 @@ def carry(source: Source, state: TrainState, settings: TrainConfig) -> TrainStat
 
 def _read_config(start: str) -> TrainConfig:
     try:
-        return config.build(TrainConfig, export.read_config(Path(start)), "stored ")
+        return config.build(TrainConfig, read_config(Path(start)), "stored ")
     except ConfigError as error:
         raise _refused(start, error) from None
 

@@ -10,9 +10,9 @@ import pytest
 
 from swarmjax import policy
 from swarmjax.config import TrainConfig, load_train
-from swarmjax.export import __main__ as export
 from swarmjax.ppo import learner as ppo
 from swarmjax.run.checkpoint import to_leaves
+from swarmjax.run.policy_export import write_policy
 from swarmjax.training import loop, seeds
 
 ROLLOUT, LIMIT, UPDATES = 128, 32, 8
@@ -84,7 +84,7 @@ def test_an_exported_policy_has_the_output_of_tanh(config: TrainConfig, tmp_path
     learners = state.learners.replace(params={**state.learners.params, "actor": actor})
     state = state.replace(learners=learners)
     leaves = {name: np.asarray(leaf) for name, leaf in to_leaves(state).items()}
-    export.write_policy(tmp_path / "p.npz", leaves, config, update=0, seed=1)
+    write_policy(tmp_path / "p.npz", leaves, config, update=0, seed=1)
     observation = np.random.default_rng(0).uniform(0.0, 1.0, (5, 3, 10)).astype(np.float32)
     found = policy.act(policy.load(tmp_path / "p.npz"), observation)
     second = jax.tree.map(lambda x: x[1], learners)

@@ -1,0 +1,118 @@
+"""Judges policies on the levels of a suite or a stage: who, on which, and what came of it."""
+
+import os
+from functools import partial
+from glob import glob
+from typing import Any, NamedTuple
+
+from rich.progress import Progress
+
+from swarmjax.config import ConfigError, EvaluateConfig
+from swarmjax.evaluate import cells, judge, summary
+from swarmjax.evaluate import trials as evaluate_run
+from swarmjax.evaluate.cells import Suite
+from swarmjax.evaluate.trials import Entrant, Trial
+from swarmjax.settings import show
+
+
+class Evaluation(NamedTuple):
+    """What an evaluation found.
+
+    Attributes:
+        result: Plain data for JSON; docs/interface.md lists it.
+        entrants: The policies, those of both sides of a comparison.
+        trials: What they came to, a cell each; rows as `entrants`.
+    """
+
+    result: dict[str, Any]
+    entrants: list[Entrant]
+    trials: list[Trial]
+
+
+def evaluate(settings: EvaluateConfig, progress: Progress | None = None) -> Evaluation:
+    """Judges policies.
+
+    Args:
+        settings: Of the evaluation.
+        progress: To show how far it is; None shows nothing.
+
+    Returns:
+        What it found.
+
+    Raises:
+        PolicyError: If a policy is unsound, or does not fit the levels.
+        ConfigError: If a file is missing, a suite unsound, or the physics breaks down.
+    """
+    sides = [evaluate_run.read_policies(each) for each in _sides(settings)]
+    entrants = [each for side in sides for each in side]
+    for stage in cells.stages(settings):  # before levels are drawn, which takes a while
+        for path, trained in entrants:
+            judge.check_policy(stage, path, trained)
+    suite = cells.load(settings)
+    total = len(entrants) * sum(len(cell.episodes) for cell in suite.cells)
+    progress = progress or Progress(disable=True)
+    bar = progress.add_task("episodes", total=total)
+    report = partial(progress.advance, bar)
+    trials = evaluate_run.run(settings, suite.cells, entrants, report)
+    return Evaluation(_sum_up(settings, suite, sides, trials), entrants, trials)
+
+
+def _sum_up(
+    settings: EvaluateConfig, suite: Suite, sides: list[list[Entrant]], trials: list[Trial]
+) -> dict[str, Any]:
+    if settings.compare is None:
+        return summary.result(settings, suite.name, sides[0], trials)
+    first, second = sides
+    part = len(first)
+    pair = ([_rows(t, slice(part)) for t in trials], [_rows(t, slice(part, None)) for t in trials])
+    return summary.comparison(settings, suite.name, (first, second), pair)
+
+
+def _rows(trial: Trial, rows: slice) -> Trial:
+    """Keeps some of the policies of a trial."""
+    found = {name: table[rows] for name, table in trial.found.items()}
+    return trial._replace(found=found, arrival=trial.arrival[rows])
+
+
+def _sides(settings: EvaluateConfig) -> list[list[str]]:
+    """Lists the files to judge: of one recipe, or of the two that are compared."""
+    if settings.policy is not None:
+        return [list_files("policy", settings.policy)]
+    parts = (settings.compare or "").split(",")
+    if len(parts) != 2 or not all(parts):
+        raise ConfigError(
+            f"compare is {show(settings.compare)}: give two files or patterns, as in a.npz,b.npz."
+        )
+    sides = [list_files("compare", part) for part in parts]
+    first, second = map(len, sides)
+    if first != second:
+        raise ConfigError(
+            f"compare is {show(settings.compare)}, which is {first} against {second}: give as many "
+            "policies on both sides, those of the same seeds in the same order."
+        )
+    return sides
+
+
+def list_files(key: str, text: str) -> list[str]:
+    """Lists the files that a word of the command line names.
+
+    Args:
+        key: Of the word.
+        text: Paths and patterns such as `runs/a-seed*.npz`, with commas between them.
+
+    Returns:
+        Paths, those of a pattern in alphabetical order.
+
+    Raises:
+        ConfigError: If a pattern matches nothing, or a file is named twice.
+    """
+    found: list[str] = []
+    for part in [text] if os.path.isfile(text) else text.split(","):
+        matches = sorted(glob(part)) if set(part) & set("*?[") else [part]
+        if not matches or not part:
+            raise ConfigError(f"{key} is {show(text)}, and {show(part)} matches no file.")
+        found += matches
+    for file in found:
+        if found.count(file) > 1:
+            raise ConfigError(f"{key} is {show(text)}, which names {file} twice: give it once.")
+    return found

@@ -1,0 +1,142 @@
+"""From a checkpoint to `policy.npz`: weights, normaliser, layout and what trained them."""
+
+from pathlib import Path
+
+import numpy as np
+
+from swarmjax import compose, config, policy_file, provenance
+from swarmjax.config import AlgoConfig, RobotConfig, TrainConfig
+from swarmjax.ppo import learner as ppo
+from swarmjax.ppo import normalizer
+from swarmjax.run import checkpoint
+from swarmjax.run.checkpoint import CheckpointError, Leaves
+from swarmjax.task import observation
+from swarmjax.training import seeds
+
+POLICY = "policy.npz"
+
+
+_DRIVE = ("wheel_radius", "track", "max_wheel_speed")
+
+
+def policy_arrays(leaves: Leaves) -> dict[str, np.ndarray]:
+    """Takes what a policy needs to act out of a checkpoint.
+
+    Args:
+      leaves: of the `TrainState` of one seed, as `checkpoint.to_leaves` names them.
+
+    Returns:
+      Arrays [L, ...] under the names of the `policy.npz` format.
+    """
+    prefix = "learners/params/actor/"
+    actor = {
+        "actor/" + name.removeprefix(prefix).removeprefix("torso/"): leaf
+        for name, leaf in leaves.items()
+        if name.startswith(prefix)
+    }
+    mean, variance = (leaves[f"learners/normalizer/{name}"] for name in ("mean", "variance"))
+    std = np.maximum(np.sqrt(variance), normalizer.MIN_STD)
+    return actor | {"normalizer/mean": mean, "normalizer/std": std}
+
+
+def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
+    """Describes a policy: its layout with units, the config it was trained with, versions.
+
+    Args:
+      trained: the run's config.
+      update: that the policy is from, 0 or more.
+      seed: of the policy.
+
+    Returns:
+      The `meta` of the `policy.npz` format, all of it but `format`, in SI units.
+    """
+    robot = trained.robot
+    encoding = config.encoding(trained.task, trained.realism)
+    return {
+        "policy": trained.algo.policy,
+        "learners": trained.learners,
+        "activation": trained.algo.activation,
+        "observation": observation.describe(encoding) | {"limit": ppo.OBSERVATION_LIMIT},
+        "action": {
+            "names": list(policy_file.ACTION_NAMES),
+            "units": list(policy_file.ACTION_UNITS),
+            "low": [0.0, -robot.max_turn_rate],
+            "high": [robot.max_speed, robot.max_turn_rate],
+        },
+        "robot": {
+            "preset": _robot_preset(robot),
+            **{key: getattr(robot, key) for key in ("body", *_DRIVE)},
+        },
+        "sensors": {
+            "preset": trained.realism.name,
+            "response": trained.realism.infrared,
+            "range": trained.task.sensor_range,
+        },
+        "task": {key: getattr(trained.task, key) for key in ("control_step", "target_radius")},
+        "config": config.to_dict(trained),
+        "versions": provenance.versions(),
+        "update": update,
+        "seed": seed,
+    }
+
+
+def _robot_preset(robot: RobotConfig) -> str:
+    """Names the file of configs/robot/ that a robot's numbers are those of, or `custom`."""
+    for name in compose.choices("robot"):
+        if config.build(RobotConfig, compose.read_preset("robot", name)) == robot:
+            return name
+    return "custom"
+
+
+def seed_path(path: Path, trained: TrainConfig, seed: int) -> Path:
+    """Names the policy of a seed.
+
+    Args:
+      path: of the policy of a run of one seed.
+      trained: the run's config.
+      seed: one of the run's.
+
+    Returns:
+      `path`, or one beside it where there are several seeds.
+    """
+    return path if trained.seeds == 1 else path.with_stem(f"{path.stem}-seed{seed}")
+
+
+def _squashed(arrays: dict[str, np.ndarray], algo: AlgoConfig) -> dict[str, np.ndarray]:
+    """Writes an output of tanh as one more hidden layer, before a last one that changes nothing."""
+    if algo.output == "linear":
+        return arrays
+    parts = ("kernel", "bias")
+    last = {f"actor/hidden_{len(algo.hidden)}/{p}": arrays[f"actor/mean/{p}"] for p in parts}
+    learners, actions = arrays["actor/mean/bias"].shape
+    mean = np.tile(np.eye(actions, dtype=np.float32), (learners, 1, 1))
+    zero = np.zeros((learners, actions), np.float32)
+    return arrays | last | {"actor/mean/kernel": mean, "actor/mean/bias": zero}
+
+
+def write_policy(path: Path, leaves: Leaves, trained: TrainConfig, update: int, seed: int) -> None:
+    """Writes the policy of one seed of a checkpoint to `path`.
+
+    Args:
+      path: the file.
+      leaves: of a run, [N, ...] each.
+      trained: the run's config.
+      update: of the checkpoint.
+      seed: one of the run's.
+
+    Raises:
+      CheckpointError: if the config is not the one that made the checkpoint.
+    """
+    lane = seeds.numbers(trained).index(seed)
+    arrays = policy_arrays(checkpoint.of_seed(leaves, lane, trained.seeds))
+    widths = tuple(
+        arrays[f"actor/hidden_{i}/bias"].shape[1]
+        for i in range(sum(name.endswith("/bias") for name in arrays) - 1)
+    )
+    found = (len(arrays["actor/log_std"]), widths)
+    if found != (trained.learners, trained.algo.hidden):
+        raise CheckpointError(
+            f"the checkpoint holds {found[0]} learners of layers {list(widths)}, but the config "
+            f"says {trained.learners} of {list(trained.algo.hidden)}: it is of another run."
+        )
+    policy_file.write(path, _squashed(arrays, trained.algo), policy_meta(trained, update, seed))
