@@ -20,7 +20,7 @@ from swarmjax.policy import PolicyError
 from swarmjax.replay import __main__ as replay
 from swarmjax.replay.__main__ import Pick
 
-ROOT = Path(replay.__file__).resolve().parents[1]
+ROOT = Path(replay.__file__).resolve().parents[2]
 QUICK = (*replays.SMALL, "steps=40", "workers=1")
 
 

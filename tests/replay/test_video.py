@@ -15,7 +15,7 @@ from swarmjax import config
 from swarmjax.config import ConfigError, ReplayConfig
 from swarmjax.replay import video as replay_video
 
-ROOT = Path(replay_video.__file__).resolve().parents[1]
+ROOT = Path(replay_video.__file__).resolve().parents[2]
 
 
 def _settings(*words: str) -> ReplayConfig:

@@ -1,0 +1,189 @@
+"""Speeds are the steps that were made by the seconds that a stopped clock says they took."""
+
+import functools
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks import steps_per_second, timing
+from benchmarks.steps_per_second import Prepared
+from swarmjax.config import TrainConfig
+from swarmjax.curriculum import engine as curriculum
+from swarmjax.run import trainer
+from swarmjax.sim import physics
+from swarmjax.task import env
+from swarmjax.task.env import EnvState, TimeStep, World
+from swarmjax.training import loop, seeds
+from swarmjax.training.loop import Program
+
+Line = dict[str, Any]
+
+# Of the tiny configuration, the last stage being of three robots; the rest is chosen here.
+ARENAS, ROBOTS, ROLLOUT = 8, 3, 8
+SEEDS, SUBSTEPS = 2, 5
+CONTROL_STEPS = steps_per_second.CONTROL_STEPS["planar"]  # of a call of physics or environment
+CALLS = [100.0, 4.0, 2.0, 1.0, 2.0, 3.0]  # s; the first is not counted: the median is 2 s
+MEDIAN = 2.0  # s
+
+
+@pytest.fixture
+def pass_time(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """A clock that stands still unless it is told how many seconds have passed."""
+    now = [1000.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+
+    def go_on(seconds: float) -> None:
+        now[0] += seconds
+
+    return go_on
+
+
+@pytest.fixture(scope="module")
+def program(tiny_config: TrainConfig, tiny_world: World) -> Program:
+    config = replace(
+        tiny_config,
+        seeds=SEEDS,
+        sim=replace(tiny_config.sim, substeps=SUBSTEPS),
+        run=replace(tiny_config.run, chunk="all", tensorboard=False),
+        budget=ARENAS * ROLLOUT * 2,  # two updates of each seed
+    )
+    return Program(config, replace(tiny_world, config=config))
+
+
+class Calls(NamedTuple):
+    """What is timed in the place of a compiled program, and what it was called with."""
+
+    prepared: Prepared
+    arguments: list[Any]
+
+
+@pytest.fixture
+def calls(program: Program, pass_time: Callable[[float], None]) -> Calls:
+    """All three programs only let time pass."""
+    taken: Iterator[float] = iter(CALLS)
+    arguments = []
+
+    def call(state: Any, argument: Any) -> tuple[Any, Any]:
+        arguments.append(argument)
+        pass_time(next(taken))
+        return state, {"transitions": np.full((SEEDS, 1000), 7.0)}
+
+    stub = timing.Program(call, compile_s=0.0, size=0)
+    prepared = Prepared(
+        program=program,
+        schedule=curriculum.schedule(program.config),
+        start=lambda _: SimpleNamespace(arenas=()),
+        keys=jnp.zeros(SEEDS),
+        physics=stub,
+        environment=stub,
+        training=stub,
+    )
+    return Calls(prepared, arguments)
+
+
+def _assert_speeds(line: Line, control_steps: int) -> None:
+    """Of a call that made so many control steps in every arena."""
+    arena_steps = SEEDS * ARENAS * control_steps
+    assert line["arena_steps_per_s"] == arena_steps / MEDIAN
+    assert line["robot_steps_per_s"] == arena_steps * ROBOTS / MEDIAN
+    assert line["physics_steps_per_s"] == arena_steps * SUBSTEPS / MEDIAN
+
+
+@pytest.mark.parametrize(
+    "measure", [steps_per_second.time_physics, steps_per_second.time_environment]
+)
+def test_speeds_are_the_steps_of_a_call_by_its_seconds(
+    measure: Callable[[Prepared], Line], calls: Calls
+) -> None:
+    line = measure(calls.prepared)
+    assert line["calls_s"] == CALLS[1:]
+    _assert_speeds(line, CONTROL_STEPS)
+
+
+def test_speeds_of_training_are_those_of_the_updates_that_were_asked_for(calls: Calls) -> None:
+    line = steps_per_second.time_training(calls.prepared, arena_steps_per_s=1000.0)
+    (updates,) = {int(n) for n in calls.arguments}
+    _assert_speeds(line, updates * ROLLOUT)
+    assert line["transitions_per_s"] == SEEDS * updates * 7.0 / MEDIAN
+
+
+def _begun(program: Program) -> EnvState:
+    """All zeros, in the shapes of arenas that have just begun."""
+    shapes = jax.eval_shape(
+        functools.partial(loop.init, program, curriculum.schedule(program.config))
+    )
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes.arenas)
+
+
+def test_a_call_of_the_environment_makes_the_steps_that_are_counted(
+    program: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def step(world: World, state: EnvState, action: Any) -> tuple[EnvState, TimeStep]:
+        """Does nothing but count."""
+        nothing, no = jnp.zeros(ROBOTS), jnp.zeros(ROBOTS, bool)
+        done = jnp.zeros((), bool)
+        came = TimeStep(state.observation, nothing, no, no, no, no, done=done, sound=~done)
+        return replace(state, clock=state.clock + 1), came
+
+    monkeypatch.setattr(env, "step", step)
+    schedule = curriculum.schedule(program.config)
+    arenas = _begun(program)
+    call = jax.jit(functools.partial(steps_per_second.environment, program, schedule))
+    after, _ = call(arenas, jax.random.key(1))
+    assert after.clock.tolist() == [CONTROL_STEPS] * ARENAS
+
+
+def test_a_call_of_the_physics_makes_the_steps_that_are_counted(
+    program: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def step(_: physics.Physics, data: Any, *__: Any) -> Any:
+        """Does nothing but count."""
+        return data.replace(qpos=data.qpos + 1.0)
+
+    monkeypatch.setattr(physics, "step", step)
+    arenas = _begun(program)
+    call = jax.jit(functools.partial(steps_per_second.physics_alone, program))
+    after, _ = call(arenas, jax.random.key(1))
+    np.testing.assert_array_equal(after.sim.qpos, np.full_like(after.sim.qpos, CONTROL_STEPS))
+
+
+class _State(NamedTuple):
+    """What the trainer asks of a state."""
+
+    update: jax.Array
+
+
+def test_speeds_of_a_run_are_its_steps_by_the_seconds_of_a_call(
+    program: Program, pass_time: Callable[[float], None], tmp_path: Path
+) -> None:
+    schedule = curriculum.schedule(program.config)
+    state = jax.eval_shape(functools.partial(seeds.init, program), schedule)
+    train = functools.partial(seeds.train_chunk, program)
+    blank = jax.eval_shape(train, schedule, state, np.int32(2))[1]
+    metrics = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), blank)
+    metrics["mix"] += 4
+    metrics["robots"] += 20  # over all arenas; two updates of two seeds
+    metrics["transitions"] += 100
+
+    def call(_: Any, state: _State, n: np.int32) -> tuple[_State, dict]:
+        pass_time(MEDIAN)
+        return _State(state.update + n), metrics
+
+    shown: list[Line] = []
+    display: Any = SimpleNamespace(show=lambda _, speeds, __: shown.append(speeds), say=print)
+    compiled: Any = trainer.Compiled(call, seconds=0.0, state_bytes=0, work_bytes=0)
+    begun: Any = _State(jnp.zeros(SEEDS, jnp.int32))
+    trainer.train(tmp_path / "run", program, schedule, compiled, begun, display, trainer.Stop())
+    (speeds,) = shown
+    assert speeds["arena_steps_per_s"] == 2 * SEEDS * ARENAS * ROLLOUT / MEDIAN
+    assert speeds["robot_steps_per_s"] == 2 * SEEDS * 20 * ROLLOUT / MEDIAN
+    assert speeds["physics_steps_per_s"] == 2 * SEEDS * ARENAS * ROLLOUT * SUBSTEPS / MEDIAN
+    assert speeds["transitions_per_s"] == 2 * SEEDS * 100 / MEDIAN

@@ -1,0 +1,123 @@
+"""What is random is drawn anew: levels every rollout, noise every step, the order every pass."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from swarmjax.config import AlgoConfig, StageConfig, TrainConfig
+from swarmjax.curriculum import engine as curriculum
+from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.learner import Batch
+from swarmjax.task import env
+from swarmjax.training import loop, rollout
+from swarmjax.training.loop import Metrics, Program, TrainState
+
+Update = Callable[[TrainState], tuple[TrainState, Metrics]]
+
+ARENAS, STEPS = 8, 8  # of the tiny configuration; control steps of a rollout
+
+
+@pytest.fixture(scope="module")
+def program(tiny_config: TrainConfig) -> Program:
+    """One robot an arena, which compiles sooner; an episode is over at the end of each rollout."""
+    algo = replace(tiny_config.algo, hidden=(4,), epochs=1, minibatches=4, max_grad_norm=None)
+    config = replace(
+        tiny_config,
+        stage=(StageConfig(name="alone", robots=1, side=0.5),),
+        task=replace(tiny_config.task, step_limit=STEPS),
+        algo=replace(algo, initialization="uniform"),
+        sim=replace(tiny_config.sim, max_robots=1, max_obstacles=0),
+    )
+    return Program(config, env.load(config))
+
+
+@pytest.fixture(scope="module")
+def start(program: Program) -> TrainState:
+    return jax.jit(functools.partial(loop.init, program))(curriculum.schedule(program.config))
+
+
+@pytest.fixture(scope="module")
+def update(program: Program) -> Update:
+    jitted = jax.jit(functools.partial(loop.update, program))
+    return functools.partial(jitted, curriculum.schedule(program.config))
+
+
+def _with_mean(state: TrainState, action: float) -> TrainState:
+    """Has the policy's mean be one action whatever is observed, with deviation 1."""
+    params = state.learners.params
+    actor: Any = jax.tree.map(jnp.zeros_like, params["actor"])
+    actor["mean"]["bias"] += action
+    return replace(state, learners=replace(state.learners, params=params | {"actor": actor}))
+
+
+def _critic(state: TrainState) -> np.ndarray:
+    """All parameters of the critic, side by side."""
+    leaves = jax.tree.leaves(state.learners.params["critic"])
+    return np.concatenate([np.ravel(leaf) for leaf in leaves])
+
+
+def test_every_rollout_draws_levels_of_its_own(start: TrainState, update: Update) -> None:
+    """All episodes are over after a rollout, and the next has those that were drawn for it."""
+    state, starts = start, []
+    for _ in range(3):
+        state, _ = update(state)
+        starts.append(state.arenas.level.start[:, 0, 0])
+    assert len(np.unique(starts)) == 3 * ARENAS
+
+
+def test_every_control_step_of_a_rollout_has_noise_of_its_own(
+    program: Program, start: TrainState
+) -> None:
+    collect = jax.jit(functools.partial(rollout.collect, program.world))
+    learners = _with_mean(start, 0.0).learners
+    _, trajectory, _ = collect(learners, start.arenas, start.arenas, jax.random.key(0))
+    # With mean 0 and deviation 1 an action is its noise.
+    actions = np.asarray(trajectory.action)
+    assert actions.shape == (STEPS, 1, ARENAS, 1, 2)
+    assert len(np.unique(actions)) == actions.size
+
+
+def test_every_rollout_has_noise_of_its_own(start: TrainState, update: Update) -> None:
+    """Levels play no part: those of the rollout are there, and the next begin after it."""
+    begun = _with_mean(start, 0.0)
+    one, seen = update(begun)
+    _, seen_too = update(replace(begun, key=one.key))  # the key of the update after it
+    assert seen["reward"] != seen_too["reward"]
+
+
+def test_every_update_shuffles_in_an_order_of_its_own(start: TrainState, update: Update) -> None:
+    """What the robots do is the same in both: an action of 100 is full speed with any noise."""
+    begun = _with_mean(start, 100.0)
+    one, seen = update(begun)
+    other, seen_too = update(replace(begun, key=one.key))  # the key of the update after it
+    assert seen["robot_steps"] == seen_too["robot_steps"]
+    assert seen["reward"] == seen_too["reward"]
+    assert np.any(_critic(other) != _critic(one))
+
+
+def test_every_epoch_shuffles_in_an_order_of_its_own() -> None:
+    """Two of four groups are valid: in one minibatch they are one step, in two they are two."""
+    epochs, groups = 12, 4
+    config = AlgoConfig(hidden=(4,), epochs=epochs, minibatches=2)
+    learner = ppo.init(jax.random.key(0), config, 3, 2, 1)
+    zeros = jnp.zeros((groups, 1))
+    batch = Batch(
+        observation=jnp.zeros((groups, 1, 3)),
+        action=jnp.zeros((groups, 1, 2)),
+        log_prob=zeros,
+        advantage=zeros,
+        return_=zeros,
+        valid=jnp.array([[True], [True], [False], [False]]),
+    )
+    learned, _ = jax.jit(lambda key: ppo.update(learner, config, batch, key, 1))(jax.random.key(1))
+    counts = optax.tree.get_all_with_path(learned.optimizer_state, "count")
+    (steps,) = {int(count) for _, count in counts}
+    # In the same order every time it would be 12 or 24.
+    assert epochs < steps < 2 * epochs
