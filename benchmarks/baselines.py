@@ -14,10 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from swarmjax import command, config, epuck, policy_file, provenance
-from swarmjax.config import EvaluateConfig
+from swarmjax import command, epuck, policy_file, provenance
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import evaluate
 from swarmjax.task import observation
+from swarmjax.task.stage_files import load_levels
 
 # Action (speed, turn rate; -1..1) at bearing 0, and what each radian to the left or right adds:
 # full speed and twice the bearing as a turn, slower the further the target is off the nose.
@@ -82,7 +83,7 @@ def main(arguments: Sequence[str]) -> int:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"{name}.npz"
             write(path, *actions)
-            settings = config.load_evaluate([*arguments, f"policy={path}"])
+            settings = load_levels(EvaluateConfig, [*arguments, f"policy={path}"])
             result = evaluate(settings).result
         del result["policies"]  # written a moment ago, to a folder that is gone
         line = {"benchmark": "baselines", "policy": name, **result, "commit": provenance.commit()}

@@ -16,8 +16,8 @@ import numpy as np
 
 from benchmarks import rig
 from swarmjax import command, epuck, provenance
-from swarmjax.config import ConfigError, RobotConfig
-from swarmjax.settings import Section
+from swarmjax.config import ConfigError, Section
+from swarmjax.sim.config import RobotConfig
 
 SECONDS = 2.0
 GAP = 0.001  # m; between hull and wall at the start

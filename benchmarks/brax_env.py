@@ -20,11 +20,13 @@ from brax.envs.base import Env, State
 from flax import struct
 from jax import Array
 
+from swarmjax.curriculum.engine import Schedule
 from swarmjax.sim import physics
 from swarmjax.task import env, observation
-from swarmjax.task.env import EnvState, TimeStep, World
-from swarmjax.task.stage import Stage
+from swarmjax.task.env import EnvState, TimeStep
+from swarmjax.training import program as programs
 from swarmjax.training import rollout
+from swarmjax.training.program import Program
 
 
 @struct.dataclass
@@ -50,12 +52,12 @@ class SwarmEnv(Env):
     """All arenas of a world, a robot an environment.
 
     Attributes:
-      world: the compiled environment.
-      stages: [S], of which the first is played.
+      program: the compiled side.
+      schedule: with the stages, of which the first is played.
     """
 
-    def __init__(self, world: World, stages: Stage) -> None:
-        self.world, self.stages = world, stages
+    def __init__(self, program: Program, schedule: Schedule) -> None:
+        self.program, self.world, self.stages = program, program.world, schedule.stages
 
     @property
     def observation_size(self) -> int:
@@ -65,7 +67,7 @@ class SwarmEnv(Env):
     @property
     def action_size(self) -> int:
         """Numbers that a robot is commanded with."""
-        return rollout.ACTION_SIZE
+        return programs.ACTION_SIZE
 
     @property
     def backend(self) -> str:
@@ -82,7 +84,7 @@ class SwarmEnv(Env):
           The state, its fields [A R, ...].
         """
         key, level_key = jax.random.split(rng[0])
-        arenas = self.world.config.arenas
+        arenas = self.program.config.arenas
         drawn = self._draw(level_key, 1 + self._waiting)
         now = jax.tree.map(lambda x: x[:arenas], drawn)
         starts = jax.tree.map(lambda x: x[arenas:], drawn)
@@ -94,7 +96,7 @@ class SwarmEnv(Env):
             key=key,
             clock=jnp.zeros((), jnp.int32),
         )
-        nothing = jnp.zeros(arenas * self.world.config.sim.max_robots)
+        nothing = jnp.zeros(arenas * self.program.config.sim.max_robots)
         return _state(inner, nothing, nothing, nothing)
 
     def step(self, state: State, action: Array) -> State:
@@ -121,11 +123,11 @@ class SwarmEnv(Env):
 
     @property
     def _waiting(self) -> int:
-        return rollout.waiting(self.world.config.algo.rollout)
+        return self.program.config.waiting
 
     def _draw(self, key: Array, each: int) -> EnvState:
         """Draws so many fresh episodes for each arena, packed."""
-        index = jnp.zeros(each * self.world.config.arenas, jnp.int32)
+        index = jnp.zeros(each * self.program.config.arenas, jnp.int32)
         return rollout.draw_starts(self.world, self.stages, index, jnp.int32(0), key)
 
     def _refill(self, inner: Arenas) -> Arenas:
@@ -136,7 +138,7 @@ class SwarmEnv(Env):
             starts = self._draw(key, self._waiting)
             return replace(inner, starts=starts, begun=jnp.zeros_like(begun), key=next_key)
 
-        due = inner.clock % self.world.config.algo.rollout == 0
+        due = inner.clock % self.program.config.algo.rollout == 0
         return jax.lax.cond(due, draw, lambda inner: inner, inner)
 
 

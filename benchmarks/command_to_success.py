@@ -21,12 +21,16 @@ import numpy as np
 
 from benchmarks import peers, steps_per_second
 from benchmarks.watched_run import MADE_WITH, Watched
-from swarmjax import command, config
+from swarmjax import command
+from swarmjax.config import Section, about
+from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate import cells, trials
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import Row
 from swarmjax.run.policy_export import POLICY
-from swarmjax.settings import Section, about
+from swarmjax.run.settings import load_train
+from swarmjax.task.stage_files import load_levels
 
 SHARES = (0.90, 0.95)
 
@@ -36,7 +40,7 @@ class SuccessConfig(Section):
     """Which seeds, and how they are judged."""
 
     seed: tuple[int, ...] = field(
-        default=(0,), metadata=about("random seeds, one after the other", 0, config.MAX_COUNT)
+        default=(0,), metadata=about("random seeds, one after the other", 0, MAX_COUNT)
     )
     stop_at: float = field(
         default=0.95, metadata=about("share of targets at which training stops", 0.95, 1.0)
@@ -71,8 +75,9 @@ def train(words: Sequence[str], run: Path, stop_at: float) -> tuple[dict[str, fl
 def judge(run: Path, stage: str, episodes: int) -> dict[str, Any]:
     """Share of targets that a run's policy reaches in MuJoCo C on wheels, and how it acts there."""
     path = run / POLICY
-    settings = config.load_evaluate(
-        [f"policy={path}", f"stage={stage}", "robot=wheeled", f"episodes={episodes}"]
+    settings = load_levels(
+        EvaluateConfig,
+        [f"policy={path}", f"stage={stage}", "robot=wheeled", f"episodes={episodes}"],
     )
     policies = trials.read_policies([str(path)])
     (trial,) = trials.run(settings, cells.load(settings).cells, policies)
@@ -82,7 +87,7 @@ def judge(run: Path, stage: str, episodes: int) -> dict[str, Any]:
 
 def results(given: SuccessConfig, words: Sequence[str]) -> Iterator[Row]:
     """Trains and judges every seed; yields a line each."""
-    trained = config.load_train(words)
+    trained = load_train(words)
     for seed in given.seed:
         with tempfile.TemporaryDirectory() as name:
             run = Path(name) / "run"

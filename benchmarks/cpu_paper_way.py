@@ -20,9 +20,10 @@ import numpy as np
 
 from benchmarks import mujoco_arena, peers, timing
 from benchmarks.mujoco_arena import Arena, Moved
-from swarmjax import config, provenance, settings
-from swarmjax.config import AlgoConfig
-from swarmjax.settings import Section, about
+from swarmjax import provenance
+from swarmjax.config import Section, about, to_dict
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.run.settings import load_train
 from swarmjax.task import observation
 
 _WARM = 200  # control steps of the cycle that is not counted
@@ -162,7 +163,7 @@ def results(given: PaperWayConfig, words: list[str]) -> Iterator[dict[str, Any]]
     """Trains for a while; yields the line."""
     torch = peers.find("torch", peers.TORCH)
     judged = mujoco_arena.load_settings(["stage=s6", "robot=planar", "steps=500", *words])
-    algo = config.load_train(["algo=paper"]).algo
+    algo = load_train(["algo=paper"]).algo
     arena = Arena(judged)
     robots = [Robot(torch, algo) for _ in range(judged.stage.robots)]
     calls_s, transitions = [], 0
@@ -188,7 +189,7 @@ def results(given: PaperWayConfig, words: list[str]) -> Iterator[dict[str, Any]]
         "transitions_per_s": transitions / sum(calls_s),
         "compile_s": None,
         **timing.spread(calls_s),
-        "settings": settings.to_dict(given) | {"algo": config.to_dict(algo)},
+        "settings": to_dict(given) | {"algo": to_dict(algo)},
         "device": peers.torch_device_name(torch, "cpu"),
         "versions": peers.versions("torch"),
         "commit": provenance.commit(),

@@ -22,9 +22,10 @@ import numpy as np
 
 from benchmarks import mujoco_arena, peers, timing
 from benchmarks.mujoco_arena import Arena
-from swarmjax import config, provenance, settings
-from swarmjax.config import ConfigError, EvaluateConfig
-from swarmjax.settings import Section, about
+from swarmjax import provenance
+from swarmjax.config import ConfigError, Section, about, to_dict
+from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.run.settings import load_train
 from swarmjax.task import observation
 
 _LEVELS = 1_000_000  # numbers of levels that each arena has to itself
@@ -145,7 +146,7 @@ def vectorised(workers: Workers) -> Any:
 
 def ppo_settings(robots: int) -> dict[str, Any]:
     """Numbers of `algo=ppo` under the names of Stable-Baselines3, for so many robots in all."""
-    algo = config.load_train(["stage=s6"]).algo
+    algo = load_train(["stage=s6"]).algo
     return {
         "n_steps": algo.rollout,
         "batch_size": robots * algo.rollout // algo.minibatches,
@@ -192,7 +193,7 @@ def results(given: Sb3Config, words: list[str]) -> Iterator[dict[str, Any]]:
         "transitions_per_s": rate * judged.stage.robots,
         "compile_s": None,
         **timing.spread(calls_s),
-        "settings": settings.to_dict(given) | {"ppo": chosen},
+        "settings": to_dict(given) | {"ppo": chosen},
         "device": peers.torch_device_name(torch, "cpu"),
         "versions": peers.versions("torch", "stable-baselines3", "gymnasium"),
         "commit": provenance.commit(),

@@ -18,7 +18,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -27,16 +27,20 @@ import numpy as np
 
 from benchmarks import curriculum_arms
 from benchmarks.curriculum_arms import StudyConfig
-from swarmjax import command, config, provenance
-from swarmjax.config import StageConfig, TrainConfig
+from swarmjax import command, provenance
+from swarmjax.config import to_dict
 from swarmjax.evaluate import engine_mjx
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.run import trainer
-from swarmjax.sim import physics
+from swarmjax.run.settings import TrainConfig
+from swarmjax.sim import dispatch
 from swarmjax.task import env
 from swarmjax.task.level import Level
-from swarmjax.training import loop, seeds
-from swarmjax.training.loop import Program, TrainState
+from swarmjax.task.stage_config import StageConfig
+from swarmjax.training import program as programs
+from swarmjax.training import seeds
+from swarmjax.training.loop import TrainState
+from swarmjax.training.program import Program
 
 Judge = Callable[[LearnerState], dict[str, dict[str, np.ndarray]]]
 
@@ -54,18 +58,16 @@ def load_judge(study: StudyConfig, trained: TrainConfig, judged: dict[str, Stage
     """
     stages, arenas = tuple(judged.values()), len(judged) * study.levels
     world = env.load(
-        replace(
-            trained,
-            stage=stages,
-            seeds_by="vmap",
-            algo=replace(trained.algo, minibatches=1),
-            arenas=arenas,
-            budget=arenas * trained.algo.rollout,
-        )
+        stages,
+        trained.robot,
+        trained.task,
+        trained.realism,
+        trained.sim,
+        arenas=arenas * trained.seeds,
     )
     drawn = [engine_mjx.draw_levels(world, s, study.level_seed, study.levels) for s in stages]
     levels = Level(*(np.concatenate(fields) for fields in zip(*drawn, strict=True)))
-    run = partial(engine_mjx.outcomes, world, steps=trained.task.step_limit)
+    run = partial(engine_mjx.outcomes, world, trained.algo, steps=trained.task.step_limit)
     call = jax.jit(jax.vmap(run, in_axes=(0, None)))
 
     def judge(learners: LearnerState) -> dict[str, dict[str, np.ndarray]]:
@@ -117,7 +119,7 @@ def measure(trained: TrainConfig, at: np.ndarray, judge: Judge) -> Curves:
     Returns:
       The curves.
     """
-    program, schedule = loop.load(trained)
+    program, schedule = programs.load(trained)
     state = jax.jit(partial(seeds.init, program))(schedule)
     compiled = trainer.compile_chunk(program, schedule, state)
     call = partial(compiled.call, schedule)
@@ -199,7 +201,7 @@ def results(study: StudyConfig, words: Sequence[str]) -> Iterator[dict[str, Any]
 
 def _line(study: StudyConfig, arm: str, trained: TrainConfig, at: np.ndarray) -> dict[str, Any]:
     """What an arm was."""
-    whole = config.to_dict(trained)
+    whole = to_dict(trained)
     digest = hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
     return {
         "benchmark": "curriculum",
@@ -216,7 +218,7 @@ def _line(study: StudyConfig, arm: str, trained: TrainConfig, at: np.ndarray) ->
         "steps": trained.task.step_limit,
         "robot": trained.robot.body,
         "realism": trained.realism.name,
-        "impl": physics.resolve_impl(trained.sim.impl),
+        "impl": dispatch.resolve_impl(trained.sim.impl),
         "arena_steps": (at * trained.arenas * trained.algo.rollout).tolist(),
         "settings_digest": digest[:12],
         "device": provenance.device(),

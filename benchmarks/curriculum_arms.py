@@ -11,9 +11,10 @@ from typing import Literal
 
 import numpy as np
 
-from swarmjax import config, settings
-from swarmjax.config import ConfigError, StageConfig, TrainConfig
-from swarmjax.settings import Section, about
+from swarmjax.config import ConfigError, Section, about, build
+from swarmjax.config.section import MAX_COUNT, names
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.task.stage_config import StageConfig
 
 BASELINE = "final"
 HELD_OUT = "expanded"
@@ -39,7 +40,7 @@ class StudyConfig(Section):
     points: int = field(default=10, metadata=about("points at which arms are judged", 2, 1000))
     first: int = field(default=100_000, metadata=about("arena steps of the first one", 1, 10**15))
     levels: int = field(default=256, metadata=about("of each stage", 1, 2**20))
-    level_seed: int = field(default=2, metadata=about("of their levels", 0, config.MAX_COUNT))
+    level_seed: int = field(default=2, metadata=about("of their levels", 0, MAX_COUNT))
 
     def _check(self) -> None:
         if "adaptive-grid" in self.arms and self.goal != GRID_GOAL:
@@ -63,14 +64,14 @@ def parse(words: Sequence[str]) -> tuple[StudyConfig, list[str]]:
     Raises:
       ConfigError: if a word of the study is unsound, or one of training is what arms are about.
     """
-    mine = set(settings.names(StudyConfig))
+    mine = set(names(StudyConfig))
     parts = [(word, *word.partition("=")[::2]) for word in words]
     for _, key, _ in parts:
         if key in _CHOSEN:
             raise ConfigError(f"{key} cannot be given: choose it by {_CHOSEN[key]}.")
     given = {key: value.split(",") if key in _LISTS else value for _, key, value in parts}
     study = {key: value for key, value in given.items() if key in mine}
-    return settings.build(StudyConfig, study), [word for word, key, _ in parts if key not in mine]
+    return build(StudyConfig, study), [word for word, key, _ in parts if key not in mine]
 
 
 def curriculum_of(goal: str) -> str:
@@ -97,7 +98,7 @@ def load_arm(study: StudyConfig, arm: str, policy: str, words: Sequence[str]) ->
         BASELINE: [f"stage={study.goal}"],
         "adaptive-grid": ["stage=grid", "curriculum.mode=adaptive"],
     }.get(arm, [f"stage={curriculum_of(study.goal)}", f"curriculum.mode={arm}"])
-    return config.load_train(["seeds=10", *words, *chosen, f"algo.policy={policy}"])
+    return load_train(["seeds=10", *words, *chosen, f"algo.policy={policy}"])
 
 
 def points(study: StudyConfig, trained: TrainConfig) -> np.ndarray:
@@ -135,4 +136,4 @@ def roles(study: StudyConfig, trained: TrainConfig, words: Sequence[str]) -> dic
 
 def _stages(words: Sequence[str], name: str) -> tuple[StageConfig, ...]:
     maxima = [word for word in words if word.startswith("sim.")]
-    return config.load_train([*maxima, f"stage={name}"]).stage
+    return load_train([*maxima, f"stage={name}"]).stage

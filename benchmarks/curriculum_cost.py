@@ -15,9 +15,9 @@ from dataclasses import replace
 from typing import Any
 
 from benchmarks.pairs import Arm, median, time_in_turn
-from swarmjax import command, config, provenance
-from swarmjax.config import TrainConfig
-from swarmjax.sim import physics
+from swarmjax import command, provenance
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.sim import dispatch
 
 PAIRS = 20
 COPIES = {"sequential": 6, "mixed": 6, "adaptive": 6, "adaptive-grid": 48}
@@ -29,7 +29,7 @@ def curriculum(settings: TrainConfig, name: str) -> TrainConfig:
     stage = settings.stage[-1]
     copies = tuple(replace(stage, name=f"{stage.name}-{i}") for i in range(COPIES[name]))
     words = [f"curriculum.mode={name.removesuffix('-grid')}"]
-    options = config.load_train(words).curriculum
+    options = load_train(words).curriculum
     return replace(settings, stage=copies, stage_name=name, curriculum=options)
 
 
@@ -58,7 +58,7 @@ def results(settings: TrainConfig) -> Iterator[dict[str, Any]]:
             * settings.algo.rollout
             / median([mine for _, mine in times])[0],
             "robot": settings.robot.body,
-            "impl": physics.resolve_impl(settings.sim.impl),
+            "impl": dispatch.resolve_impl(settings.sim.impl),
             "arenas": settings.arenas,
             "compile_s": arm.compile_s,
             "device": provenance.device(),
@@ -69,7 +69,7 @@ def results(settings: TrainConfig) -> Iterator[dict[str, Any]]:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    settings = config.load_train(["stage=s6", *arguments])
+    settings = load_train(["stage=s6", *arguments])
     for line in results(settings):
         sys.stdout.write(json.dumps(line) + "\n")
         sys.stdout.flush()

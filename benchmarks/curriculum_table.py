@@ -30,9 +30,11 @@ from matplotlib.ticker import NullFormatter
 
 from benchmarks.curriculum_arms import BASELINE
 from swarmjax import command
-from swarmjax.config import ConfigError, TrainConfig
+from swarmjax.config import ConfigError
 from swarmjax.evaluate import statistics
+from swarmjax.evaluate.curves import area_under, curve, steps_to
 from swarmjax.evaluate.statistics import Interval
+from swarmjax.run.settings import TrainConfig
 
 MEASURES = {"targets_reached": "targets reached", "all_reached": "episodes in which all arrived"}
 THRESHOLDS = (0.8, 0.9)
@@ -128,9 +130,9 @@ def figures(line: Line, measure: str) -> Figures:
     return Figures(
         goal=goal[:, -1],
         held_out=curve["held_out"][:, -1] if "held_out" in curve else None,
-        steps={share: statistics.steps_to(steps, goal, share) for share in THRESHOLDS},
-        area=statistics.area_under(steps, goal),
-        log_area=statistics.area_under(np.log10(steps), goal),
+        steps={share: steps_to(steps, goal, share) for share in THRESHOLDS},
+        area=area_under(steps, goal),
+        log_area=area_under(np.log10(steps), goal),
         forgotten=None if first is None else first.max(axis=1) - first[:, -1],
     )
 
@@ -220,7 +222,7 @@ def _draw_curves(axes: Axes, arms: dict[str, Line], role: str, measure: str) -> 
     """Draws the curves of one stage, of the arms that were judged on it."""
     there = {name: line for name, line in arms.items() if role in line["judged"]}
     for name, line in there.items():
-        band = statistics.curve(np.array(line["judged"][role][measure]))
+        band = curve(np.array(line["judged"][role][measure]))
         (drawn,) = axes.plot(line["arena_steps"], band.estimate, label=name)
         axes.fill_between(
             line["arena_steps"], band.low, band.high, color=drawn.get_color(), alpha=0.2, lw=0
@@ -284,7 +286,7 @@ def _are_curves(steps: Any, curves: Any) -> bool:
     try:
         at, values = np.array(steps), np.array(curves)
         if {at.dtype.kind, values.dtype.kind} <= {"i", "f"} and values.ndim == 2:
-            statistics.area_under(at, values)
+            area_under(at, values)
             return bool(at[0] > 0)
     except ValueError:  # of lists that make no array, or of what statistics refuses
         return False

@@ -14,11 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax import command, config, provenance
-from swarmjax.config import ConfigError, EvaluateConfig
+from swarmjax import command, provenance
+from swarmjax.config import ConfigError
 from swarmjax.evaluate import summary as evaluate_summary
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import evaluate
 from swarmjax.evaluate.trials import Trial
+from swarmjax.task.stage_files import load_levels
 
 SAME_TIME = 0.032  # s; arrivals may fall into neighbouring control steps
 
@@ -52,7 +54,7 @@ def compare(c: Trial, mjx: Trial) -> dict[str, Any]:
 
 def results(words: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Runs both engines; yields a line for each cell."""
-    settings = config.load_evaluate(words)
+    settings = load_levels(EvaluateConfig, words)
     if settings.policy is None:
         raise ConfigError("compare cannot be given: the engines are compared, by policy=FILE.")
     found = [evaluate(replace(settings, engine=engine)) for engine in ("c", "mjx")]

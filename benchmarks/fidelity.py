@@ -24,8 +24,10 @@ from rich.table import Table
 from benchmarks import fidelity_body, fidelity_infrared, fidelity_motion, pages, rig
 from benchmarks.fidelity_row import Row
 from benchmarks.rig import Rig
-from swarmjax import command, compose, config, provenance
-from swarmjax.settings import ConfigError, Section, about, build
+from swarmjax import command, provenance
+from swarmjax.config import ConfigError, Section, about, build, files
+from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.task.stage_files import load_levels
 
 ROBOTS = ("planar", "wheeled", "planar_v2", "wheeled_v2")  # files of configs/robot/
 PAGE = "robot.md"
@@ -46,13 +48,13 @@ class FidelityConfig(Section):
 
 def load(arguments: Sequence[str]) -> FidelityConfig:
     """Makes the configuration of its `key=value` words; raises ConfigError."""
-    return build(FidelityConfig, compose.values(compose.split_words(FidelityConfig, arguments)))
+    return build(FidelityConfig, files.values(files.split_words(FidelityConfig, arguments)))
 
 
 def rigs() -> list[Rig]:
     """Puts the robots of configs/robot/ on rigs, in the order of `ROBOTS`."""
     keys = (["policy=none", f"robot={name}"] for name in ROBOTS)
-    return [rig.load(config.load_evaluate(words).robot) for words in keys]
+    return [rig.load(load_levels(EvaluateConfig, words).robot) for words in keys]
 
 
 def measure(benches: Sequence[Rig]) -> list[Row]:

@@ -26,9 +26,10 @@ from benchmarks.fidelity_row import (
     beside,
 )
 from benchmarks.rig import Rig, Track
-from swarmjax import config
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.sim import motor
 from swarmjax.sim.wheeled import encoders
+from swarmjax.task.stage_files import load_levels
 
 FULL = 0.25, 0.0  # m/s, rad/s: more than the motors give
 TURN = 0.0, 3.14
@@ -359,7 +360,7 @@ def _quantised() -> list[Row]:
 
 
 def _speed_noise() -> list[Row]:
-    realism = config.load_evaluate(["policy=none", "realism=real"]).realism
+    realism = load_levels(EvaluateConfig, ["policy=none", "realism=real"]).realism
     realism = replace(realism, speed_quantisation=None)
     ones = np.ones((_SAMPLES // 2, 2), np.float32)
     noisy = motor.disturb(ones, realism, np.uint32(0), np.int32(0), np).astype(float)

@@ -23,16 +23,17 @@ import optax
 from jax.errors import JaxRuntimeError
 
 from benchmarks import peers, timing
-from swarmjax import command, config, provenance
-from swarmjax.config import AlgoConfig
+from swarmjax import command, provenance
+from swarmjax.config import Section, about
 from swarmjax.ppo import losses, networks
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.fast import fused
 from swarmjax.ppo.fast.kernel import Launch
 from swarmjax.ppo.losses import Minibatch
 from swarmjax.ppo.networks import Params
-from swarmjax.settings import Section, about
+from swarmjax.run.settings import load_train
 from swarmjax.task import observation
-from swarmjax.training import rollout
+from swarmjax.training import program as programs
 
 _STEP = 1e-6  # along each gradient: none may be computed once for all
 _VALID = 0.75  # share of the samples
@@ -68,7 +69,7 @@ def minibatch(key: jax.Array, params: Params, algo: AlgoConfig, size: int) -> Mi
     """Draws samples whose ratios are about 1, some of them clipped."""
     keys = jax.random.split(key, 6)
     seen = jax.random.normal(keys[0], (size, observation.SIZE))
-    action = jax.random.normal(keys[1], (size, rollout.ACTION_SIZE))
+    action = jax.random.normal(keys[1], (size, programs.ACTION_SIZE))
     mean, std = networks.action_distribution(params, algo, seen)
     moved = 0.1 * jax.random.normal(keys[2], (size,))
     return Minibatch(
@@ -142,7 +143,7 @@ def _difference(one: Params, other: Params) -> float:
 def lines(given: SpeedConfig, algo: AlgoConfig, size: int) -> Iterator[dict[str, Any]]:
     """Measures one size of the minibatch; yields a line for each method."""
     init_key, key = jax.random.split(jax.random.key(0))
-    params = networks.init_params(init_key, algo, observation.SIZE, rollout.ACTION_SIZE)
+    params = networks.init_params(init_key, algo, observation.SIZE, programs.ACTION_SIZE)
     samples = jax.jit(minibatch, static_argnums=(2, 3))(key, params, algo, size)
     made = methods(given, algo)
     built = {
@@ -191,7 +192,7 @@ def _about(
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     given, words = peers.parse(SpeedConfig, arguments)
-    algo = config.load_train(words).algo
+    algo = load_train(words).algo
     for size in given.batch:
         for line in lines(given, algo, size):
             sys.stdout.write(json.dumps(line) + "\n")

@@ -19,10 +19,11 @@ import jax
 import numpy as np
 
 from benchmarks import peers, steps_per_second, timing
-from swarmjax import command, config
-from swarmjax.config import TrainConfig
-from swarmjax.sim import physics
-from swarmjax.training import loop, seeds
+from swarmjax import command
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.sim import dispatch
+from swarmjax.training import program as programs
+from swarmjax.training import seeds
 
 _UPDATES = 2
 
@@ -30,7 +31,7 @@ _UPDATES = 2
 def result(settings: TrainConfig) -> dict[str, Any]:
     """Trains for two updates; returns the line."""
     free = free_bytes()
-    program, schedule = loop.load(settings)
+    program, schedule = programs.load(settings)
     init = partial(seeds.init, program)
     train = partial(seeds.train_chunk, program, schedule)
     template = jax.eval_shape(init, schedule)
@@ -62,7 +63,7 @@ def free_bytes() -> int | None:
 def warp_bytes(settings: TrainConfig) -> int | None:
     """The most that Warp's allocator held at once; None where it is not used."""
     card = _card()
-    if card is None or physics.resolve_impl(settings.sim.impl) != "warp":
+    if card is None or dispatch.resolve_impl(settings.sim.impl) != "warp":
         return None
     import warp
 
@@ -81,7 +82,7 @@ def _card() -> Any:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    settings = config.load_train(["stage=s6", "budget=1e10", *arguments])
+    settings = load_train(["stage=s6", "budget=1e10", *arguments])
     peers.write([result(replace(settings, stage=settings.stage[-1:]))])
     return 0
 

@@ -10,13 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarmjax import config
-from swarmjax.config import ConfigError, EvaluateConfig
+from swarmjax.config import ConfigError
 from swarmjax.evaluate import engine_c
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.engine_c import Arenas
 from swarmjax.evaluate.judge import Judge
 from swarmjax.policy import Policy
 from swarmjax.task import observation
+from swarmjax.task.config import resolve_encoding
+from swarmjax.task.stage_files import load_levels
 
 ACTION_SIZE = 2
 
@@ -101,7 +103,7 @@ class Arena:
 def _puppet(settings: EvaluateConfig, action: np.ndarray) -> Policy:
     """A policy that does what it is told, [R, 2]."""
     robots, none = len(action), np.zeros((len(action), observation.SIZE), np.float32)
-    encoding = config.encoding(settings.task, settings.realism)
+    encoding = resolve_encoding(settings.task, settings.realism)
     return Policy(
         layers=[(np.zeros((robots, observation.SIZE, ACTION_SIZE), np.float32), action)],
         log_std=np.zeros_like(action),
@@ -140,4 +142,4 @@ def rewards(judge: Judge, before: Arenas, after: Arenas) -> np.ndarray:
 
 def load_settings(words: list[str]) -> EvaluateConfig:
     """Makes the settings of an arena of `key=value` words of `swarmjax.evaluate`."""
-    return config.load_evaluate(["policy=none", *words])
+    return load_levels(EvaluateConfig, ["policy=none", *words])

@@ -1,6 +1,6 @@
 """Pages of docs/ that a command writes a part of, between two markers."""
 
-from swarmjax.settings import ConfigError
+from swarmjax.config import ConfigError
 
 
 def insert(text: str, page: str, marker: str, part: str) -> str:

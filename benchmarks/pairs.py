@@ -8,9 +8,10 @@ from math import comb
 import jax
 import numpy as np
 
-from swarmjax.config import TrainConfig
 from swarmjax.run import trainer
-from swarmjax.training import loop, seeds
+from swarmjax.run.settings import TrainConfig
+from swarmjax.training import program as programs
+from swarmjax.training import seeds
 
 
 class Arm:
@@ -23,7 +24,7 @@ class Arm:
     """
 
     def __init__(self, settings: TrainConfig) -> None:
-        program, schedule = loop.load(settings)
+        program, schedule = programs.load(settings)
         self.settings = settings
         self._state = jax.jit(partial(seeds.init, program))(schedule)
         compiled = trainer.compile_chunk(program, schedule, self._state)

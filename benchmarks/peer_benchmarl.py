@@ -18,7 +18,7 @@ from typing import Any, Literal
 from benchmarks import peer_vmas, peers, timing
 from benchmarks.peers import PeerConfig
 from swarmjax import provenance
-from swarmjax.settings import about, to_dict
+from swarmjax.config import about, to_dict
 
 _WARM = 2  # iterations that are not counted
 

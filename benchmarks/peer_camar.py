@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from benchmarks import peers, timing
 from benchmarks.peers import PeerConfig
 from swarmjax import epuck, provenance
-from swarmjax.settings import about
+from swarmjax.config import about
 
 FRAMESKIP = 2  # CAMAR's own default: three substeps
 DT = 0.032 / (FRAMESKIP + 1)  # s

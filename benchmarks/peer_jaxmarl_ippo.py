@@ -25,7 +25,7 @@ from jax import Array
 from benchmarks import peer_jaxnav, peers, timing
 from benchmarks.peers import PeerConfig
 from swarmjax import provenance
-from swarmjax.settings import about, to_dict
+from swarmjax.config import about, to_dict
 
 ACTION_SIZE = 2
 # baselines/IPPO/config/ippo_ff_mabrax.yaml

@@ -20,7 +20,7 @@ from jax import Array
 from benchmarks import peers, timing
 from benchmarks.peers import PeerConfig
 from swarmjax import epuck, provenance
-from swarmjax.settings import about
+from swarmjax.config import about
 
 # JaxNav's cells are 1 m and its robots have a radius of 0.3 m: all lengths of ours are put in
 # radii of 0.037 m. Rays of 0.04 m are 0.32 m; samples along them are as far apart as by default.

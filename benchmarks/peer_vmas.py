@@ -15,7 +15,7 @@ from typing import Any, Literal
 from benchmarks import peers, timing
 from benchmarks.peers import PeerConfig
 from swarmjax import provenance
-from swarmjax.settings import about
+from swarmjax.config import about
 
 SUBSTEPS = 2  # vmas.simulator.core.World's own default
 COUNTED = {

@@ -15,8 +15,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from benchmarks import timing
-from swarmjax import command, provenance, settings
-from swarmjax.settings import Section, about, build
+from swarmjax import command, provenance
+from swarmjax.config import ConfigError, Section, about, build, section
+from swarmjax.config.section import keys
 
 TORCH = "benchmarks/torch-peers.txt"
 
@@ -52,12 +53,12 @@ def load(cls: type[Section], words: Sequence[str]) -> Any:
     Raises:
       ConfigError: if a word is unsound.
     """
-    lists = {name for name, item in settings.keys(cls).items() if "tuple" in str(item.type)}
+    lists = {name for name, item in keys(cls).items() if "tuple" in str(item.type)}
     given = {}
     for word in words:
         key, equals, value = word.partition("=")
         if not equals:
-            raise settings.ConfigError(f"'{word}' is not a setting: give key=value.")
+            raise ConfigError(f"'{word}' is not a setting: give key=value.")
         given[key] = value.split(",") if key in lists else value
     return build(cls, given)
 
@@ -75,8 +76,8 @@ def parse(cls: type[Section], words: Sequence[str]) -> tuple[Any, list[str]]:
     Raises:
       ConfigError: if a word of `cls` is unsound.
     """
-    names = settings.names(cls)
-    mine = [word for word in words if word.partition("=")[0] in names]
+    known = section.names(cls)
+    mine = [word for word in words if word.partition("=")[0] in known]
     return load(cls, mine), [word for word in words if word not in mine]
 
 

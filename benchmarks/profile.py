@@ -24,8 +24,8 @@ import jax
 import numpy as np
 
 from benchmarks import steps_per_second
-from swarmjax import command, config
-from swarmjax.config import TrainConfig
+from swarmjax import command
+from swarmjax.run.settings import TrainConfig, load_train
 
 TOP = 40
 UPDATES = 2  # of the call of training
@@ -145,7 +145,7 @@ def results(settings: TrainConfig, top: int) -> Iterator[dict]:
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     tops, words = steps_per_second.split(arguments, "top")
-    settings = config.load_train(["stage=s6", *words])
+    settings = load_train(["stage=s6", *words])
     settings = replace(settings, stage=settings.stage[-1:])
     for line in results(settings, int(tops[0]) if tops else TOP):
         sys.stdout.write(json.dumps(line) + "\n")

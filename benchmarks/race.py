@@ -33,13 +33,13 @@ from flax import linen
 
 from benchmarks import curriculum, peers, steps_per_second, timing
 from benchmarks.curriculum_arms import StudyConfig
-from swarmjax import config
-from swarmjax.config import TrainConfig
-from swarmjax.curriculum import engine as curricula
+from swarmjax.config import ConfigError, Section, about, to_dict
+from swarmjax.config.section import MAX_COUNT
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
-from swarmjax.settings import Section, about
-from swarmjax.task import env, observation
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.task import observation
+from swarmjax.training import program as programs
 
 SHARES = (0.90, 0.95)
 # MuJoCo Playground 0.2.0, `config/locomotion_params.py`, `brax_ppo_config`, of whose 8,192 robots a
@@ -74,7 +74,7 @@ class RaceConfig(Section):
     )
     points: int = field(default=30, metadata=about("points at which it is judged", 4, 1000))
     levels: int = field(default=256, metadata=about("that it is judged on", 1, 2**20))
-    level_seed: int = field(default=2, metadata=about("of these", 0, config.MAX_COUNT))
+    level_seed: int = field(default=2, metadata=about("of these", 0, MAX_COUNT))
     settings: Literal["ours", "playground"] = field(
         default="ours", metadata=about("of Brax: ours, or those of MuJoCo Playground")
     )
@@ -253,7 +253,7 @@ def run_brax(race: RaceConfig, trained: TrainConfig) -> Course:
 
     _mend_jax()
     brax_ppo.train(
-        environment=adapter.SwarmEnv(env.load(trained), curricula.schedule(trained).stages),
+        environment=adapter.SwarmEnv(*programs.load(trained)),
         wrap_env=False,
         max_devices_per_host=1,
         run_evals=False,
@@ -318,7 +318,7 @@ def line(race: RaceConfig, trained: TrainConfig, course: Course) -> dict[str, An
         "arena_steps_per_call": float(course.arena_steps[0]),
         **timing.spread(calls_s.tolist()),
         "levels": race.levels,
-        "settings": config.to_dict(trained.algo) if ours else brax_settings(race, trained),
+        "settings": to_dict(trained.algo) if ours else brax_settings(race, trained),
         **steps_per_second.made_with(),
         "versions": peers.versions("brax"),
     }
@@ -336,7 +336,7 @@ def seconds_to(course: Course) -> dict[str, float | None]:
 def parse(words: Sequence[str]) -> tuple[RaceConfig, TrainConfig]:
     """Tells the words of the race from those of training; raises ConfigError."""
     race, rest = peers.parse(RaceConfig, words)
-    trained = config.load_train(["stage=s6", *rest])
+    trained = load_train(["stage=s6", *rest])
     _check(race, trained)
     return race, trained
 
@@ -344,9 +344,9 @@ def parse(words: Sequence[str]) -> tuple[RaceConfig, TrainConfig]:
 def _check(race: RaceConfig, trained: TrainConfig) -> None:
     *others, stage = trained.stage
     if others:
-        raise config.ConfigError(f"stage is {trained.stage_name}: give one stage, as in stage=s6.")
+        raise ConfigError(f"stage is {trained.stage_name}: give one stage, as in stage=s6.")
     if stage.robots < trained.sim.max_robots:
-        raise config.ConfigError(
+        raise ConfigError(
             f"sim.max_robots is {trained.sim.max_robots}, but stage {stage.name} has "
             f"{stage.robots} robots, and Brax has no place for absent ones: give "
             f"sim.max_robots={stage.robots}."
@@ -356,7 +356,7 @@ def _check(race: RaceConfig, trained: TrainConfig) -> None:
         _check_playground(trained)
         updates = _brax_updates(trained, PLAYGROUND)
     if updates < race.points:
-        raise config.ConfigError(
+        raise ConfigError(
             f"points is {race.points}, but the budget is {updates} updates: give at most as many."
         )
 
@@ -364,7 +364,7 @@ def _check(race: RaceConfig, trained: TrainConfig) -> None:
 def _check_playground(trained: TrainConfig) -> None:
     robots, parts = trained.arenas * trained.sim.max_robots, PLAYGROUND["num_minibatches"]
     if robots % parts:
-        raise config.ConfigError(
+        raise ConfigError(
             f"arenas is {trained.arenas}: settings=playground takes a number of robots, {robots} "
             f"of which there are, that {parts} divides."
         )

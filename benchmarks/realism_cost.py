@@ -16,9 +16,11 @@ from dataclasses import replace
 from typing import Any
 
 from benchmarks.pairs import Arm, median, time_in_turn
-from swarmjax import command, config, provenance
-from swarmjax.config import ConfigError, RealismConfig, TrainConfig
-from swarmjax.sim import physics
+from swarmjax import command, provenance
+from swarmjax.config import ConfigError
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.sim import dispatch
+from swarmjax.sim.realism_config import COUNTED, RealismConfig
 
 PAIRS = 10
 CALL_SECONDS = 0.5  # of the ideal program, about
@@ -29,13 +31,13 @@ _NO_FACTOR = ("name", "infrared", "stall_time")
 
 def arms() -> dict[str, RealismConfig]:
     """The realism of each arm: the presets, the response alone, and each factor of `real` alone."""
-    presets = {name: config.load_train([f"realism={name}"]).realism for name in PRESETS}
+    presets = {name: load_train([f"realism={name}"]).realism for name in PRESETS}
     real = presets["real"]
     alone = {"infrared": RealismConfig(infrared=real.infrared)}
     for item in dataclasses.fields(RealismConfig):
         if item.name not in _NO_FACTOR:
             # What acts on counts costs what it does on top of a response that has any.
-            base = alone["infrared"] if item.name in config.COUNTED else RealismConfig()
+            base = alone["infrared"] if item.name in COUNTED else RealismConfig()
             alone[item.name] = replace(base, **{item.name: getattr(real, item.name)})
     return presets | alone
 
@@ -74,7 +76,7 @@ def results(settings: TrainConfig, chosen: dict[str, RealismConfig]) -> Iterator
             "factor": name,
             **compare(ideal, arm, updates),
             "robot": settings.robot.body,
-            "impl": physics.resolve_impl(settings.sim.impl),
+            "impl": dispatch.resolve_impl(settings.sim.impl),
             "arenas": settings.arenas,
             "seeds": settings.seeds,
             "robots": settings.stage[-1].robots,
@@ -100,7 +102,7 @@ def _choose(words: Sequence[str]) -> tuple[dict[str, RealismConfig], list[str]]:
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     chosen, rest = _choose(arguments)
-    settings = config.load_train(["stage=s6", *rest])
+    settings = load_train(["stage=s6", *rest])
     for line in results(replace(settings, stage=settings.stage[-1:]), chosen):
         sys.stdout.write(json.dumps(line) + "\n")
         sys.stdout.flush()

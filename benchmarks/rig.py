@@ -10,10 +10,10 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from swarmjax.config import RobotConfig
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.body import AS_BUILT, Body
+from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.geometry import FLOOR_GROUP, HULL_GROUP
 
 CONTROL_STEP = 0.032  # s; Webots basicTimeStep

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from benchmarks import peers, steps_per_second
-from swarmjax import command, config
-from swarmjax.config import TrainConfig
-from swarmjax.settings import Section, about
+from swarmjax import command
+from swarmjax.config import Section, about
+from swarmjax.run.settings import TrainConfig, load_train
 
 _ROBOTS, _SIDE = 5, 1.2  # of s6; m
 _LEAST = 0.8  # m; the three obstacles need as much
@@ -46,7 +46,7 @@ def load(robots: int, total: int, words: Sequence[str]) -> TrainConfig:
     side = max(_LEAST, round(_SIDE * math.sqrt(robots / _ROBOTS), 2))
     arenas = max(8, 2 ** round(math.log2(total / robots)))
     size = [f"sim.max_robots={robots}", f"stage.robots={robots}", f"stage.side={side}"]
-    return config.load_train(["stage=s6", "budget=1e10", *words, *size, f"arenas={arenas}"])
+    return load_train(["stage=s6", "budget=1e10", *words, *size, f"arenas={arenas}"])
 
 
 def main(arguments: Sequence[str]) -> int:

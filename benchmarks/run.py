@@ -27,8 +27,7 @@ from typing import Any, TextIO
 from benchmarks import peers, run_page
 from benchmarks.suites import SUITES, Entry
 from swarmjax import command
-from swarmjax.config import ConfigError
-from swarmjax.settings import Section, about
+from swarmjax.config import ConfigError, Section, about
 
 Line = dict[str, Any]
 _GRACE = 10.0  # s that a process is given to end by itself

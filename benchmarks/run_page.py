@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import pages, run_figures, run_tables
-from swarmjax.settings import ConfigError
+from swarmjax.config import ConfigError
 
 PAGE = "benchmarks.md"
 MARKER = "results"

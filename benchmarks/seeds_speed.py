@@ -14,9 +14,9 @@ from dataclasses import replace
 from typing import Any
 
 from benchmarks.pairs import Arm, median
-from swarmjax import command, config, provenance
-from swarmjax.config import TrainConfig
-from swarmjax.sim import physics
+from swarmjax import command, provenance
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.sim import dispatch
 
 PAIRS = 10
 CALL_SECONDS = 0.5  # of a call of one seed, about
@@ -51,7 +51,7 @@ def result(settings: TrainConfig) -> dict[str, Any]:
         "compile_s_of_one": one.compile_s,
         "compile_s": all_.compile_s,
         "stages": [stage.name for stage in settings.stage],
-        "impl": physics.resolve_impl(settings.sim.impl),
+        "impl": dispatch.resolve_impl(settings.sim.impl),
         "device": provenance.device(),
         "versions": provenance.versions(),
         "commit": provenance.commit(),
@@ -60,7 +60,7 @@ def result(settings: TrainConfig) -> dict[str, Any]:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    settings = config.load_train(["stage=s6", "seeds=10", *arguments])
+    settings = load_train(["stage=s6", "seeds=10", *arguments])
     sys.stdout.write(json.dumps(result(settings)) + "\n")
     return 0
 

@@ -16,9 +16,10 @@ from pathlib import Path
 
 from benchmarks import peers, steps_per_second
 from benchmarks.watched_run import MADE_WITH, Watched
-from swarmjax import command, config
+from swarmjax import command
+from swarmjax.config import Section, about
 from swarmjax.report.rows import Row
-from swarmjax.settings import Section, about
+from swarmjax.run.settings import load_train
 
 _FIRST = ("run.chunk=1", "run.stop_after=1")
 
@@ -58,7 +59,7 @@ def measure(words: Sequence[str], run: Path, environment: dict[str, str]) -> tup
 
 def results(given: StartConfig, words: Sequence[str]) -> Iterator[Row]:
     """Measures cold and warm starts; yields a line each."""
-    trained = config.load_train(words)
+    trained = load_train(words)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for cache, count in {"cold": 1, "warm": given.warm}.items():

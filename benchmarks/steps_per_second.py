@@ -23,14 +23,17 @@ import numpy as np
 from jax import Array
 
 from benchmarks import timing
-from swarmjax import command, config, provenance
-from swarmjax.config import TrainConfig
+from swarmjax import command, provenance
 from swarmjax.curriculum.engine import Schedule
-from swarmjax.sim import drive, physics
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.sim import dispatch, drive, physics
+from swarmjax.sim.config import physics_substeps
 from swarmjax.task import env
 from swarmjax.task.env import EnvState
-from swarmjax.training import loop, rollout, seeds
-from swarmjax.training.loop import Program, TrainState
+from swarmjax.training import program as programs
+from swarmjax.training import rollout, seeds
+from swarmjax.training.loop import TrainState
+from swarmjax.training.program import Program
 
 # Of one call of physics and environment; whole rollouts of the default algorithm.
 CONTROL_STEPS = {"planar": 64, "wheeled": 32}
@@ -69,7 +72,7 @@ class Prepared:
 
 def prepare(settings: TrainConfig) -> Prepared:
     """Compiles all programs of one size; several sizes may be prepared in threads."""
-    program, schedule = loop.load(settings)
+    program, schedule = programs.load(settings)
     init = partial(seeds.init, program)
     template: TrainState = jax.eval_shape(init, schedule)
     keys = jax.vmap(jax.random.key)(np.array(seeds.numbers(settings), np.uint32))
@@ -138,7 +141,7 @@ def _rollouts(settings: TrainConfig) -> int:
 
 def _actions(program: Program, key: Array) -> Array:
     """Uniform random actions [A, R, 2]."""
-    shape = (program.config.arenas, program.config.sim.max_robots, rollout.ACTION_SIZE)
+    shape = (program.config.arenas, program.config.sim.max_robots, programs.ACTION_SIZE)
     return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
 
 
@@ -153,7 +156,7 @@ def _line(
     settings, compiled = prepared.program.config, getattr(prepared, name)
     seconds = statistics.median(calls_s)
     arena_steps = control_steps * settings.seeds * settings.arenas / seconds
-    count = config.substeps(settings.robot, settings.sim.substeps)
+    count = physics_substeps(settings.robot, settings.sim.substeps)
     return {
         "benchmark": f"steps_per_second.{name}",
         **about(settings),
@@ -180,13 +183,13 @@ def about(settings: TrainConfig, impl: str | None = None) -> dict[str, Any]:
     """
     return {
         "robot": settings.robot.body,
-        "impl": physics.resolve_impl(settings.sim.impl) if impl is None else impl,
+        "impl": dispatch.resolve_impl(settings.sim.impl) if impl is None else impl,
         "arenas": settings.arenas,
         "seeds": settings.seeds,
         "robots": settings.stage[-1].robots,
         "obstacles": settings.stage[-1].obstacles,
         "side": settings.stage[-1].side,
-        "substeps": config.substeps(settings.robot, settings.sim.substeps),
+        "substeps": physics_substeps(settings.robot, settings.sim.substeps),
         "control_step": settings.task.control_step,
         **COUNTED,
         "matmul_precision": timing.matmul_precision(),
@@ -297,7 +300,7 @@ def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     sizes, words = split(arguments, "arenas")
     given = [[f"arenas={size}"] for size in sizes] or [[]]
-    points = [config.load_train(["stage=s6", *words, *size]) for size in given]
+    points = [load_train(["stage=s6", *words, *size]) for size in given]
     for lines in sweep([replace(point, stage=point.stage[-1:]) for point in points]):
         sys.stdout.write("".join(json.dumps(line) + "\n" for line in lines))
         sys.stdout.flush()

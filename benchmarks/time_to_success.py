@@ -13,10 +13,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from swarmjax.command import USER_ERROR
-from swarmjax.config import ConfigError, substeps
+from swarmjax.config import ConfigError
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import Row
 from swarmjax.run.recorder import METRICS
+from swarmjax.sim.config import physics_substeps
 
 USAGE = "usage: python -m benchmarks.time_to_success RUN [SHARE]\n"
 
@@ -67,7 +68,7 @@ def lines(run: Path, share: float) -> list[Row]:
                 "robot": trained.robot.body,
                 "arenas": trained.arenas,
                 "robots": last.robots,
-                "substeps": substeps(trained.robot, trained.sim.substeps),
+                "substeps": physics_substeps(trained.robot, trained.sim.substeps),
                 **{key: summary[key] for key in OF_THE_RUN},
             }
         )

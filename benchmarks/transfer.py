@@ -16,9 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax import command, config, policy_file, provenance
-from swarmjax.config import ConfigError, EvaluateConfig
+from swarmjax import command, policy_file, provenance
+from swarmjax.config import ConfigError
 from swarmjax.evaluate import cells, statistics, trials
+from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.task.stage_files import load_levels
 
 WORLDS = (("planar", "ideal"), ("wheeled", "ideal"), ("wheeled", "webots"), ("wheeled", "real"))
 MEASURES = ("targets_reached", "all_reached", "contacts_per_robot", "episode_time_s")
@@ -71,7 +73,7 @@ def results(words: Sequence[str], policies: dict[str, list[str]]) -> Iterator[di
         worlds: dict[tuple[str, str], dict[str, np.ndarray]] = {}
         for body, realism in WORLDS:
             given = [f"policy={some}", *words, f"robot={body}", f"realism={realism}"]
-            settings = config.load_evaluate(given)
+            settings = load_levels(EvaluateConfig, given)
             if settings.suite is not None:
                 raise ConfigError(
                     f"suite is '{settings.suite}', but worlds are compared on levels of one stage: "

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from swarmjax import command
+from swarmjax.config import ConfigError
 from swarmjax.report import rows as report_rows
 from swarmjax.run.recorder import METRICS
-from swarmjax.settings import ConfigError
 
 # Of a run's summary, what a line about it says of where it was made.
 MADE_WITH = ("device", "versions", "commit")

@@ -3,8 +3,8 @@
 import sys
 from collections.abc import Callable, Sequence
 
-from swarmjax import config
-from swarmjax.config import ConfigError
+from swarmjax.config import ConfigError, files, section
+from swarmjax.config.section import Section
 from swarmjax.policy import PolicyError
 
 USER_ERROR = 2
@@ -32,7 +32,7 @@ def run(
     module = _module(name)
     try:
         if {"-h", "--help"} & set(arguments):
-            sys.stdout.write(config.help_text(settings, module) + "\n")
+            sys.stdout.write(help_text(settings, module) + "\n")
             return 0
         return main(arguments)
     except KeyboardInterrupt:
@@ -47,3 +47,20 @@ def _module(name: str) -> str:
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     found = "" if spec is None else spec.name.removesuffix(".__main__")
     return found if found.rpartition(".")[2] == name else f"swarmjax.{name}"
+
+
+def help_text(cls: type[Section], module: str) -> str:
+    """Describe a command's settings: groups with their choices, then every key.
+
+    Args:
+        cls: the command's dataclass.
+        module: the command as `python -m` names it, such as `swarmjax.train`.
+
+    Returns:
+        Lines for a terminal, without a newline at the end.
+    """
+    lines = [f"usage: python -m {module} key=value ..."]
+    groups = files.describe_groups(cls.command) if cls.command else []
+    if groups:
+        lines += ["", "Groups, each a folder of configs/:", *groups]
+    return "\n".join([*lines, "", "Keys, with their defaults:", *section.describe_keys(cls)])

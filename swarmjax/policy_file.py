@@ -8,17 +8,16 @@ before anything is allocated.
 import io
 import json
 import math
-import os
 import re
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
 
 from swarmjax import policy
+from swarmjax.atomic_file import replacing
 from swarmjax.policy import FORMAT, MAX_BYTES, Policy, PolicyError
 
 ACTION_NAMES = ("speed", "turn_rate")
@@ -106,31 +105,6 @@ def write(path: str | Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str,
             np.savez(file, allow_pickle=False, **everything)
     except OSError as error:
         raise PolicyError(f"{path} cannot be written: {error.strerror or error}.") from None
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Gives a place to write to, and moves what was written to `path` unless something failed.
-
-    Args:
-        path: Of the file; folders that are missing are made.
-
-    Yields:
-        Another path with the same ending.
-
-    Raises:
-        OSError: If it cannot be written.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Beside the file, so that the move stays within one file system and cannot stop half way.
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
-    try:
-        yield temporary
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:

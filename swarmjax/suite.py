@@ -9,10 +9,10 @@ import re
 import sys
 import textwrap
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import yaml
@@ -21,15 +21,42 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from swarmjax import command, compose, config, policy_file
-from swarmjax.config import CellConfig, ConfigError, EvaluateConfig, SuiteConfig
+from swarmjax import command
+from swarmjax.atomic_file import replacing
+from swarmjax.config import ConfigError, about, files
+from swarmjax.config.section import MAX_COUNT, Section
 from swarmjax.evaluate import cells, trials
 from swarmjax.evaluate.cells import Cell, Suite
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import list_files
+from swarmjax.evaluate.suite_config import CellConfig, read_suite
 from swarmjax.evaluate.table import PLAIN_WIDTH
 from swarmjax.evaluate.trials import Entrant, Trial
 
 _WIDTH = 100  # of a line of a suite's file
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuiteConfig(Section):
+    """Which suite is drawn, and what becomes of it."""
+
+    command: ClassVar[str] = "suite"
+
+    suite: str = field(metadata=about("a name of configs/suites/, or a file .yaml"))
+    out: str | None = field(default=None, metadata=about("file .npz for all of its levels"))
+    write: bool = field(
+        default=False,
+        metadata=about("put digests, and episodes that were chosen, into the suite's file"),
+    )
+    policies: str | None = field(
+        default=None,
+        metadata=about("choose the levels that these fail most: a.npz,b.npz or a pattern"),
+    )
+    pool: int = field(default=20_000, metadata=about("levels drawn to choose from", 1, 1_000_000))
+    steps: int = field(default=1500, metadata=about("control steps of an episode", 1, MAX_COUNT))
+    workers: int | None = field(
+        default=None, metadata=about("processes; null: one a core", 1, 1024)
+    )
 
 
 def choose(trial: Trial, count: int) -> np.ndarray:
@@ -53,7 +80,7 @@ def choose(trial: Trial, count: int) -> np.ndarray:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    settings = config.load_suite(arguments)
+    settings = files.load(SuiteConfig, arguments)
     if settings.policies is not None and not settings.write:
         raise ConfigError(
             "policies is given, but write is false: give write=true, which puts the levels that "
@@ -73,18 +100,18 @@ def main(arguments: Sequence[str]) -> int:
 
 def _renew(settings: SuiteConfig) -> Suite:
     """Draws a suite whatever its digests are, and writes those that it finds into its file."""
-    file = config.read_suite(settings.suite)
+    file = read_suite(settings.suite)
     wanted = file.cells
     if settings.policies is not None:
         entrants = trials.read_policies(list_files("policies", settings.policies))
         wanted = tuple(_search(settings, each, entrants) for each in wanted)
     suite = Suite(file.name, tuple(cells.draw_cell(each) for each in wanted))
-    path = compose.suite_path(settings.suite)
-    content = compose.read_yaml(path)
-    for entry, cell, about in zip(content["cells"], suite.cells, wanted, strict=True):
+    path = files.suite_path(settings.suite)
+    content = files.read_yaml(path)
+    for entry, cell, chosen in zip(content["cells"], suite.cells, wanted, strict=True):
         entry["digest"] = cell.digest
-        if about.episodes:
-            entry["episodes"] = list(about.episodes)
+        if chosen.episodes:
+            entry["episodes"] = list(chosen.episodes)
     _replace(path, _comment(path) + to_yaml(content))
     return suite
 
@@ -92,7 +119,7 @@ def _renew(settings: SuiteConfig) -> Suite:
 def _replace(path: Path, text: str) -> None:
     """Puts a text in the place of a file's, whole or not at all."""
     try:
-        with policy_file.replacing(path) as temporary:
+        with replacing(path) as temporary:
             temporary.write_text(text)
     except OSError as error:
         raise ConfigError(f"{path} cannot be written: {error.strerror or error}.") from None
@@ -132,7 +159,7 @@ def to_yaml(content: dict[str, Any]) -> str:
     """Writes a suite's file: a line for each key, lists of numbers wrapped.
 
     Args:
-        content: Plain data, as `compose.read_yaml` gives it.
+        content: Plain data, as `files.read_yaml` gives it.
 
     Returns:
         The text.

@@ -10,14 +10,13 @@ from pathlib import Path
 
 import jax
 
-from swarmjax import command, config
-from swarmjax.config import TrainConfig
+from swarmjax import command
 from swarmjax.run import compile_cache, memory
 from swarmjax.run.checkpoint import CheckpointError
 from swarmjax.run.display import Display
 from swarmjax.run.lifecycle import carry_out, dry_run, find_run
 from swarmjax.run.policy_export import POLICY, seed_path
-from swarmjax.run.settings import read_config
+from swarmjax.run.settings import TrainConfig, load_resume, load_train, read_config
 from swarmjax.run.trainer import Stop, Tally, TrainingError, measure
 
 FAILED = 1
@@ -61,8 +60,8 @@ def _settings(arguments: Sequence[str]) -> tuple[TrainConfig, bool]:
     resumed = given.get("resume", "null").strip("'\"")
     if resumed in ("", "null"):
         auto = given.get("arenas", "").strip("'\"") == memory.AUTO
-        return config.load_train(arguments, auto=auto), auto
-    settings = config.load_resume(read_config(Path(resumed)), arguments)
+        return load_train(arguments, auto=auto), auto
+    settings = load_resume(read_config(Path(resumed)), arguments)
     kept = given.get("run.dir", "null") in ("", "null") or settings.run.dir is None
     directory = settings.resume if kept else settings.run.dir
     return replace(settings, run=replace(settings.run, dir=directory)), False

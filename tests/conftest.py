@@ -13,16 +13,14 @@ import hypothesis
 import jax
 import pytest
 
-from swarmjax.config import (
-    AlgoConfig,
-    RewardConfig,
-    SimConfig,
-    StageConfig,
-    TaskConfig,
-    TrainConfig,
-)
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.run.settings import TrainConfig
+from swarmjax.sim.config import SimConfig
 from swarmjax.task import env
+from swarmjax.task.config import RewardConfig, TaskConfig
 from swarmjax.task.env import EnvState, TimeStep, World
+from swarmjax.task.stage_config import StageConfig
+from swarmjax.training import program as programs
 
 ArenaStep = Callable[[EnvState, jax.Array], tuple[EnvState, TimeStep]]
 
@@ -69,7 +67,7 @@ def tiny_config() -> TrainConfig:
 
 @pytest.fixture(scope="session")
 def tiny_world(tiny_config: TrainConfig) -> World:
-    return env.load(tiny_config)
+    return programs.load_world(tiny_config)
 
 
 @pytest.fixture(scope="session")

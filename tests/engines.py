@@ -9,10 +9,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from swarmjax.config import RobotConfig, SimConfig, StageConfig, TrainConfig, substeps
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import drive, model, physics
 from swarmjax.sim.body import AS_BUILT, Chassis
-from swarmjax.task import env
+from swarmjax.sim.config import RobotConfig, SimConfig, physics_substeps
+from swarmjax.task.stage_config import StageConfig
+from swarmjax.training import program as programs
 
 ARENAS, ROBOTS, OBSTACLES = 8, 3, 2
 STEP, RADIUS = 0.032, 0.037  # s, m
@@ -62,10 +64,11 @@ def load(impl: Literal["jax", "warp"], body: BodyName) -> Engine:
 
 def load_as(config: TrainConfig) -> Engine:
     """Compiles; the model is an argument of the step, so that its numbers may change."""
-    loaded = env.load(config).physics
+    loaded = programs.load_world(config).physics
 
     def run(model: Any, data: Any, side: Any, obstacle: Any, wheels: Any, chassis: Any) -> Any:
-        mine = dataclasses.replace(loaded, model=model)
+        engine = dataclasses.replace(loaded.engine, model=model)
+        mine = dataclasses.replace(loaded, engine=engine)
 
         def step(data: Any, now: Any) -> tuple[Any, Any]:
             move = jax.vmap(lambda d, w: physics.step(mine, d, side, obstacle, w, chassis))
@@ -107,7 +110,7 @@ def drive_all(
     wheels = np.broadcast_to(wheels, (count, ARENAS, ROBOTS, 2)).astype(np.float32)
     # Whole chunks, so that one program serves all tests; what is driven beyond is dropped.
     wheels = np.concatenate([wheels, np.repeat(wheels[-1:], -count % CHUNK, axis=0)])
-    model = engine.loaded.model if model is None else model
+    model = engine.loaded.engine.model if model is None else model
     for now in wheels.reshape(-1, CHUNK, ARENAS, ROBOTS, 2):
         arena = (jnp.float32(side), jnp.asarray(obstacle), jnp.asarray(now), chassis)
         data, path = engine.run(model, data, *arena)
@@ -140,7 +143,7 @@ def drive_in_c(
     built: mujoco.MjModel | None = None,
 ) -> Path:
     """One arena [R, 3] by MuJoCo C; wheels [T, R, 2]; the path is [T, 1, R, ...]."""
-    given: Any = built or compile_in_c(robot, obstacle, substeps(robot, None))
+    given: Any = built or compile_in_c(robot, obstacle, physics_substeps(robot, None))
     count = round(STEP / given.opt.timestep)
     data, body = mujoco.MjData(given), model.BODIES[robot.body]
     ids = model.ids(given, model.ArenaSize(ROBOTS, OBSTACLES, BIGGEST_HALF))

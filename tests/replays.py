@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from swarmjax import config
-from swarmjax.config import ReplayConfig
 from swarmjax.evaluate import cells, trials
 from swarmjax.evaluate import judge as evaluate_judge
 from swarmjax.evaluate.judge import Judge
 from swarmjax.replay import record as replay_record
+from swarmjax.replay.config import ReplayConfig
 from swarmjax.replay.record import Episode, Recording, Scene
+from swarmjax.task.stage_files import load_levels
 
 SMALL = ("stage.robots=3", "stage.side=0.9", "stage.obstacles=2")
 
@@ -24,7 +24,7 @@ def judge(settings: ReplayConfig) -> Judge:
 
 def recorded(path: Path, *words: str) -> tuple[Judge, list[Recording]]:
     """Records the levels of a replay with the first policy."""
-    settings = config.load_replay([f"policy={path}", *words])
+    settings = load_levels(ReplayConfig, [f"policy={path}", *words])
     found = judge(settings)
     levels = cells.split(cells.load(settings.evaluation).cells[0].levels)
     return found, replay_record.record(found, [levels[number] for number in settings.levels])

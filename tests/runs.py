@@ -3,8 +3,12 @@
 import json
 from pathlib import Path
 
-from swarmjax import config
-from swarmjax.config import AlgoConfig, SimConfig, StageConfig, TaskConfig, TrainConfig
+from swarmjax.config import to_dict
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.run.settings import TrainConfig
+from swarmjax.sim.config import SimConfig
+from swarmjax.task.config import TaskConfig
+from swarmjax.task.stage_config import StageConfig
 
 CONFIG = TrainConfig(
     stage=(
@@ -46,7 +50,7 @@ def write(
 ) -> Path:
     """Writes a run directory."""
     run.mkdir(parents=True, exist_ok=True)
-    (run / "config.json").write_text(json.dumps(config.to_dict(trained)))
+    (run / "config.json").write_text(json.dumps(to_dict(trained)))
     (run / "metrics.jsonl").write_text("".join(json.dumps(each) + "\n" for each in rows))
     lines = "".join(json.dumps(each) + "\n" for each in decisions or [])
     (run / "curriculum.jsonl").write_text(lines)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from swarmjax.settings import ConfigError
+from swarmjax.config import ConfigError
 
 
 def refusal(function, *arguments) -> str:

@@ -56,7 +56,7 @@ def test_policy_and_evaluate_run_without_jax(tmp_path: Path) -> None:
     code = (
         "import sys, runpy\n"
         "sys.modules['mujoco.mjx'] = None\n"
-        "import swarmjax.policy, swarmjax.policy_file, swarmjax.statistics\n"
+        "import swarmjax.policy, swarmjax.policy_file, swarmjax.evaluate.statistics\n"
         f"sys.argv = ['evaluate', *{words}, 'out=result.json']\n"
         "runpy.run_module('swarmjax.evaluate', run_name='__main__', alter_sys=True)\n"
     )

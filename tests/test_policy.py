@@ -18,10 +18,11 @@ import pytest
 from policies import Arrays, saved, several
 
 from swarmjax import policy
-from swarmjax.config import AlgoConfig, RobotConfig
 from swarmjax.policy import Policy, PolicyError
 from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.sim import drive
+from swarmjax.sim.config import RobotConfig
 from swarmjax.task import observation
 
 SIZE, ACTIONS = observation.SIZE, 2

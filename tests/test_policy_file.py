@@ -15,9 +15,10 @@ import pytest
 from policies import Arrays, forge, saved, several
 
 from swarmjax import command, policy, policy_file
-from swarmjax.config import EvaluateConfig, ExportConfig
 from swarmjax.evaluate import __main__ as evaluate_command
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.export import __main__ as export
+from swarmjax.export.config import ExportConfig
 from swarmjax.policy import MAX_BYTES, PolicyError
 
 

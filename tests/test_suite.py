@@ -9,11 +9,14 @@ import pytest
 import steering
 import yaml
 
-from swarmjax import command, compose, config, suite
-from swarmjax.config import StageConfig, SuiteConfig
+from swarmjax import command, suite
+from swarmjax.config import files
 from swarmjax.evaluate import cells
 from swarmjax.evaluate.cells import Cell
+from swarmjax.evaluate.suite_config import read_suite
 from swarmjax.evaluate.trials import Trial
+from swarmjax.suite import SuiteConfig
+from swarmjax.task.stage_config import StageConfig
 
 TEXT = """# What it is,
 # in two lines.
@@ -90,7 +93,7 @@ def test_chosen_levels_are_written_with_their_numbers(
     policy = steering.write(tmp_path / "policy.npz")
     words = (f"suite={file}", f"policies={policy}", "pool=6", "steps=60", "workers=1")
     assert _command(monkeypatch, *words, "write=true") == 0
-    found = config.read_suite(str(file)).cells
+    found = read_suite(str(file)).cells
     for cell, count in zip(found, (2, 3), strict=True):
         assert len(cell.episodes) == count
         assert set(cell.episodes) < set(range(6))
@@ -133,7 +136,7 @@ def test_words_that_yaml_reads_otherwise_are_quoted(tmp_path: Path, word: str) -
     content = {"name": word, "cells": [{"name": word, "stage": {"name": word, "robots": 1}}]}
     path = tmp_path / "x.yaml"
     path.write_text(suite.to_yaml(content))
-    assert yaml.safe_load(path.read_text()) == compose.read_yaml(path) == content
+    assert yaml.safe_load(path.read_text()) == files.read_yaml(path) == content
     assert (f'"{word}"' in path.read_text()) == (word not in ("real", "a-b_c", "y"))
 
 
@@ -153,7 +156,7 @@ def test_a_written_suite_reads_back(tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     path.write_text(suite.to_yaml(content))
     assert max(map(len, path.read_text().splitlines())) <= 100
-    assert compose.read_yaml(path) == content
+    assert files.read_yaml(path) == content
 
 
 @pytest.mark.parametrize(

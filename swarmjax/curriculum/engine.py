@@ -18,10 +18,11 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from swarmjax.config import CurriculumConfig, TrainConfig
+from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.task import stage as task_stage
+from swarmjax.task.episode import Ended
 from swarmjax.task.stage import Stage
-from swarmjax.training.rollout import Ended
+from swarmjax.task.stage_config import StageConfig
 
 STAYED, BY_THRESHOLD, BY_BUDGET, BY_DEMOTION, REWEIGHED = range(5)
 REASONS = ("stayed", "threshold", "budget", "demotion", "reweighed")
@@ -193,24 +194,40 @@ class Decision(NamedTuple):
 Mode = Callable[[Curriculum, Schedule, CurriculumConfig, Verdict, Array], Choice]
 
 
-def schedule(config: TrainConfig) -> Schedule:
+def schedule(
+    stages: Sequence[StageConfig],
+    options: CurriculumConfig,
+    *,
+    updates: int,
+    step_limit: int,
+    rollout: int,
+) -> Schedule:
     """Works the curriculum's numbers out.
 
-    The stages before the last share `curriculum.budget_share` of the updates in equal parts.
+    The stages before the last share `budget_share` of the updates in equal parts.
+
+    Args:
+      stages: S, in order.
+      options: what the config says of the curriculum.
+      updates: of the whole run.
+      step_limit: control steps of an episode, at most.
+      rollout: control steps of an update.
+
+    Returns:
+      The numbers, an argument of the compiled program.
     """
-    stages, options = len(config.stage), config.curriculum
-    deadline = [NEVER] * stages
+    deadline = [NEVER] * len(stages)
     if options.budget_share is not None:
-        share = options.budget_share * config.updates / max(stages - 1, 1)
-        deadline[:-1] = [math.ceil(share * (i + 1)) for i in range(stages - 1)]
+        share = options.budget_share * updates / max(len(stages) - 1, 1)
+        deadline[:-1] = [math.ceil(share * (i + 1)) for i in range(len(stages) - 1)]
     return Schedule(
-        stages=task_stage.stack(config.stage),
+        stages=task_stage.stack(stages),
         deadline=np.array(deadline, np.int32),
         threshold=_number(options.threshold, math.nan),
         demotion=_number(options.demotion, -1.0),
         earlier_share=_number(options.earlier_share, math.nan),
         floor=_number(options.floor, math.nan),
-        cohort_updates=np.int32(math.ceil(config.task.step_limit / config.algo.rollout)),
+        cohort_updates=np.int32(math.ceil(step_limit / rollout)),
     )
 
 
@@ -427,45 +444,4 @@ def _settle(curriculum: Curriculum, schedule: Schedule, choice: Choice) -> Curri
         stage=choice.stage,
         weights=choice.weights,
         met=jnp.maximum(curriculum.met, jnp.max(robots)),
-    )
-
-
-def log(rows: Sequence[dict], names: Sequence[str], seed: int) -> list[dict]:
-    """Turns rows of metrics into the decision log.
-
-    Args:
-      rows: metrics of one update of one seed each, as `loop.update` names them; lists by stage.
-      names: of the stages.
-      seed: what the entries say of it.
-
-    Returns:
-      One entry a decision: `update`, `seed` and `why`; for a promotion or demotion `from`, `to`
-      and what was measured on the stage that was left (`targets_reached`, `all_reached`,
-      `episodes`), for new weights `weights` and `success`, by stage.
-    """
-    return [
-        {"update": row["update"], "seed": seed, **_entry(row, names)}
-        for row in rows
-        if row["decision"] != STAYED
-    ]
-
-
-def _entry(row: dict, names: Sequence[str]) -> dict:
-    """Says what was decided in an update, and by which figures."""
-    why = {"why": REASONS[row["decision"]]}
-    if row["decision"] == REWEIGHED:
-        weights, success = row["weights"], row["estimate_by_stage"]
-        return why | {
-            "weights": dict(zip(names, weights, strict=True)),
-            "success": dict(zip(names, success, strict=True)),
-        }
-    left = row["decided_stage"]
-    return (
-        {"from": names[left], "to": names[row["next_stage"]]}
-        | why
-        | {
-            "targets_reached": row["success_by_stage"][left],
-            "all_reached": row["complete_by_stage"][left],
-            "episodes": row["episodes_by_stage"][left],
-        }
     )

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from swarmjax.config import CurriculumConfig
+from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.curriculum.engine import (
     BY_BUDGET,
     BY_DEMOTION,

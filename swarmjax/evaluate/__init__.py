@@ -1,1 +1,6 @@
-"""Judges policies on levels that they never saw."""
+"""Policies judged on levels that they never saw, by another engine than the one that trains.
+
+Imports `task`, `sim` and policy files, and no JAX: only `engine_mjx.py`, which judges on the
+device, takes `training` and `ppo` too. `cells.py` says which levels, `trials.py` runs the episodes,
+`measures.py` and `statistics.py` say what came of them. Start with `evaluation.evaluate`.
+"""

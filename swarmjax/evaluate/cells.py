@@ -13,14 +13,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from swarmjax import config as settings
-from swarmjax import epuck, policy, policy_file
-from swarmjax.config import CellConfig, ConfigError, EvaluateConfig, Shape, StageConfig, TaskConfig
+from swarmjax import epuck, policy
+from swarmjax.atomic_file import replacing
+from swarmjax.config import ConfigError, build, show, to_dict
 from swarmjax.evaluate import judge
-from swarmjax.settings import build, show, to_dict
+from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.evaluate.suite_config import CellConfig, read_suite
 from swarmjax.task import level, shapes
 from swarmjax.task import stage as task_stage
+from swarmjax.task.config import TaskConfig
 from swarmjax.task.level import Level
+from swarmjax.task.shapes import Shape
+from swarmjax.task.stage_config import StageConfig
 
 FORMAT = 1
 _TARGET_RADIUS = TaskConfig().target_radius
@@ -101,7 +105,7 @@ def stages(config: EvaluateConfig) -> list[StageConfig]:
         return [config.stage]
     if Path(config.suite).suffix == ".npz":
         return []
-    return [cell.stage for cell in settings.read_suite(config.suite).cells]
+    return [cell.stage for cell in read_suite(config.suite).cells]
 
 
 def draw(choice: str) -> Suite:
@@ -116,7 +120,7 @@ def draw(choice: str) -> Suite:
     Raises:
         ConfigError: If the file is unsound, or a digest is missing or off.
     """
-    file = settings.read_suite(choice)
+    file = read_suite(choice)
     found = []
     for each in file.cells:
         if each.digest is None:
@@ -206,7 +210,7 @@ def write(path: Path, suite: Suite) -> None:
     ]
     meta = json.dumps({"format": FORMAT, "suite": suite.name, "cells": about})
     try:
-        with policy_file.replacing(path) as temporary, temporary.open("wb") as file:
+        with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **{"meta": np.array(meta), **arrays})
     except OSError as error:
         raise ConfigError(f"{path} cannot be written: {error.strerror or error}.") from None

@@ -19,25 +19,22 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from swarmjax.config import (
-    AlgoConfig,
-    ConfigError,
-    EvaluateConfig,
-    SimConfig,
-    StageConfig,
-    TrainConfig,
-)
+from swarmjax.config import ConfigError
 from swarmjax.evaluate import judge, measures
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.measures import Outcome
 from swarmjax.policy import Policy
 from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.sim import noise, physics
+from swarmjax.sim.config import SimConfig
 from swarmjax.sim.noise import Stream
 from swarmjax.task import electronics, env, level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
 from swarmjax.task.level import Level, Spacing
+from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import rollout
 
 LARGEST_BOX = 0.3  # m; the largest that a stage takes
@@ -127,22 +124,10 @@ def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
       ConfigError: if a box is larger than the engine may be compiled for.
     """
     stage = config.stage if config.stage.level == "fixed" else _largest(config.stage, half)
-    return env.load(
-        TrainConfig(
-            stage=(stage,),
-            robot=config.robot,
-            task=config.task,
-            realism=config.realism,
-            algo=AlgoConfig(rollout=1, minibatches=1),
-            sim=SimConfig(
-                max_robots=stage.robots,
-                max_obstacles=len(half),
-                substeps=judge.substeps(config),
-            ),
-            arenas=arenas,
-            budget=arenas,
-        )
+    sim = SimConfig(
+        max_robots=stage.robots, max_obstacles=len(half), substeps=judge.substeps(config)
     )
+    return env.load((stage,), config.robot, config.task, config.realism, sim, arenas=arenas)
 
 
 def _largest(stage: StageConfig, half: np.ndarray) -> StageConfig:
@@ -204,11 +189,11 @@ def _program(
     sampled: bool,
 ) -> Callable[[Any, ArrayLike, Level], tuple[dict[str, Array], Array]]:
     """The compiled program of policies that differ in their weights alone."""
-    config, (speed, turn_rate) = world.config, limits
+    speed, turn_rate = limits
     mine = replace(
         world,
         drive=world.drive._replace(max_speed=speed, max_turn_rate=turn_rate),
-        electronics=electronics.load(config.task, config.realism, encoding),
+        electronics=electronics.load(world.task, world.realism, encoding),
     )
 
     def play(weights: Any, log_std: Array, levels: Level) -> tuple[dict[str, Array], Array]:
@@ -248,16 +233,19 @@ def _dense(x: Array, layer: tuple[ArrayLike, ArrayLike], robots: slice) -> Array
     return jnp.einsum("eri,rio->ero", x, kernel, precision=jax.lax.Precision.HIGHEST) + bias
 
 
-def outcomes(world: World, learners: LearnerState, levels: Level, steps: int) -> Outcomes:
+def outcomes(
+    world: World, config: AlgoConfig, learners: LearnerState, levels: Level, steps: int
+) -> Outcomes:
     """Runs an episode of each level, every robot driven by the mean of its policy.
 
-    Pure: `jit` it with `world` and `steps` bound, and `vmap` it over the seeds of `learners`. With
-    `impl=warp` the world must be loaded for as many arenas as are judged together (E, or E for
-    every seed), since that is what MJX-Warp's memory of contacts is sized for. Its
+    Pure: `jit` it with `world`, `config` and `steps` bound, and `vmap` it over the seeds of
+    `learners`. With `impl=warp` the world must be loaded for as many arenas as are judged together
+    (E, or E for every seed), since that is what MJX-Warp's memory of contacts is sized for. Its
     `task.step_limit` is not read.
 
     Args:
       world: the compiled environment.
+      config: that made the learners.
       learners: [L].
       levels: [E].
       steps: control steps of an episode, at least 1.
@@ -266,14 +254,14 @@ def outcomes(world: World, learners: LearnerState, levels: Level, steps: int) ->
       [E] what they came to. An episode whose physics breaks ends there, its robots where they
       were.
     """
-    arenas, _, broken = _run(world, partial(_mode, world, learners), levels, steps)
-    return _sum_up(arenas, broken, world.config.task.control_step)
+    arenas, _, broken = _run(world, partial(_mode, config, learners), levels, steps)
+    return _sum_up(arenas, broken, world.task.control_step)
 
 
-def _mode(world: World, learners: LearnerState, arenas: EnvState) -> Array:
+def _mode(config: AlgoConfig, learners: LearnerState, arenas: EnvState) -> Array:
     """The learners' most likely actions [E, R, U]."""
     seen = rollout.to_learners(arenas.observation, len(jax.tree.leaves(learners)[0]))
-    action = jax.vmap(partial(ppo.mode, config=world.config.algo))(learners, observation=seen)
+    action = jax.vmap(partial(ppo.mode, config=config))(learners, observation=seen)
     return rollout.to_arenas(action)
 
 
@@ -295,8 +283,7 @@ def _run(
     chex.assert_shape(levels.present, (None, robots))
     chex.assert_shape(levels.obstacle, (len(levels.side), obstacles, 5))
     levels = jax.tree.map(jnp.asarray, levels)
-    zero = jnp.zeros((), jnp.int32)
-    arenas = jax.vmap(lambda each: env.reset(world, each, zero, zero))(levels)
+    arenas = jax.vmap(lambda each: env.reset(world, each))(levels)
     unpack = partial(physics.unpack, world.physics)
     arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
     none = jnp.zeros(levels.present.shape, jnp.int32)

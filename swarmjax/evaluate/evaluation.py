@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 
 from rich.progress import Progress
 
-from swarmjax.config import ConfigError, EvaluateConfig
+from swarmjax.config import ConfigError, show
 from swarmjax.evaluate import cells, judge, summary
 from swarmjax.evaluate import trials as evaluate_run
 from swarmjax.evaluate.cells import Suite
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.trials import Entrant, Trial
-from swarmjax.settings import show
 
 
 class Evaluation(NamedTuple):

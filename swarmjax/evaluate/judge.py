@@ -6,18 +6,19 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from swarmjax import config as settings
-from swarmjax.config import EvaluateConfig, StageConfig
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.rays import Scene
 from swarmjax.policy import Policy, PolicyError
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps
 from swarmjax.sim import model as sim_model
+from swarmjax.sim.config import physics_substeps
 from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors as task_factors
 from swarmjax.task import level, observation, shapes
 from swarmjax.task import stage as task_stage
 from swarmjax.task.electronics import Electronics
+from swarmjax.task.stage_config import StageConfig
 
 SOLVER_ITERATIONS = 100  # MuJoCo's own default: until its tolerance of 1e-8 is met
 
@@ -109,7 +110,7 @@ def substeps(config: EvaluateConfig) -> int:
     ones, separate surfaces that slide: by 1.3 mm in steps of 16 ms, by 0.8 mm from 8 ms down.
     """
     finer = 2 if config.robot.body == "wheeled" and config.substeps is None else 1
-    return finer * settings.substeps(config.robot, config.substeps)
+    return finer * physics_substeps(config.robot, config.substeps)
 
 
 def _compile(config: EvaluateConfig, half: np.ndarray) -> tuple[mujoco.MjModel, sim_model.Ids]:

@@ -1,4 +1,4 @@
-"""Point estimates, their intervals, and learning curves in a number each: NumPy only.
+"""Point estimates and their intervals, with NumPy alone (of learning curves: `curves.py`).
 
 What evaluation, benchmarks and studies report is worked out here, after Agarwal et al. 2021, "Deep
 Reinforcement Learning at the Edge of the Statistical Precipice": interquartile means (section 4.3)
@@ -177,7 +177,7 @@ def bootstrap(
     Raises:
       ValueError: If any of these is refused, or the statistic gives nan or another shape.
     """
-    table = _table("values", values, draw)
+    table = checked_table("values", values, draw)
     _check_resampling(confidence, resamples)
     _check_strata(strata, table.shape[1])
     draws = _distributions((table,), statistic, draw, resamples, seed, strata)[0]
@@ -216,7 +216,7 @@ def paired(
     Raises:
       ValueError: As of `bootstrap`, and if the shapes differ or a value is inf.
     """
-    before, after = _table("a", a, draw), _table("b", b, draw)
+    before, after = checked_table("a", a, draw), checked_table("b", b, draw)
     if before.shape != after.shape:
         raise ValueError(f"a is {before.shape} and b is {after.shape}: pairs take equal shapes.")
     for name, table in (("a", before), ("b", after)):
@@ -265,7 +265,7 @@ def probability_of_improvement(
     """
     if draw not in ("runs_per_task", "runs", "tasks", "runs_and_tasks"):
         raise ValueError(f"draw is '{draw}': give runs_per_task, runs, tasks or runs_and_tasks.")
-    ours, theirs = _table("a", a, draw), _table("b", b, draw)
+    ours, theirs = checked_table("a", a, draw), checked_table("b", b, draw)
     if ours.shape[1] != theirs.shape[1]:
         raise ValueError(f"a has {ours.shape[1]} tasks and b has {theirs.shape[1]}: give the same.")
     _check_resampling(confidence, resamples)
@@ -282,94 +282,7 @@ def probability_of_improvement(
     return _interval(float(wins.mean()), np.concatenate(draws), confidence)
 
 
-def curve(
-    values: ArrayLike,
-    statistic: Statistic = iqm,
-    *,
-    confidence: float = 0.95,
-    resamples: int = 2000,
-    seed: int = 0,
-) -> Interval[np.ndarray]:
-    """Interval of a statistic over runs at each point of their curves.
-
-    All points share their draws, so that runs are drawn with their whole curves. The band holds
-    at each point by itself, not at all of them at once.
-
-    Args:
-      values: [runs, points] of any unit, at least three runs.
-      statistic: as of `bootstrap`, called on [..., runs, 1].
-      confidence: as of `bootstrap`.
-      resamples: as of `bootstrap`.
-      seed: of the draws.
-
-    Returns:
-      Estimates and intervals [points].
-
-    Raises:
-      ValueError: As of `bootstrap`.
-    """
-    columns = _table("values", values, "runs").T[..., None]
-    found = [
-        bootstrap(
-            column,
-            statistic,
-            draw="runs",
-            confidence=confidence,
-            resamples=resamples,
-            seed=seed,
-        )
-        for column in columns
-    ]
-    return Interval(*np.array(found).T)
-
-
-def area_under(steps: ArrayLike, values: ArrayLike) -> np.ndarray:
-    """Mean height of learning curves: the area under them by trapezoids, by the span of the steps.
-
-    Args:
-      steps: [points] at which the curves are known, rising.
-      values: [..., points] of any unit, finite.
-
-    Returns:
-      [...] in the unit of values.
-
-    Raises:
-      ValueError: If there are fewer than two points, steps do not rise, or a number is not finite.
-    """
-    at, curves = _curves(steps, values)
-    return np.asarray(np.trapezoid(curves, at, axis=-1) / (at[-1] - at[0]))
-
-
-def steps_to(steps: ArrayLike, values: ArrayLike, threshold: float) -> np.ndarray:
-    """Steps until learning curves first reach a threshold, whether they stay there or not.
-
-    Curves are straight between their points. One that scatters touches a threshold early: let
-    its values be means over episodes enough.
-
-    Args:
-      steps: [points] at which the curves are known, rising.
-      values: [..., points] of any unit, finite.
-      threshold: to reach from below, in the same unit.
-
-    Returns:
-      [...] in the unit of steps: the first one if a curve begins there, inf if it never does.
-      `iqm`, `np.median` and `probability_of_improvement` take these as they are.
-
-    Raises:
-      ValueError: If there are fewer than two points, steps do not rise, or a number is not finite.
-    """
-    if not math.isfinite(threshold):
-        raise ValueError(f"threshold is {threshold}: give a finite number.")
-    at, curves = _curves(steps, values)
-    reached = curves >= threshold
-    after = reached.argmax(axis=-1)
-    before = np.maximum(after - 1, 0)
-    low, high = (np.take_along_axis(curves, i[..., None], -1)[..., 0] for i in (before, after))
-    share = (threshold - low) / np.where(high > low, high - low, 1.0)
-    return np.where(reached.any(axis=-1), at[before] + share * (at[after] - at[before]), np.inf)
-
-
-def _numbers(name: str, x: ArrayLike) -> np.ndarray:
+def checked(name: str, x: ArrayLike) -> np.ndarray:
     """Takes numbers in double precision; refuses none at all, nan and -inf."""
     values = np.asarray(x, np.float64)
     if not values.size:
@@ -383,7 +296,7 @@ def _numbers(name: str, x: ArrayLike) -> np.ndarray:
 
 def _flat(x: ArrayLike, axis: int | tuple[int, ...] | None) -> np.ndarray:
     """Takes numbers, with the axes that are to be reduced as the last one."""
-    values = _numbers("x", x)
+    values = checked("x", x)
     if axis is None:
         return values.ravel()
     axes = np.lib.array_utils.normalize_axis_tuple(axis, values.ndim)
@@ -391,11 +304,11 @@ def _flat(x: ArrayLike, axis: int | tuple[int, ...] | None) -> np.ndarray:
     return moved.reshape(*moved.shape[: values.ndim - len(axes)], -1)
 
 
-def _table(name: str, x: ArrayLike, draw: str) -> np.ndarray:
+def checked_table(name: str, x: ArrayLike, draw: str) -> np.ndarray:
     """Takes numbers [runs, tasks]; refuses too few of what is to be drawn."""
     if draw not in _DRAWS:
         raise ValueError(f"draw is '{draw}': give one of {', '.join(_DRAWS)}.")
-    values = _numbers(name, x)
+    values = checked(name, x)
     if values.ndim != 2:
         raise ValueError(f"{name} has shape {values.shape}: give [runs, tasks].")
     for what, how, count in zip(("runs", "tasks"), _DRAWS[draw], values.shape, strict=True):
@@ -404,19 +317,6 @@ def _table(name: str, x: ArrayLike, draw: str) -> np.ndarray:
                 f"{name} has {count} {what}: an interval over {what} takes {LEAST_DRAWN} or more."
             )
     return values
-
-
-def _curves(steps: ArrayLike, values: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Takes the points of curves; refuses what does not fit together or is not finite."""
-    at, curves = _numbers("steps", steps), _numbers("values", values)
-    if at.ndim != 1 or len(at) < 2 or not (np.diff(at) > 0).all():
-        raise ValueError(f"steps of shape {at.shape} must be two or more numbers that rise.")
-    if curves.shape[-1:] != at.shape:
-        raise ValueError(f"values has shape {curves.shape}: give [..., {len(at)}], as steps has.")
-    for name, numbers in (("steps", at), ("values", curves)):
-        if np.isinf(numbers).any():
-            raise ValueError(f"{name} holds inf: the points of a curve are finite.")
-    return at, curves
 
 
 def _check_resampling(confidence: float, resamples: int) -> None:

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from swarmjax import provenance
-from swarmjax.config import EvaluateConfig
+from swarmjax.config import to_dict
 from swarmjax.evaluate import judge, statistics
 from swarmjax.evaluate.cells import Cell
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.measures import MEASURES, Measure
 from swarmjax.evaluate.statistics import LEAST_DRAWN, Interval, SharedDraw, Statistic
 from swarmjax.evaluate.trials import Entrant, Trial, specialise
-from swarmjax.settings import to_dict
 
 WORST = 0.05  # share of the levels that CVaR is the mean of
 Found = Mapping[str, np.ndarray]

@@ -10,14 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarmjax import compose, policy_file, provenance
-from swarmjax.config import EvaluateConfig, RealismConfig
+from swarmjax import policy_file, provenance
+from swarmjax.config import build, files
 from swarmjax.evaluate import engine_c, measures, shortest_path
 from swarmjax.evaluate import judge as evaluate_judge
 from swarmjax.evaluate.cells import Cell, split
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.measures import Outcome
 from swarmjax.policy import Policy
-from swarmjax.settings import build
+from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.level import Level
 
 BATCH = 64  # arenas that share NumPy's cost per call; more gain little
@@ -107,7 +108,7 @@ def specialise(config: EvaluateConfig, cell: Cell, path: str | None = None) -> E
     """
     realism = config.realism
     if cell.realism is not None:
-        realism = build(RealismConfig, compose.read_preset("realism", cell.realism))
+        realism = build(RealismConfig, files.read_preset("realism", cell.realism))
     return replace(
         config,
         policy=path or config.policy,

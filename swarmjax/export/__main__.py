@@ -12,15 +12,15 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from swarmjax import command, config, policy_file
-from swarmjax.config import ConfigError, ExportConfig, TrainConfig
+from swarmjax import command, policy_file
+from swarmjax.config import ConfigError, files
 from swarmjax.export import c, onnx, webots
 from swarmjax.export import folder as export_folder
+from swarmjax.export.config import ExportConfig
 from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import CheckpointError
 from swarmjax.run.policy_export import POLICY, seed_path, write_policy
-from swarmjax.run.settings import read_config
-from swarmjax.training import seeds
+from swarmjax.run.settings import TrainConfig, from_stored, read_config
 
 # What each format is called where `out` does not say.
 _NAMES = {"npz": POLICY, "onnx": "policy.onnx", "c": "policy_c", "webots": "swarmjax_epuck"}
@@ -30,14 +30,14 @@ _IMPORTED = sys.stdlib_module_names | {"policy", "controller", "numpy"}
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    settings = config.load_export(arguments)
+    settings = files.load(ExportConfig, arguments)
     if settings.policy is not None:
         out = _target(settings, Path(settings.policy).parent)
         _convert(settings, Path(settings.policy), out)
         sys.stdout.write(f"{out}: the policy of {settings.policy}.\n")
         return 0
     run = Path(settings.run or "")
-    trained = config.build(TrainConfig, read_config(run))
+    trained = from_stored(read_config(run))
     targets = _targets(settings, trained)
     leaves, update, skipped = checkpoint.restore(run, settings.step)
     for sentence in skipped:
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _targets(settings: ExportConfig, trained: TrainConfig) -> dict[int, Path]:
     """Says which seeds are exported, and where to."""
-    every, seed = seeds.numbers(trained), settings.seed
+    every, seed = trained.numbers, settings.seed
     if seed is not None and seed not in every:
         several = f"seeds {every[0]} to {every[-1]}: give one of them."
         has = several if len(every) > 1 else f"seed {every[0]}: give {every[0]}."

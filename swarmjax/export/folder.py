@@ -13,7 +13,7 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
-from swarmjax import policy_file
+from swarmjax.atomic_file import replacing
 from swarmjax.config import ConfigError
 
 MANIFEST = "export.json"
@@ -31,7 +31,7 @@ def write_file(path: Path, content: bytes) -> None:
         ConfigError: if it cannot be written.
     """
     try:
-        with policy_file.replacing(path) as temporary:
+        with replacing(path) as temporary:
             temporary.write_bytes(content)
     except OSError as error:
         raise _unwritable(path, error) from None

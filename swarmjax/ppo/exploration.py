@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 
-from swarmjax.config import AlgoConfig
+from swarmjax.ppo.config import AlgoConfig
 
 
 def levels(config: AlgoConfig) -> tuple[float, ...]:

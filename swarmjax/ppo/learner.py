@@ -1,8 +1,7 @@
 """One PPO learner: its state, how it acts and how it learns.
 
 All functions are pure and serve a single learner; `jax.vmap` over state, batch and key serves L.
-G stands for groups of samples (arenas), N for the samples of a group. Minibatches are of whole
-groups or, by the kernels of `fused`, of whole tiles of valid samples.
+G stands for groups of samples, N for the samples of a group. Minibatches are of whole groups.
 """
 
 import functools
@@ -14,25 +13,19 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jax.flatten_util import ravel_pytree
 
-from swarmjax.config import AlgoConfig
-from swarmjax.ppo import contact_price, exploration, losses, networks, normalizer
-from swarmjax.ppo.fast import blocks as full_batch
-from swarmjax.ppo.fast import fused
-from swarmjax.ppo.fast.valid_first import valid_first
+from swarmjax.ppo import dispatch, exploration, losses, networks, normalizer, optimizer
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.dispatch import Backend
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
 from swarmjax.ppo.normalizer import Normalizer
+from swarmjax.ppo.optimizer import Progress
 
 # Huang et al. 2022, "The 37 Implementation Details of Proximal Policy Optimization":
 # bound of normalised observations, continuous-action detail 7.
 OBSERVATION_LIMIT = 10.0
 _ADVANTAGE_EPSILON = 1e-8
-
-_METRICS = (*fused.METRICS, "grad_norm")  # of a step
-
-_Progress = tuple[Params, optax.OptState]
 
 
 @struct.dataclass(kw_only=True)
@@ -46,14 +39,12 @@ class LearnerState:
             that does not normalise stay 0 and 1.
         explored: [], int32, control steps that the schedule of exploration has counted; None if
             exploration is learned.
-        price: Of contacts with other robots; None without a limit on them.
     """
 
     params: Params
     optimizer_state: optax.OptState
     normalizer: Normalizer
     explored: jax.Array | None = None
-    price: contact_price.Price | None = None
 
 
 @struct.dataclass(kw_only=True)
@@ -96,10 +87,9 @@ def init(
     params = networks.init_params(key, config, observation_size, action_size)
     return LearnerState(
         params=params,
-        optimizer_state=_optimizer(config, updates).init(params),
+        optimizer_state=optimizer.make(config, updates).init(params),
         normalizer=normalizer.init(observation_size),
         explored=jnp.zeros((), jnp.int32) if config.exploration == "scheduled" else None,
-        price=None if config.contact_limit is None else contact_price.init(),
     )
 
 
@@ -181,15 +171,19 @@ def values(learner: LearnerState, config: AlgoConfig, observation: jax.Array) ->
 
 
 def update(
-    learner: LearnerState, config: AlgoConfig, batch: Batch, key: jax.Array, updates: int
+    learner: LearnerState,
+    config: AlgoConfig,
+    batch: Batch,
+    key: jax.Array,
+    updates: int,
+    backend: Backend = "autodiff",
 ) -> tuple[LearnerState, Metrics]:
     """Learns from one batch: `config.epochs` passes in `config.minibatches` steps each.
 
     The batch's observations were normalised, and its log densities computed, by the normalizer as
     it is before this update. All epochs keep to that one, so that the ratio of new to old density
-    starts at 1; only then does the normalizer take in the batch. By the kernels of `fused`, there
-    may be fewer tiles of valid samples than minibatches. A minibatch without a
-    valid sample is no step: it moves neither the parameters nor the learning rate's schedule.
+    starts at 1; only then does the normalizer take in the batch. A minibatch without a valid sample
+    is no step: it moves neither the parameters nor the learning rate's schedule.
 
     Args:
         learner: State before.
@@ -197,6 +191,7 @@ def update(
         batch: G groups of N samples; `config.minibatches` divides G.
         key: Random key, consumed.
         updates: As given to `init`.
+        backend: How the update is computed; `dispatch.resolve` chooses.
 
     Returns:
         The state after, and metrics, each []: those of `losses.ppo_loss` and `grad_norm` (before
@@ -205,16 +200,8 @@ def update(
     _check(config, batch)
     samples = _samples(learner, config, batch)
     begun = (learner.params, learner.optimizer_state)
-    sizes = batch.observation.shape[-1], batch.action.shape[-1]
-    if fused.resolve(config, *sizes) == "fused":
-        progress, metrics = _learn_in_tiles(config, updates, begun, samples, key)
-        params, optimizer_state = progress
-    elif config.minibatches == 1 and jax.default_backend() == "cpu":
-        # Where a step takes the whole batch, no order matters; an accelerator has it all at once.
-        learn = full_batch.in_turn(functools.partial(_learn_in_blocks, config, updates))
-        (params, optimizer_state), metrics = learn(begun, samples)
-    else:
-        (params, optimizer_state), metrics = _learn(config, updates, begun, samples, key)
+    learn = dispatch.find(backend) or _learn
+    (params, optimizer_state), metrics = learn(config, updates, begun, samples, key)
     metrics = {name: jnp.mean(metric) for name, metric in metrics.items()}
     metrics["std"] = jnp.mean(jnp.exp(params["actor"]["log_std"]))
     moments = learner.normalizer
@@ -222,26 +209,6 @@ def update(
         moments = normalizer.update(moments, batch.observation, batch.valid)
     learned = replace(learner, params=params, optimizer_state=optimizer_state, normalizer=moments)
     return learned, metrics
-
-
-def _optimizer(config: AlgoConfig, updates: int) -> optax.GradientTransformation:
-    """One clip over all gradients, if any, then Adam with a learning rate for each network."""
-    steps = updates * config.epochs * config.minibatches
-
-    def adam(learning_rate: float) -> optax.GradientTransformation:
-        schedule = {
-            "constant": optax.constant_schedule(learning_rate),
-            "linear": optax.linear_schedule(learning_rate, 0.0, steps),
-        }[config.learning_rate_schedule]
-        return optax.adam(schedule, eps=config.adam_epsilon)
-
-    adams = optax.partition(
-        {"actor": adam(config.actor_learning_rate), "critic": adam(config.critic_learning_rate)},
-        {"actor": "actor", "critic": "critic"},
-    )
-    if config.max_grad_norm is None:
-        return adams
-    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adams)
 
 
 def _check(config: AlgoConfig, batch: Batch) -> None:
@@ -280,8 +247,8 @@ def _normalize_advantages(advantage: jax.Array, valid: jax.Array) -> jax.Array:
 
 
 def _learn(
-    config: AlgoConfig, updates: int, begun: _Progress, samples: Minibatch, key: jax.Array
-) -> tuple[_Progress, Metrics]:
+    config: AlgoConfig, updates: int, begun: Progress, samples: Minibatch, key: jax.Array
+) -> tuple[Progress, Metrics]:
     """All epochs, in minibatches; the metrics of each are [epochs, minibatches]."""
     expected_valid = jnp.sum(samples.valid) / config.minibatches
     step = functools.partial(_step, config, updates, expected_valid)
@@ -289,75 +256,18 @@ def _learn(
     return jax.lax.scan(epoch, begun, jax.random.split(key, config.epochs))
 
 
-def _learn_in_blocks(
-    config: AlgoConfig, updates: int, begun: _Progress, samples: Minibatch
-) -> tuple[_Progress, Metrics]:
-    """All epochs, each one step on all samples; the metrics of each are [epochs]."""
-    blocks, count = full_batch.arrange(samples), jnp.sum(samples.valid)
-
-    def epoch(progress: _Progress, _: None) -> tuple[_Progress, Metrics]:
-        found = full_batch.gradient(progress[0], blocks, config, count)
-        return _take(config, updates, progress, found, count > 0)
-
-    return jax.lax.scan(epoch, begun, length=config.epochs)
-
-
-def _learn_in_tiles(
-    config: AlgoConfig, updates: int, begun: _Progress, samples: Minibatch, key: jax.Array
-) -> tuple[_Progress, Metrics]:
-    """All epochs, in minibatches of tiles of valid samples; the metrics of each are [steps].
-
-    Networks and what the optimiser has of them are one vector each on the way: of a minibatch's
-    kernels most would otherwise add up, compare and move one of two dozen small arrays.
-    """
-    params, state = begun
-    flat_state = _flat_state(config, updates, *begun)
-    layouts, arranged = fused.layouts(params), valid_first(samples)
-    valid = jnp.sum(arranged.valid, dtype=jnp.int32)
-    arranged = replace(arranged, valid=arranged.valid.astype(jnp.float32))
-    count, size = arranged.observation.shape
-    launch = fused.choose_launch(config, size, arranged.action.shape[-1], count)
-    keys = jax.random.split(key, config.epochs)
-    dealt = fused.shuffle(keys, count, valid, config.minibatches, launch)
-
-    def step(progress: _Progress, span: jax.Array) -> tuple[_Progress, jax.Array]:
-        tiles = dealt._replace(span=span)
-        gradient, metrics, taken = fused.flat_gradient(
-            progress[0], layouts, arranged, tiles, config, valid / config.minibatches, launch=launch
-        )
-        progress, metrics = _take(config, updates, progress, (gradient, metrics), taken > 0)
-        return progress, jnp.stack([metrics[name] for name in _METRICS])
-
-    (flat, flat_state), rows = jax.lax.scan(step, (fused.flatten(params), flat_state), dealt.span)
-    learned = fused.unflatten(flat, params), _tree_state(flat_state, state)
-    return learned, dict(zip(_METRICS, rows.T, strict=True))
-
-
-def _flat_state(
-    config: AlgoConfig, updates: int, params: Params, state: optax.OptState
-) -> optax.OptState:
-    """The optimiser's state with one vector where there is a tree of each network's parameters."""
-    like = jax.eval_shape(_optimizer(config, updates).init, fused.flatten(params))
-    return jax.tree.map(lambda x, tree: ravel_pytree(tree)[0] if x.ndim else tree, like, state)
-
-
-def _tree_state(flat: optax.OptState, like: optax.OptState) -> optax.OptState:
-    """Undoes `_flat_state`."""
-    return jax.tree.map(lambda x, tree: ravel_pytree(tree)[1](x) if x.ndim else x, flat, like)
-
-
 def _epoch(
     config: AlgoConfig,
-    step: functools.partial[tuple[_Progress, Metrics]],
+    step: functools.partial[tuple[Progress, Metrics]],
     samples: Minibatch,
-    progress: _Progress,
+    progress: Progress,
     key: jax.Array,
-) -> tuple[_Progress, Metrics]:
+) -> tuple[Progress, Metrics]:
     """One pass over all samples. Whole groups are shuffled: rows to gather, not single samples."""
     groups = samples.valid.shape[0]
     order = jax.random.permutation(key, groups).reshape(config.minibatches, -1)
 
-    def learn(progress: _Progress, rows: jax.Array) -> tuple[_Progress, Metrics]:
+    def learn(progress: Progress, rows: jax.Array) -> tuple[Progress, Metrics]:
         minibatch = jax.tree.map(lambda x: x[rows].reshape(-1, *x.shape[2:]), samples)
         return step(progress, minibatch)
 
@@ -368,26 +278,10 @@ def _step(
     config: AlgoConfig,
     updates: int,
     expected_valid: jax.Array,
-    progress: _Progress,
+    progress: Progress,
     minibatch: Minibatch,
-) -> tuple[_Progress, Metrics]:
+) -> tuple[Progress, Metrics]:
     """One step of the optimiser on a minibatch."""
     gradient = jax.grad(losses.ppo_loss, has_aux=True)
     found = gradient(progress[0], minibatch, config, expected_valid)
-    return _take(config, updates, progress, found, jnp.any(minibatch.valid))
-
-
-def _take(
-    config: AlgoConfig,
-    updates: int,
-    progress: _Progress,
-    found: tuple[Params, Metrics],
-    any_valid: jax.Array,
-) -> tuple[_Progress, Metrics]:
-    """Takes a step along a gradient; none at all if no sample is valid."""
-    (params, optimizer_state), (gradient, metrics) = progress, found
-    metrics["grad_norm"] = optax.tree.norm(gradient)
-    steps, stepped_state = _optimizer(config, updates).update(gradient, optimizer_state, params)
-    stepped = (optax.apply_updates(params, steps), stepped_state)
-    # Adam moves by its momentum even where the gradient is zero.
-    return jax.tree.map(lambda new, old: jnp.where(any_valid, new, old), stepped, progress), metrics
+    return optimizer.take(config, updates, progress, found, jnp.any(minibatch.valid))

@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from swarmjax.config import AlgoConfig
 from swarmjax.ppo import networks
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.networks import Params
 
 Metrics = dict[str, jax.Array]

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from swarmjax.config import AlgoConfig
+from swarmjax.ppo.config import AlgoConfig
 
 Params = dict[str, Any]
 

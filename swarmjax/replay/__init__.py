@@ -1,1 +1,5 @@
-"""Episodes as a page or a film."""
+"""Episodes as one HTML page, or as a film.
+
+Imports `evaluate`, whose engine steps them. `record.py` keeps what happened, `pack.py` makes it
+small, `page.py` and `video.py` show it. Start with `__main__.replay`.
+"""

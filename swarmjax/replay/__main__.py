@@ -17,8 +17,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from swarmjax import command, config
-from swarmjax.config import ConfigError, ReplayConfig
+from swarmjax import command
+from swarmjax.config import ConfigError, show
 from swarmjax.evaluate import cells
 from swarmjax.evaluate import judge as evaluate_judge
 from swarmjax.evaluate import trials as evaluate_run
@@ -28,7 +28,9 @@ from swarmjax.export import folder as export_folder
 from swarmjax.replay import page as replay_page
 from swarmjax.replay import record
 from swarmjax.replay import video as replay_video
+from swarmjax.replay.config import ReplayConfig
 from swarmjax.replay.record import Episode
+from swarmjax.task.stage_files import load_levels
 
 
 class Pick(NamedTuple):
@@ -81,7 +83,7 @@ def _cells(settings: ReplayConfig) -> list[Cell]:
     found = [cell for cell in suite.cells if cell.name == settings.cell]
     if not found:
         names = ", ".join(cell.name for cell in suite.cells)
-        raise ConfigError(f"cell is {config.show(settings.cell)}: give one of {names}.")
+        raise ConfigError(f"cell is {show(settings.cell)}: give one of {names}.")
     return found
 
 
@@ -157,7 +159,7 @@ def _record(
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    settings = config.load_replay(arguments)
+    settings = load_levels(ReplayConfig, arguments)
     entrants = evaluate_run.read_policies(settings.policies)
     out, video = Path(settings.out), settings.video and Path(settings.video)
     _check_out(out, [*settings.policies, settings.suite, settings.video])

@@ -8,9 +8,9 @@ from importlib import resources
 from string import Template
 
 from swarmjax import epuck, provenance
-from swarmjax.config import ReplayConfig
 from swarmjax.policy import Policy
 from swarmjax.replay import pack
+from swarmjax.replay.config import ReplayConfig
 from swarmjax.replay.record import Episode
 from swarmjax.sim import gaps
 

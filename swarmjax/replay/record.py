@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarmjax import config
-from swarmjax.config import RewardConfig
+from swarmjax.config import build, show
 from swarmjax.evaluate import engine_c
 from swarmjax.evaluate.engine_c import Arenas, Judge
 from swarmjax.policy import Policy, PolicyError
 from swarmjax.sim import gaps, infrared
 from swarmjax.task import electronics
+from swarmjax.task.config import RewardConfig, TaskConfig
 from swarmjax.task.level import Level
 
 
@@ -135,7 +135,7 @@ def terms(steps: Steps, weights: RewardConfig) -> dict[str, np.ndarray]:
     return {name: term for name, term in weighted.items() if getattr(weights, name)}
 
 
-def weights(trained: Policy, task: config.TaskConfig) -> RewardConfig:
+def weights(trained: Policy, task: TaskConfig) -> RewardConfig:
     """Returns the weights that a policy was trained with; those of `task` if it does not say.
 
     Raises:
@@ -144,10 +144,10 @@ def weights(trained: Policy, task: config.TaskConfig) -> RewardConfig:
     """
     stored = trained.meta["config"].get("task", {})
     if not isinstance(stored, dict):
-        raise PolicyError(f"meta.config.task is {config.show(stored)}: expected an object.")
+        raise PolicyError(f"meta.config.task is {show(stored)}: expected an object.")
     if "reward" not in stored:
         return task.reward
-    return config.build(RewardConfig, stored["reward"], "the policy's config.task.reward.")
+    return build(RewardConfig, stored["reward"], "the policy's config.task.reward.")
 
 
 def record(

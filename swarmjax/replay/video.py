@@ -15,9 +15,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from swarmjax import epuck, policy_file
-from swarmjax.config import ConfigError, ReplayConfig
+from swarmjax import epuck
+from swarmjax.atomic_file import replacing
+from swarmjax.config import ConfigError
 from swarmjax.replay import pack
+from swarmjax.replay.config import ReplayConfig
 from swarmjax.replay.record import Episode, Recording
 from swarmjax.sim.model import HALF_HEIGHT
 
@@ -81,7 +83,7 @@ def write(
     """
     import imageio.v2 as imageio
 
-    with policy_file.replacing(path) as temporary:
+    with replacing(path) as temporary:
         film: Any = imageio.get_writer(temporary, fps=FRAME_RATE, quality=7)
         with film:
             for picture in _pictures(settings, episodes):

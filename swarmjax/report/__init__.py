@@ -1,1 +1,4 @@
-"""What a run came to, on one page."""
+"""What a run came to, in figures and on one page, from the files that it wrote. No JAX.
+
+Imports names and settings of `run`, and the statistics of `evaluate`. Start with `rows.read`.
+"""

@@ -10,10 +10,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from swarmjax import command, config
-from swarmjax.config import ConfigError, ReportConfig
+from swarmjax import command
+from swarmjax.config import ConfigError, files
 from swarmjax.report import page as report_page
 from swarmjax.report import rows
+from swarmjax.report.config import ReportConfig
 
 PAGE = "report.html"
 
@@ -51,12 +52,12 @@ def write(run: Path, out: Path, words: str) -> list[Path]:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    settings = config.load_report(arguments)
+    settings = files.load(ReportConfig, arguments)
     run = Path(settings.run)
     out = Path(settings.out) if settings.out else run / "report"
     words = shlex.join(["python", "-m", "swarmjax.report", *arguments])
-    files = write(run, out, words)
-    sys.stdout.write(f"{files[-1]}: the report of {run}, with {len(files) - 1} figures.\n")
+    written = write(run, out, words)
+    sys.stdout.write(f"{written[-1]}: the report of {run}, with {len(written) - 1} figures.\n")
     return 0
 
 

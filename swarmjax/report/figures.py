@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
 
-from swarmjax.config import StageConfig
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History
+from swarmjax.task.stage_config import StageConfig
 
 _DOTS = 110  # an inch
 _POINTS, _STRETCHES = 600, 200  # of a curve and of a band: about what the dots can show

@@ -7,7 +7,7 @@ from html import escape
 
 import numpy as np
 
-from swarmjax import config
+from swarmjax.config import to_dict
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History, Row
 
@@ -70,7 +70,7 @@ def page(title: str, command: str, history: History, figures: Mapping[str, bytes
 def _facts(history: History) -> list[tuple[str, str]]:
     """What the run is and what came of it, a line each."""
     trained, names = history.config, history.names
-    options = config.to_dict(trained.curriculum).items()
+    options = to_dict(trained.curriculum).items()
     seeds = f"{history.seeds[0]}" + (f" to {history.seeds[-1]}" if len(history.seeds) > 1 else "")
     spent = f"{history.updates[-1] + 1:,} of {trained.updates:,} updates"
     time = "" if history.seconds is None else f", {history.seconds / 60.0:.1f} minutes"

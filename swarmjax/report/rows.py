@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax import config
-from swarmjax.config import ConfigError, TrainConfig
+from swarmjax.config import ConfigError
 from swarmjax.evaluate.statistics import iqm
 from swarmjax.run import recorder
+from swarmjax.run.settings import TrainConfig, from_stored
 
 Row = dict[str, Any]
 
@@ -261,7 +261,7 @@ def read_config(run: Path) -> TrainConfig:
         raise ConfigError(f"{run} is no run directory: it has no config.json.")
     stored = read_object(path)
     try:
-        return config.build(TrainConfig, stored)
+        return from_stored(stored)
     except ConfigError as error:
         raise ConfigError(f"{path} does not fit: {error}") from None
 

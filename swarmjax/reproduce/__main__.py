@@ -16,10 +16,12 @@ import jax
 from rich.console import Console
 from rich.progress import Progress
 
-from swarmjax import command, config, policy_file, provenance
-from swarmjax.config import ConfigError, ReproduceConfig
+from swarmjax import command, provenance
+from swarmjax.atomic_file import replacing
+from swarmjax.config import ConfigError, to_dict
 from swarmjax.reproduce import arms, judge
 from swarmjax.reproduce import page as reproduce_page
+from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
 from swarmjax.reproduce.judge import Task
 from swarmjax.reproduce.rows import EVALUATION, FACTS, FORMAT
 from swarmjax.run.checkpoint import CheckpointError
@@ -65,7 +67,7 @@ def _settings(arguments: Sequence[str]) -> tuple[ReproduceConfig, Path]:
     words = {key: value for key, _, value in (word.partition("=") for word in arguments)}
     resumed = words.get("resume", "null").strip("'\"")
     if resumed in ("", "null"):
-        given = config.load_reproduce(arguments)
+        given = load_reproduce(arguments)
         name = f"{datetime.now():%Y%m%d-%H%M%S}-reproduce"
         out = Path(given.out) if given.out else Path("runs") / name
         if (out / FACTS).exists():
@@ -75,7 +77,7 @@ def _settings(arguments: Sequence[str]) -> tuple[ReproduceConfig, Path]:
             )
         return given, out
     out = Path(resumed)
-    return config.load_reproduce(arguments, _read(out)), out
+    return load_reproduce(arguments, _read(out)), out
 
 
 def _read(out: Path) -> dict:
@@ -116,7 +118,7 @@ def _write(out: Path, given: ReproduceConfig) -> None:
     done = arms.summaries(out)
     facts = {
         "format": FORMAT,
-        "settings": config.to_dict(replace(given, resume=None)),
+        "settings": to_dict(replace(given, resume=None)),
         "seeds": list(range(given.seed, given.seed + given.seeds)),
         "budget": given.budget,
         "fine_tune": given.fine_tune,
@@ -133,7 +135,7 @@ def _replace(path: Path, found: dict) -> None:
     """Writes a JSON file whole or not at all."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with policy_file.replacing(path) as temporary:
+        with replacing(path) as temporary:
             temporary.write_text(json.dumps(found, indent=2, allow_nan=False) + "\n")
     except OSError as error:
         raise ConfigError(f"{path} cannot be written: {error.strerror or error}.") from None

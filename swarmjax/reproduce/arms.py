@@ -8,12 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from swarmjax import config
-from swarmjax.config import ARMS, Arm, ConfigError, ReproduceConfig, TrainConfig
+from swarmjax.config import ConfigError
+from swarmjax.reproduce.config import ARMS, Arm, ReproduceConfig
 from swarmjax.run import checkpoint, compile_cache, lifecycle, memory
 from swarmjax.run.checkpoint import CheckpointError
 from swarmjax.run.display import Display
-from swarmjax.run.settings import read_config
+from swarmjax.run.settings import TrainConfig, from_stored, load_train, read_config
 from swarmjax.run.trainer import Stop
 
 _EXPANDED, _MODERN = "_expanded", "modern_"
@@ -49,7 +49,7 @@ def settings(given: ReproduceConfig, arm: Arm, out: Path) -> TrainConfig:
         "run.episodes=true",
         "run.tensorboard=false",
     ]
-    paper = config.load_train(
+    paper = load_train(
         [
             "algo=paper",
             *shared,
@@ -59,7 +59,7 @@ def settings(given: ReproduceConfig, arm: Arm, out: Path) -> TrainConfig:
     )
     if not arm.startswith(_MODERN):
         return paper
-    modern = config.load_train(["realism=webots", *shared, *_FEW])
+    modern = load_train(["realism=webots", *shared, *_FEW])
     return replace(modern, task=paper.task)
 
 
@@ -92,7 +92,7 @@ def _go_on(made: TrainConfig, directory: Path) -> TrainConfig:
     """Lets an arm that has begun go on; one that was killed before it saved anything begins."""
     if not (directory / "config.json").exists():
         return made
-    stored = config.build(TrainConfig, read_config(directory), "stored ")
+    stored = from_stored(read_config(directory), "stored ")
     kept = replace(made, run=replace(made.run, dir=stored.run.dir), start=stored.start)
     if kept != stored:
         raise ConfigError(

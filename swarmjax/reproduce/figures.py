@@ -11,24 +11,23 @@ from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
-from matplotlib.ticker import EngFormatter, FuncFormatter, MaxNLocator, PercentFormatter
+from matplotlib.ticker import MaxNLocator, PercentFormatter
 from PIL import Image
 
 from swarmjax.evaluate import statistics
+from swarmjax.evaluate.curves import curve
 from swarmjax.evaluate.statistics import iqm
 from swarmjax.reproduce import measures
 from swarmjax.reproduce.measures import WINDOW, Axis, Measure
-from swarmjax.reproduce.rows import EXPANDED, LAST, Log, Reproduction
+from swarmjax.reproduce.raster import raster
+from swarmjax.reproduce.rows import EXPANDED, LAST, Reproduction
+from swarmjax.reproduce.style import AXES, WIDTH, thousands
 
 _DOTS = 110  # an inch
 _SHADES = 128  # colours of a file: a quarter of its size, each off by 23 of 255 at most
-_COLUMNS = 700  # of a raster: about as many as the dots along it
 _POINTS, _RESAMPLES = 100, 1000  # of an interval along a curve
-_WIDTH = 8.6  # inches
 COLOURS = {
     "curriculum": "#0072b2",
     "baseline": "#d55e00",
@@ -38,13 +37,9 @@ COLOURS = {
     "modern_baseline": "#aa4499",
 }
 _DASHES = {"baseline": "--", "baseline_expanded": "--", "modern_baseline": "--"}
-_REACHED = LinearSegmentedColormap.from_list("reached", ["white", "#0b4f9e"])
-_NOTHING, _STEADY = "0.86", "#e69f00"
-_PAPER = {"curriculum": 300, "baseline": 600}  # episodes: section 4, on Figure 6
 _PAIR = ("curriculum", "baseline")
 _TUNED = ("curriculum_expanded", "baseline_expanded")
 _MODERN = ("modern_curriculum", "modern_baseline")
-_AXES: dict[Axis, str] = {"episode": "episode of the run", "steps": "arena control steps"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,100 +103,6 @@ def png(figure: Figure) -> bytes:
     return small.getvalue()
 
 
-def raster(data: Reproduction, arms: tuple[str, ...], *, axis: Axis, stage: str | None) -> Figure:
-    """Draws a line for each episode that reached the goal, a row a seed: Figures 6 and 9.
-
-    Args:
-      data: of the reproduction.
-      arms: finished ones, two panels each, one for each reading of success.
-      axis: along which episodes are laid out.
-      stage: whose episodes alone are shown; None for all.
-    """
-    kinds = [(name, success, arm) for name, success in measures.SUCCESS.items() for arm in arms]
-    seeds = len(data.seeds)
-    height = 1.1 + len(kinds) * (0.55 + 0.11 * seeds)
-    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
-    panels = figure.subplots(len(kinds), sharex=True, squeeze=False)[:, 0]
-    edges = _edges([log for arm in arms for log in data.logs[arm]], axis)
-    for panel, (name, success, arm) in zip(panels, kinds, strict=True):
-        rows = [columns(log, success, axis, stage, edges) for log in data.logs[arm]]
-        extent = (float(edges[0]), float(edges[-1]), seeds - 0.5, -0.5)
-        panel.set_facecolor(_NOTHING)
-        panel.imshow(
-            np.array(rows),
-            _REACHED,
-            vmin=0.0,
-            vmax=1.0,
-            aspect="auto",
-            interpolation="nearest",
-            extent=extent,
-        )
-        places = measures.steady_at(data, arm, success=success, axis=axis, stage=stage)
-        panel.scatter(places, range(seeds), s=16, marker="v", color=_STEADY, ec="black", lw=0.5)
-        if axis == "episode" and arm in _PAPER:
-            panel.axvline(_PAPER[arm], color="black", lw=1.0, ls=":")
-        panel.set_title(f"{arm}: {name}", loc="left", fontsize=9, pad=3)
-        panel.set_yticks(range(seeds), [str(seed) for seed in data.seeds], fontsize=6)
-    panels[-1].set_xlabel(_AXES[axis])
-    panels[-1].xaxis.set_major_formatter(_thousands())
-    figure.supylabel("seed", fontsize=10)
-    _explain_raster(figure, axis == "episode" and any(arm in _PAPER for arm in arms))
-    return figure
-
-
-def columns(
-    log: Log, success: Measure, axis: Axis, stage: str | None, edges: np.ndarray
-) -> np.ndarray:
-    """Shares of success in the columns of a raster.
-
-    A column in which no episode ended shows the one that was under way.
-
-    Args:
-      log: of a seed.
-      success: [E] of a log.
-      axis: along which episodes are laid out.
-      stage: whose episodes alone are shown; None for all.
-      edges: [P + 1] of the columns, rising.
-
-    Returns:
-      [P] of 0 to 1; nan where there is no episode to be shown.
-    """
-    at, shown = measures.along(log, axis), np.ones(len(log), bool)
-    if stage is not None:
-        shown = log.stage == stage
-    value = np.where(shown, success(log), np.nan)
-    count = len(edges) - 1
-    column = np.clip(np.searchsorted(edges, at, side="left") - 1, 0, count - 1)
-    shows = np.bincount(column[shown], minlength=count)
-    wins = np.bincount(column[shown], weights=value[shown], minlength=count)
-    ended = np.bincount(column, minlength=count) > 0
-    following = np.searchsorted(at, edges[1:], side="left")
-    under_way = np.append(value, np.nan)[following]
-    found = np.where(shows > 0, wins / np.maximum(shows, 1), np.nan)
-    return np.where(ended, found, under_way)
-
-
-def _edges(logs: list[Log], axis: Axis) -> np.ndarray:
-    """Edges of the columns of a raster: one column an episode, if they are not too many."""
-    last = max(int(measures.along(log, axis)[-1]) for log in logs)
-    if axis == "episode":
-        return np.linspace(0, last, min(last, _COLUMNS) + 1) + 0.5
-    return np.linspace(0, last, _COLUMNS + 1)
-
-
-def _explain_raster(figure: Figure, paper: bool) -> None:
-    """Says above the panels what is what."""
-    kinds = [
-        Patch(fc=_REACHED(1.0), label="reached"),
-        Patch(fc="white", ec="0.5", lw=0.5, label="not reached"),
-        Patch(fc=_NOTHING, label="no such episode"),
-        Line2D([], [], color=_STEADY, mec="black", mew=0.5, marker="v", ls="", label="steady from"),
-    ]
-    if paper:
-        kinds.append(Line2D([], [], color="black", lw=1.0, ls=":", label="the paper's number"))
-    figure.legend(handles=kinds, loc="outside upper right", ncols=5, fontsize=8, frameon=False)
-
-
 def curves(
     data: Reproduction, arms: tuple[str, ...], *, panels: tuple[Panel, ...], axes: tuple[Axis, ...]
 ) -> Figure:
@@ -214,7 +115,7 @@ def curves(
       axes: columns, from the left.
     """
     height = 1.0 + 2.0 * len(panels)
-    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
     grid = figure.subplots(len(panels), len(axes), sharex="col", sharey="row", squeeze=False)
     for row, panel in zip(grid, panels, strict=True):
         for place, axis in zip(row, axes, strict=True):
@@ -226,9 +127,9 @@ def curves(
         if panel.share:
             row[0].yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
     for place, axis in zip(grid[-1], axes, strict=True):
-        place.set_xlabel(_AXES[axis], fontsize=9)
+        place.set_xlabel(AXES[axis], fontsize=9)
         place.set_xlim(left=0)
-        place.xaxis.set_major_formatter(_thousands())
+        place.xaxis.set_major_formatter(thousands())
         place.xaxis.set_major_locator(MaxNLocator(5))
     _explain_curves(figure, data, arms)
     return figure
@@ -245,7 +146,7 @@ def _arm(place: Axes, data: Reproduction, arm: str, panel: Panel, axis: Axis) ->
     shared = measures.on_grid(found, _POINTS)
     if shared is None:
         return
-    band = statistics.curve(shared[1], resamples=_RESAMPLES)
+    band = curve(shared[1], resamples=_RESAMPLES)
     place.fill_between(shared[0], band.low, band.high, color=COLOURS[arm], alpha=0.25, lw=0)
     style = _DASHES.get(arm, "-")
     place.plot(shared[0], band.estimate, style, color=COLOURS[arm], lw=2.0)
@@ -275,7 +176,7 @@ def final(data: Reproduction, arms: tuple[str, ...]) -> Figure:
         "sensed_share": "robot steps within infrared range",
         "contacts_per_robot": "contacts per robot and episode",
     }
-    figure = Figure(figsize=(_WIDTH, 1.6 + 0.8 * len(arms)), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 1.6 + 0.8 * len(arms)), layout="constrained")
     places = figure.subplots(2, 2, sharey=True)
     for place, (key, label) in zip(places.flat, kinds.items(), strict=True):
         for shift, stage, mark in ((-0.16, LAST, "o"), (0.16, EXPANDED, "s")):
@@ -305,12 +206,6 @@ def _dots(place: Axes, values: np.ndarray, row: float, style: tuple[str, str]) -
     place.plot(values, np.full(len(values), row + 0.11), ".", color=colour, ms=4, alpha=0.5)
     place.hlines(row, mean.low, mean.high, color=colour, lw=2.0)
     place.plot([mean.estimate], [row], mark, color=colour, ms=5)
-
-
-def _thousands() -> FuncFormatter:
-    """Writes episodes and steps as 500, 1.5k and 1M."""
-    short = EngFormatter(sep="")
-    return FuncFormatter(lambda x, _: f"{x:g}" if abs(x) < 10_000 else short(x))
 
 
 _TWO: tuple[Axis, ...] = ("episode", "steps")

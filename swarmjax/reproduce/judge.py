@@ -12,18 +12,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from swarmjax import compose, policy_file
-from swarmjax.config import ConfigError, EvaluateConfig, ReproduceConfig, StageConfig, TrainConfig
+from swarmjax import policy_file
+from swarmjax.config import ConfigError, build
 from swarmjax.evaluate import cells, engine_c, trials
 from swarmjax.evaluate import judge as evaluate_judge
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.engine_c import Arenas
 from swarmjax.evaluate.judge import Judge
 from swarmjax.evaluate.measures import Outcome
 from swarmjax.provenance import cores
+from swarmjax.reproduce.config import ReproduceConfig
 from swarmjax.reproduce.rows import EVALUATION, EXPANDED, LAST
-from swarmjax.settings import build
-from swarmjax.task import observation
+from swarmjax.run.settings import from_stored
+from swarmjax.task import observation, stage_files
 from swarmjax.task.level import Level
+from swarmjax.task.stage_config import StageConfig
 
 STAGES = (LAST, EXPANDED)
 
@@ -69,8 +72,8 @@ def judge(
 def _judge(episodes: int, task: Task) -> Row:
     """Judges one policy on one stage."""
     trained = policy_file.read(str(task.path))
-    config = build(TrainConfig, trained.meta["config"])
-    stage = build(StageConfig, compose.stages(compose.read_stage(task.stage), task.stage)[0])
+    config = from_stored(trained.meta["config"])
+    stage = build(StageConfig, stage_files.read_stage(task.stage))
     evaluation = EvaluateConfig(
         policy=str(task.path),
         stage=stage,

@@ -13,19 +13,21 @@ from typing import Any
 
 import jax
 
-from swarmjax import config, provenance
-from swarmjax.config import ConfigError, TrainConfig
+from swarmjax import provenance
+from swarmjax.config import ConfigError, to_dict
 from swarmjax.curriculum import engine as curriculum
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.run import checkpoint, memory, warm_start
 from swarmjax.run.display import Display
 from swarmjax.run.policy_export import POLICY, seed_path, write_policy
-from swarmjax.run.trainer import Stop, Tally, compile_chunk, prepare, train
+from swarmjax.run.settings import TrainConfig
+from swarmjax.run.trainer import Built, Stop, Tally, compile_chunk, prepare, train
 from swarmjax.run.warm_start import Source
-from swarmjax.sim import physics
-from swarmjax.task import env
-from swarmjax.training import loop, seeds
-from swarmjax.training.loop import Program, TrainState
+from swarmjax.training import program as programs
+from swarmjax.training import seeds
+from swarmjax.training.loop import TrainState
+
+_PRICE = "learners/price/"  # of checkpoints written while algo.contact_limit was a key
 
 
 def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) -> Tally:
@@ -52,7 +54,7 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
         display.say(f"{sentence}: it was passed over.")
     if source is not None:
         display.say(f"starting with what {source.run} had learned after {source.update} updates")
-    display.say(f"{_opening(settings)}, into {run}; compiling")
+    display.say(f"{_opening(program)}; into {run}; compiling")
     for sentence in _short_budget(settings, schedule):
         display.say(sentence)
     compiled, state = prepare(program, schedule, state, memory.limit())
@@ -62,9 +64,9 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
     return tally
 
 
-def _load(settings: TrainConfig) -> tuple[Program, Schedule, Any, TrainState]:
+def _load(settings: TrainConfig) -> tuple[Built, Schedule, Any, TrainState]:
     """Builds the program, the curriculum's numbers, what starts a run, and its state's shapes."""
-    program, schedule = loop.load(settings)
+    program, schedule = programs.load(settings, by_robot=settings.run.episodes)
     init = jax.jit(partial(seeds.init, program))  # traced once, for the shapes and for the state
     template = init.eval_shape(schedule)
     memory.check_state(settings, memory.size(template), memory.limit())
@@ -72,7 +74,7 @@ def _load(settings: TrainConfig) -> tuple[Program, Schedule, Any, TrainState]:
 
 
 def _first_state(
-    program: Program, init: Callable[[], TrainState], template: TrainState, source: Source | None
+    program: Built, init: Callable[[], TrainState], template: TrainState, source: Source | None
 ) -> tuple[TrainState, list[str]]:
     """Starts from the seed, or from the newest sound checkpoint of the run that is resumed.
 
@@ -90,6 +92,8 @@ def _first_state(
             f"budget is {settings.budget}, but {settings.resume} has spent "
             f"{update * settings.arenas * settings.algo.rollout} already: give at least that."
         )
+    if any(name.startswith(_PRICE) for name in leaves):
+        skipped = [*skipped, f"a price on contacts (algo.contact_limit) in {settings.resume}"]
     return checkpoint.from_leaves(leaves, template), skipped
 
 
@@ -117,7 +121,7 @@ def _open_run(run: Path, settings: TrainConfig) -> None:
     """Makes the run directory and writes `config.json` into it."""
     try:
         run.mkdir(parents=True, exist_ok=True)
-        stored = config.to_dict(replace(settings, resume=None))
+        stored = to_dict(replace(settings, resume=None))
         (run / "config.json").write_text(json.dumps(stored, indent=2) + "\n")
     except OSError as error:
         raise _unwritable(run, error) from None
@@ -135,15 +139,16 @@ def dry_run(settings: TrainConfig) -> int:
     memory.check(settings, compiled.total_bytes, memory.limit())
     state, work = compiled.state_bytes / 2**20, compiled.work_bytes / 2**20
     sys.stdout.write(
-        f"{'\n'.join([_opening(settings), *_short_budget(settings, schedule)])}\n"
+        f"{'\n'.join([_opening(program), *_short_budget(settings, schedule)])}\n"
         f"compiled in {compiled.seconds:.1f} s; memory: {state:.1f} MiB of state, "
         f"{work:.1f} MiB to work with; nothing was trained (run.dry).\n"
     )
     return 0
 
 
-def _opening(settings: TrainConfig) -> str:
-    """Says what is about to be trained."""
+def _opening(program: Built) -> str:
+    """Says what is about to be trained, where, and what steps the robots."""
+    settings, engine = program.config, program.world.physics.engine
     names = ", ".join(stage.name for stage in settings.stage)
     steps, every = settings.arenas * settings.algo.rollout, seeds.numbers(settings)
     how = {"vmap": "side by side", "map": "in turn", "cores": "spread over cores"}[
@@ -152,7 +157,9 @@ def _opening(settings: TrainConfig) -> str:
     several = f", seeds {every[0]} to {every[-1]} {how}" if len(every) > 1 else ""
     return (
         f"swarmjax: {settings.stage_name} ({names}), {settings.updates:,} updates of {steps:,} "
-        f"arena control steps ({settings.arenas:,} arenas){several} on {provenance.device()}"
+        f"arena control steps ({settings.arenas:,} arenas){several} on {provenance.device()}; "
+        f"{settings.robot.body} robots stepped by {engine.label}, "
+        f"sim.solver={engine.solver} sim.impl={engine.impl}"
     )
 
 
@@ -173,9 +180,10 @@ def _short_budget(settings: TrainConfig, schedule: Schedule) -> list[str]:
     ]
 
 
-def _write_results(run: Path, program: Program, state: TrainState, tally: Tally) -> None:
+def _write_results(run: Path, program: Built, state: TrainState, tally: Tally) -> None:
     """Writes the policies and `summary.json`."""
     settings, every = program.config, seeds.numbers(program.config)
+    engine = program.world.physics.engine
     leaves = checkpoint.to_leaves(state)
     for seed in every:
         file = seed_path(run / POLICY, settings, seed)
@@ -198,9 +206,10 @@ def _write_results(run: Path, program: Program, state: TrainState, tally: Tally)
         "decisions": [
             [entry for entry in tally.decisions if entry["seed"] == seed] for seed in every
         ],
-        "impl": physics.resolve_impl(settings.sim.impl),
-        "solver": env.resolve_solver(settings),
-        "gradient": loop.resolve_gradient(settings),
+        "impl": engine.impl,
+        "solver": engine.solver,
+        "stepped_by": engine.label,
+        "gradient": program.backend,
         "device": provenance.device(),
         "versions": provenance.versions(),
         "commit": provenance.commit(),

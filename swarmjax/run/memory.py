@@ -15,7 +15,8 @@ from typing import Any
 
 import jax
 
-from swarmjax.config import ConfigError, TrainConfig
+from swarmjax.config import ConfigError
+from swarmjax.run.settings import TrainConfig
 
 AUTO = "auto"  # what `arenas` may be instead of a number
 ON_CPU = 128  # the default: more leave fewer updates of a budget, and gain little there

@@ -4,13 +4,17 @@ from pathlib import Path
 
 import numpy as np
 
-from swarmjax import compose, config, policy_file, provenance
-from swarmjax.config import AlgoConfig, RobotConfig, TrainConfig
+from swarmjax import policy_file, provenance
+from swarmjax.config import build, files, to_dict
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import normalizer
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import CheckpointError, Leaves
+from swarmjax.run.settings import TrainConfig
+from swarmjax.sim.config import RobotConfig
 from swarmjax.task import observation
+from swarmjax.task.config import resolve_encoding
 from swarmjax.training import seeds
 
 POLICY = "policy.npz"
@@ -51,7 +55,7 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
       The `meta` of the `policy.npz` format, all of it but `format`, in SI units.
     """
     robot = trained.robot
-    encoding = config.encoding(trained.task, trained.realism)
+    encoding = resolve_encoding(trained.task, trained.realism)
     return {
         "policy": trained.algo.policy,
         "learners": trained.learners,
@@ -73,7 +77,7 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
             "range": trained.task.sensor_range,
         },
         "task": {key: getattr(trained.task, key) for key in ("control_step", "target_radius")},
-        "config": config.to_dict(trained),
+        "config": to_dict(trained),
         "versions": provenance.versions(),
         "update": update,
         "seed": seed,
@@ -82,8 +86,8 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
 
 def _robot_preset(robot: RobotConfig) -> str:
     """Names the file of configs/robot/ that a robot's numbers are those of, or `custom`."""
-    for name in compose.choices("robot"):
-        if config.build(RobotConfig, compose.read_preset("robot", name)) == robot:
+    for name in files.choices("robot"):
+        if build(RobotConfig, files.read_preset("robot", name)) == robot:
             return name
     return "custom"
 

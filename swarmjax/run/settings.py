@@ -1,9 +1,199 @@
-"""What a run was trained with, as its directory tells."""
+"""The settings of a training run, and what its directory tells of them."""
 
 import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, ClassVar, Literal
 
-from swarmjax.config import ConfigError
+from swarmjax.config import ConfigError, Section, about, build, files, to_dict
+from swarmjax.config.section import MAX_COUNT
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.task import stage_files
+from swarmjax.task.config import check_realism
+from swarmjax.training.config import ProgramConfig
+
+# Arenas of all seeds whose episodes are written down one by one: more end thousands a second.
+MOST_LOGGED = 8192
+
+
+# What older versions wrote: section, keys that are gone, and values by key that have a new name.
+_FORMER: tuple[tuple[str, tuple[str, ...], dict[str, dict[str, str]]], ...] = (
+    ("algo", tuple(AlgoConfig.removed), {}),
+    ("sim", (), {"solver": {"newton": "mjx"}}),
+)
+
+# What may change when a run goes on; everything else fixes what it has computed so far.
+_RESUME_KEYS = ("budget", "resume", "run.*")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig(Section):
+    """Where a run is written, and how often."""
+
+    dir: str | None = field(
+        default=None, metadata=about("run directory; null: runs/<date>-<time>-<stage name>")
+    )
+    chunk: int | Literal["all", "auto"] = field(
+        default="auto", metadata=about("updates per call of the compiled program", 1, MAX_COUNT)
+    )
+    checkpoint_minutes: float = field(
+        default=5.0, metadata=about("minutes between checkpoints; 0: after every chunk", 0.0)
+    )
+    keep_checkpoints: int = field(
+        default=2, metadata=about("checkpoints that are kept", 1, MAX_COUNT)
+    )
+    stop_after: int | None = field(
+        default=None,
+        metadata=about("updates after which the run saves and stops", 0, MAX_COUNT),
+    )
+    tensorboard: bool = field(default=True, metadata=about("write TensorBoard events"))
+    episodes: bool = field(
+        default=False, metadata=about("write episodes.jsonl: each episode, robot by robot")
+    )
+    dry: bool = field(default=False, metadata=about("check and describe the run, train nothing"))
+    compile_cache: Literal["auto"] | str | None = field(
+        default="auto",
+        metadata=about("directory that keeps compiled programs; auto: the user's; null: none"),
+    )
+    memory_share: float = field(
+        default=0.8,
+        metadata=about("of the GPU's memory, what arenas=auto fills", above=0.0, high=1.0),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig(ProgramConfig):
+    """Everything that fixes a training run: its program, and where it is written."""
+
+    command: ClassVar[str] = "train"
+
+    run: RunConfig = field(default_factory=RunConfig)
+    resume: str | None = field(default=None, metadata=about("run directory to go on with"))
+    start: str | None = field(
+        default=None,
+        metadata=about("run directory whose networks and normaliser a new run begins with"),
+    )
+    start_std: Literal["keep", "reset"] = field(
+        default="keep",
+        metadata=about("exploration that start begins with: as learned, or algo.initial_std"),
+    )
+    stage_name: str = field(
+        default="",
+        metadata=about("the one stage, or what the curriculum is called", derived=True),
+    )
+
+    def _check(self) -> None:
+        if self.seed + self.seeds - 1 > MAX_COUNT:
+            raise ConfigError(
+                f"seed is {self.seed}, but seeds is {self.seeds} and the last seed may be "
+                f"{MAX_COUNT}: give at most {MAX_COUNT - self.seeds + 1}."
+            )
+        self._check_stages()
+        if self.arenas % self.algo.minibatches:
+            raise ConfigError(
+                f"arenas is {self.arenas}, but algo.minibatches is {self.algo.minibatches}: "
+                f"give a multiple of {self.algo.minibatches}."
+            )
+        self._check_budget()
+        self._check_counts()
+        self._check_algo()
+        self._check_episodes()
+        check_realism(self.realism, self.robot, self.task, self.task.step_limit)
+        names = [stage.name for stage in self.stage]
+        if len(names) == 1 or not self.stage_name:
+            object.__setattr__(self, "stage_name", "-".join(names))
+
+    def _check_stages(self) -> None:
+        if not self.stage:
+            raise ConfigError("stage is []: give at least one stage.")
+        names = [stage.name for stage in self.stage]
+        for name in names:
+            if names.count(name) > 1:
+                raise ConfigError(f"stage names {name} more than once: give each stage once.")
+        for stage in self.stage:
+            where = "stage." if len(names) == 1 else f"stage {stage.name}: "
+            for key, least in (("robots", 1), ("obstacles", 0)):
+                value, most = getattr(stage, key), getattr(self.sim, f"max_{key}")
+                if value > most:
+                    raise ConfigError(
+                        f"{where}{key} is {value}, but sim.max_{key} is {most}: "
+                        f"give {least} to {most}."
+                    )
+
+    def _check_counts(self) -> None:
+        steps = max(self.task.step_limit, self.algo.rollout)
+        most = MAX_COUNT // (self.sim.max_robots * steps)
+        if self.arenas > most:
+            raise ConfigError(
+                f"arenas is {self.arenas}, but robot steps are counted in 32 bits, and "
+                f"{self.sim.max_robots} robots for {steps} control steps leave room for {most}: "
+                f"give at most {most}."
+            )
+
+    def _check_episodes(self) -> None:
+        if self.run.episodes and self.arenas * self.seeds > MOST_LOGGED:
+            raise ConfigError(
+                f"run.episodes is true, but arenas is {self.arenas} and seeds is {self.seeds}: "
+                f"give at most {MOST_LOGGED} arenas of all seeds together, or run.episodes=false."
+            )
+
+    def _check_algo(self) -> None:
+        if self.algo.exploration == "scheduled" and self.budget > MAX_COUNT:
+            raise ConfigError(
+                f"budget is {self.budget}, but algo.exploration is scheduled by control steps that "
+                f"are counted in 32 bits: give at most {MAX_COUNT}."
+            )
+        if self.curriculum.normalizer == "relearn" and not self.algo.normalize_observations:
+            raise ConfigError(
+                "curriculum.normalizer is relearn, but algo.normalize_observations is false: "
+                "give keep or algo.normalize_observations=true."
+            )
+
+    def _check_budget(self) -> None:
+        update = self.arenas * self.algo.rollout
+        if self.updates < 1:
+            raise ConfigError(
+                f"budget is {self.budget}, but one update takes arenas x algo.rollout = {update} "
+                f"control steps: give at least {update}."
+            )
+        most = MAX_COUNT // (self.algo.epochs * self.algo.minibatches)
+        if self.updates > most:
+            raise ConfigError(
+                f"budget is {self.budget}, which is {self.updates} updates of {update} control "
+                f"steps, and the gradient steps of no more than {most} are counted in 32 bits: "
+                f"give at most {most * update}."
+            )
+
+
+def from_stored(stored: Mapping[str, Any], where: str = "") -> TrainConfig:
+    """Make the configuration that a run directory or a policy holds, written by any version.
+
+    Args:
+        stored: as `to_dict` gave it. Names that have changed since are read by their old ones;
+            what is gone is left out.
+        where: what comes before its keys in a sentence.
+
+    Raises:
+        ConfigError: it is unsound.
+    """
+    return build(TrainConfig, _modernise(stored), where)
+
+
+def _modernise(stored: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Give plain data of an older version the names of this one."""
+    if not isinstance(stored, Mapping):
+        return stored
+    found = dict(stored)
+    for name, gone, renamed in _FORMER:
+        section = found.get(name)
+        if isinstance(section, Mapping):
+            kept = {key: value for key, value in section.items() if key not in gone}
+            for key, values in renamed.items():
+                if isinstance(kept.get(key), str):
+                    kept[key] = values.get(kept[key], kept[key])
+            found[name] = kept
+    return found
 
 
 def read_config(run: Path) -> dict:
@@ -28,3 +218,55 @@ def read_config(run: Path) -> dict:
     if not isinstance(found, dict):
         raise ConfigError(f"{path} is no run's config: it holds no JSON object.")
     return found
+
+
+def load_train(overrides: Sequence[str], *, auto: bool = False) -> TrainConfig:
+    """Make the configuration of `swarmjax.train` from its `key=value` words.
+
+    Args:
+        overrides: the words.
+        auto: whether `arenas=auto` may be among them. It leaves the fewest arenas there can be,
+            algo.minibatches; `memory.fill` chooses how many there will be.
+
+    Raises:
+        ConfigError: a word, a choice, a file or a value is unsound.
+    """
+
+    def complete(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:
+        if auto and mapping.get("arenas") == "auto":
+            mapping["arenas"] = build(AlgoConfig, mapping.get("algo", {}), "algo.").minibatches
+        if "start_std" in mapping and mapping.get("start") is None:
+            raise ConfigError(
+                f"start_std is {mapping['start_std']}, but there is no start: give start=DIR with "
+                "it, the directory of a run."
+            )
+        stages = stage_files.expand(mapping.get("stage", {}), chosen["stage"])
+        return mapping | {"stage": stages, "stage_name": chosen["stage"]}
+
+    return files.load(TrainConfig, overrides, complete)
+
+
+def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainConfig:
+    """Make the configuration with which a stored run goes on.
+
+    `run.stop_after` is not kept: it interrupted the stored run, and would stop this one at once.
+
+    Args:
+        stored: configuration of the run, as `to_dict` gave it.
+        overrides: `key=value` words; only `budget`, `resume` and `run.*` may be given.
+
+    Raises:
+        ConfigError: another key is given, the stored configuration is unsound, or see the module.
+    """
+    words = files.split_words(TrainConfig, overrides)
+    for key, word in words.items():
+        if key not in _RESUME_KEYS and not key.startswith("run."):
+            allowed = ", ".join(_RESUME_KEYS)
+            raise ConfigError(
+                f"{word} cannot be given: resume keeps the rest of the stored run and takes "
+                f"{allowed} only."
+            )
+    given = files.values(words)
+    kept = to_dict(from_stored(stored, "stored "))
+    run = kept["run"] | {"stop_after": None} | given.get("run", {})
+    return build(TrainConfig, kept | given | {"run": run})

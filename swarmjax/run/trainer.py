@@ -17,17 +17,22 @@ from typing import Any
 import jax
 import numpy as np
 
-from swarmjax import config, provenance
-from swarmjax.config import TrainConfig
-from swarmjax.curriculum import engine as curriculum
+from swarmjax import provenance
 from swarmjax.curriculum.engine import Schedule
+from swarmjax.curriculum.log import log
 from swarmjax.run import memory, recorder
 from swarmjax.run.checkpoint import Checkpoints
 from swarmjax.run.display import Display, summarize
 from swarmjax.run.recorder import Recorder, Row
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import physics
+from swarmjax.sim.config import physics_substeps
 from swarmjax.training import episodes, loop, seeds
-from swarmjax.training.loop import Program, TrainState
+from swarmjax.training import program as programs
+from swarmjax.training.loop import TrainState
+from swarmjax.training.program import Program
+
+Built = Program[TrainConfig]  # the program of a run
 
 CALL_SECONDS = 1.0  # what a call should take when run.chunk is auto: the display's pace
 GROWTH = 4  # a call is at most this many times as long as the one before
@@ -116,7 +121,7 @@ class Stop:
 
 
 def compile_chunk(
-    program: Program,
+    program: Built,
     schedule: Schedule,
     state: Any,
     meanwhile: Callable[[], None] | None = None,
@@ -133,7 +138,7 @@ def compile_chunk(
       The program to call.
     """
     began = time.perf_counter()
-    groups = seeds.groups(program.config, provenance.cores())
+    groups = programs.groups(program.config, provenance.cores())
     chunk = jax.jit(partial(seeds.train_chunk, program), donate_argnums=1)
     part = jax.eval_shape(partial(seeds.split, parts=groups), state)[0]
     lowered = chunk.lower(schedule, part, np.int32(1))
@@ -171,7 +176,7 @@ def _call_at_once(
 
 
 def prepare(
-    program: Program, schedule: Schedule, state: TrainState, available: int | None
+    program: Built, schedule: Schedule, state: TrainState, available: int | None
 ) -> tuple[Compiled, TrainState]:
     """Compiles, and takes all the memory that training needs, so that nothing can lack it later.
 
@@ -197,14 +202,14 @@ def prepare(
 
 def measure(settings: TrainConfig) -> int:
     """Compiles a config's program and returns the device memory that training needs, bytes."""
-    program, schedule = loop.load(settings)
+    program, schedule = programs.load(settings, by_robot=settings.run.episodes)
     template = jax.eval_shape(partial(seeds.init, program), schedule)
     return compile_chunk(program, schedule, template).total_bytes
 
 
 def train(
     run: Path,
-    program: Program,
+    program: Built,
     schedule: Schedule,
     compiled: Compiled,
     state: TrainState,
@@ -251,7 +256,7 @@ def train(
     return state, tally
 
 
-def _tally(program: Program, done: int, compile_s: float) -> Tally:
+def _tally(program: Built, done: int, compile_s: float) -> Tally:
     """Begins to add up, from what a resumed run had come to."""
     numbers = seeds.numbers(program.config)
     tally = Tally(
@@ -269,7 +274,7 @@ def _tally(program: Program, done: int, compile_s: float) -> Tally:
     return tally
 
 
-def _add(program: Program, tally: Tally, rows: list[Row], decisions: list[Row]) -> None:
+def _add(program: Built, tally: Tally, rows: list[Row], decisions: list[Row]) -> None:
     """Adds rows and decisions to the tally."""
     names = [stage.name for stage in program.config.stage]
     for row in rows:
@@ -280,7 +285,7 @@ def _add(program: Program, tally: Tally, rows: list[Row], decisions: list[Row]) 
     tally.decisions += [entry for entry in decisions if "to" in entry]
 
 
-def _recorder(run: Path, program: Program, done: int) -> Recorder:
+def _recorder(run: Path, program: Built, done: int) -> Recorder:
     """Opens what the run writes, where `done` updates are done."""
     settings = program.config
     return Recorder(
@@ -293,16 +298,16 @@ def _recorder(run: Path, program: Program, done: int) -> Recorder:
     )
 
 
-def _build_kernels(program: Program, state: TrainState) -> float:
+def _build_kernels(program: Built, state: TrainState) -> float:
     """Builds Warp's kernels before the clock of training starts; returns the seconds it took."""
     began = time.perf_counter()
-    engine = program.world.physics
-    if engine.discs is None and physics.resolve_impl(program.config.sim.impl) == "warp":
-        physics.build_kernels(engine, seeds.stepped_together(program, state))
+    loaded = program.world.physics
+    if loaded.engine.builds_kernels:
+        physics.build_kernels(loaded, seeds.stepped_together(program, state))
     return time.perf_counter() - began
 
 
-def _calls(program: Program, tally: Tally, stop: Stop) -> Iterator[int]:
+def _calls(program: Built, tally: Tally, stop: Stop) -> Iterator[int]:
     """Yields how many updates the next call does, until there is nothing left to do."""
     settings = program.config
     goal = settings.updates
@@ -322,7 +327,7 @@ def _calls(program: Program, tally: Tally, stop: Stop) -> Iterator[int]:
 
 
 def _report(
-    program: Program,
+    program: Built,
     tally: Tally,
     metrics: dict[str, np.ndarray],
     n: int,
@@ -375,7 +380,7 @@ def _decisions(settings: TrainConfig, rows: list[Row]) -> list[Row]:
     found = [
         entry
         for lane, seed in enumerate(seeds.numbers(settings))
-        for entry in curriculum.log(rows[lane::several], names, seed)
+        for entry in log(rows[lane::several], names, seed)
     ]
     return sorted(found, key=lambda entry: entry["update"])
 
@@ -392,11 +397,11 @@ def _check_finite(settings: TrainConfig, rows: list[Row]) -> None:
                 )
 
 
-def _speeds(program: Program, rows: list[Row], seconds: float) -> dict[str, float]:
+def _speeds(program: Built, rows: list[Row], seconds: float) -> dict[str, float]:
     """Speeds of a call: arena, robot and physics steps, and transitions, of all seeds a second."""
     settings = program.config
     arena_steps = len(rows) * settings.arenas * settings.algo.rollout
-    substeps = config.substeps(settings.robot, settings.sim.substeps)
+    substeps = physics_substeps(settings.robot, settings.sim.substeps)
     return {
         "arena_steps_per_s": arena_steps / seconds,
         "robot_steps_per_s": settings.algo.rollout * sum(row["robots"] for row in rows) / seconds,

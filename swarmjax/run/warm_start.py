@@ -12,11 +12,11 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from swarmjax import config
-from swarmjax.config import ConfigError, TrainConfig
+from swarmjax.config import ConfigError, show
 from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import CheckpointError, Leaves
-from swarmjax.run.settings import read_config
+from swarmjax.run.settings import TrainConfig, from_stored, read_config
+from swarmjax.task.config import resolve_encoding
 from swarmjax.training.loop import TrainState
 
 _CARRIED = ("params", "normalizer")  # of a learner
@@ -109,14 +109,14 @@ def carry(source: Source, state: TrainState, settings: TrainConfig) -> TrainStat
 
 def _read_config(start: str) -> TrainConfig:
     try:
-        return config.build(TrainConfig, read_config(Path(start)), "stored ")
+        return from_stored(read_config(Path(start)), "stored ")
     except ConfigError as error:
         raise _refused(start, error) from None
 
 
 def _refused(start: str, error: Exception) -> ConfigError:
     return ConfigError(
-        f"start is {config.show(start)}: it takes the directory of a run with a sound checkpoint, "
+        f"start is {show(start)}: it takes the directory of a run with a sound checkpoint, "
         f"but {error}"
     )
 
@@ -125,24 +125,24 @@ def _check_alike(start: str, stored: TrainConfig, settings: TrainConfig) -> None
     """Refuses networks of another shape or number, and those that would misread what they see."""
     if stored.seeds not in (1, settings.seeds):
         raise ConfigError(
-            f"start is {config.show(start)}, a run of {stored.seeds} seeds, but seeds is "
+            f"start is {show(start)}, a run of {stored.seeds} seeds, but seeds is "
             f"{settings.seeds}: give seeds={stored.seeds}, or a run of one seed."
         )
     policy = f"algo.policy={stored.algo.policy}"
     if stored.algo.policy == "independent":
         policy += f" sim.max_robots={stored.sim.max_robots}"
-    hidden, activation = config.show(stored.algo.hidden), stored.algo.activation
+    hidden, activation = show(stored.algo.hidden), stored.algo.activation
     output = stored.algo.output
-    seen, needed = (config.encoding(each.task, each.realism) for each in (stored, settings))
+    seen, needed = (resolve_encoding(each.task, each.realism) for each in (stored, settings))
     for name, held, wanted, remedy in (
         ("number of learners", stored.learners, settings.learners, policy),
-        ("algo.hidden", hidden, config.show(settings.algo.hidden), f"algo.hidden={hidden}"),
+        ("algo.hidden", hidden, show(settings.algo.hidden), f"algo.hidden={hidden}"),
         ("algo.activation", activation, settings.algo.activation, f"algo.activation={activation}"),
         ("algo.output", output, settings.algo.output, f"algo.output={output}"),
         ("encoding of observations", seen, needed, f"task.encoding={seen}"),
     ):
         if held != wanted:
             raise ConfigError(
-                f"start is {config.show(start)}, whose {name} is {held}, but here it is {wanted}: "
+                f"start is {show(start)}, whose {name} is {held}, but here it is {wanted}: "
                 f"give {remedy}, or another run."
             )

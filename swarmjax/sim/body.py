@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from swarmjax.config import RobotConfig
+from swarmjax.sim.config import RobotConfig
 
 Array = Any
 Changes = dict[str, tuple[Any, Array]]  # field of the model: rows, and their new numbers

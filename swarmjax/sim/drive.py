@@ -2,7 +2,7 @@
 
 from typing import Any, NamedTuple
 
-from swarmjax.config import RobotConfig
+from swarmjax.sim.config import RobotConfig
 
 Array = Any
 

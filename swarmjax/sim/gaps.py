@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax.sim.fast.unroll import least, pieces
+from swarmjax.sim.dispatch import least, pieces
 from swarmjax.sim.infrared import Box, to_box_frame, turned
 
 Array = Any

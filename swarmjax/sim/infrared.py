@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from swarmjax import epuck
-from swarmjax.sim.fast.unroll import least, pieces
+from swarmjax.sim.dispatch import least, pieces
 
 Array = Any
 SENSOR_POSES = np.array(epuck.SENSOR_POSES, np.float32)

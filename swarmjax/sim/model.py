@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 
 from swarmjax import epuck
-from swarmjax.config import RobotConfig
 from swarmjax.sim.body import Body, Rows, find_rows
+from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.geometry import add_geom, add_ray_hull
 from swarmjax.sim.planar import PLANAR
 from swarmjax.sim.wheeled import WHEELED

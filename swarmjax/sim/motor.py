@@ -6,9 +6,9 @@ Code takes the array module, as all that training and the judge without JAX shar
 import math
 from typing import Any, Literal, NamedTuple
 
-from swarmjax.config import RealismConfig
 from swarmjax.sim import noise
 from swarmjax.sim.noise import Stream
+from swarmjax.sim.realism_config import RealismConfig
 
 Array = Any
 

@@ -1,15 +1,11 @@
-"""Many arenas' rigid bodies on one device, by `impl=jax` or `impl=warp`: MJX, or `discs`.
+"""Many arenas' rigid bodies on one device: MJX, by `impl=jax` or `impl=warp`.
 
 The state of an arena is `PhysicsState`: positions, velocities and the solver's warm start, the
-same for all and all that a step reads. Inside a rollout the whole `mjx.Data` (or `discs.Data`) is
+same for every engine and all that a step reads. Inside a rollout the engine's whole data is
 carried instead, because rebuilding it at every control step costs a quarter of the speed.
 """
 
-import contextlib
-import copy
 import functools
-import importlib.util
-import io
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -20,32 +16,18 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from swarmjax.config import ConfigError, RobotConfig
+from swarmjax.sim import engine as sim_engine
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.body import AS_BUILT, Body, Chassis
-from swarmjax.sim.fast import discs as sim_discs
-from swarmjax.sim.fast import planar_jax
+from swarmjax.sim.config import RobotConfig
+from swarmjax.sim.engine import Data, Engine, Model
 
-# Iterations and line-search steps at most; see docs/design.md for what was measured. MJX's Newton
-# method by `jax` is cut off where it is near enough; all else has room to converge.
-_NEWTON_STEPS = {"planar": (3, 5), "wheeled": (30, 20)}
-_MOST_STEPS = (100, 50)  # MuJoCo's own
-# Contacts between hulls and what they touch are stored for all arenas together by Warp: an average
-# of this many a robot is far more than a swarm makes; each arena alone may have
-# `discs.ROWS_PER_ROBOT`. What stands on the floor is counted apart, and whole.
-CONTACTS_PER_ROBOT = 3
-# In a jam of more wheeled robots the solver made for them leaves up to 7 mm/s (design.md, 38).
-MOST_WHEELED = 5
-FEW_ARENAS = 64  # in so few, all may be crowded at once: there is room for every pair
 # Where a rotation about the z axis has cosines, sines and ones.
 _COSINES = np.diag([1.0, 1.0, 0.0]).astype(np.float32)
 _SINES = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], np.float32)
 _ONES = np.diag([0.0, 0.0, 1.0]).astype(np.float32)
 
 Fields = dict[str, Array]
-# Of MJX, by either implementation, or of discs.
-Model = Any
-Data = Any
 
 
 class PhysicsState(NamedTuple):
@@ -67,22 +49,18 @@ class Physics:
     """The compiled side of the physics: fixed for a program.
 
     Attributes:
-      model: MJX's, or the discs'.
-      template: an `mjx.Data`, or the discs', to fill in.
+      engine: what takes the physics steps.
       host: the model as MuJoCo compiled it.
       ids: rows of the moving bodies.
       robot: the robot's numbers.
       substeps: physics steps per control step.
-      discs: what takes the physics steps in MJX's place; None: MJX does.
     """
 
-    model: Model
-    template: Data
+    engine: Engine
     host: mujoco.MjModel
     ids: sim_model.Ids
     robot: RobotConfig
     substeps: int
-    discs: sim_discs.Discs | None = None
 
     @property
     def body(self) -> Body:
@@ -90,158 +68,16 @@ class Physics:
         return sim_model.BODIES[self.robot.body]
 
 
-def resolve_impl(impl: str) -> str:
-    """Turns `auto` into `warp` on an NVIDIA GPU that has Warp, `jax` elsewhere.
-
-    Args:
-      impl: `auto`, `jax` or `warp`.
-
-    Returns:
-      `jax` or `warp`.
-
-    Raises:
-      ConfigError: if Warp is asked for and not installed.
-    """
-    installed = importlib.util.find_spec("warp") is not None
-    if impl == "warp" and not installed:
-        raise ConfigError(
-            "sim.impl is warp, but Warp is not installed: give jax or auto, or install extra gpu."
-        )
-    if impl != "auto":
-        return impl
-    return "warp" if installed and jax.default_backend() == "gpu" else "jax"
-
-
-def resolve_solver(solver: str, impl: str, body: str, robots: int) -> str:
-    """Turns `auto` into `swarm` where that can be, `newton` elsewhere.
-
-    Args:
-      solver: `auto`, `newton` or `swarm`.
-      impl: `jax` or `warp`.
-      body: `planar` or `wheeled`.
-      robots: that are compiled in.
-
-    Returns:
-      `newton` or `swarm`.
-
-    Raises:
-      ConfigError: if `swarm` is asked for where it cannot be.
-    """
-    if solver == "swarm" and body == "wheeled" and impl != "warp":
-        raise ConfigError(
-            f"sim.solver is swarm, but robot.body is wheeled and sim.impl is {impl}: give newton "
-            "or auto, or sim.impl=warp."
-        )
-    if solver == "swarm" and body == "wheeled" and robots > MOST_WHEELED:
-        raise ConfigError(
-            f"sim.solver is swarm, but robot.body is wheeled and sim.max_robots is {robots}: give "
-            f"newton or auto, or {MOST_WHEELED} robots at most."
-        )
-    if solver != "auto":
-        return solver
-    possible = body == "planar" or (impl == "warp" and robots <= MOST_WHEELED)
-    return "swarm" if possible else "newton"
-
-
-def solver_steps(solver: str, impl: str, body: str) -> tuple[int, int]:
-    """Says how many iterations, and steps of their line search, a solver takes at most."""
-    return _NEWTON_STEPS[body] if (solver, impl) == ("newton", "jax") else _MOST_STEPS
-
-
-def load(
-    model: mujoco.MjModel,
-    ids: sim_model.Ids,
-    robot: RobotConfig,
-    *,
-    impl: str,
-    solver: str,
-    arenas: int,
-    substeps: int,
-) -> Physics:
-    """Puts a model on the device.
-
-    Args:
-      model: one arena; its solver iterations are taken from here.
-      ids: rows of the moving bodies.
-      robot: the robot's numbers.
-      impl: `jax` or `warp`.
-      solver: `newton` or `swarm`.
-      arenas: how many arenas will be stepped together (Warp shares its contact memory).
-      substeps: physics steps per control step.
-
-    Returns:
-      The physics of a program.
-    """
-    if impl == "warp":
-        _quiet_warp()
-    if solver == "swarm" and robot.body == "planar":
-        discs = sim_discs.load(model, ids, robot.hull_radius, _push_apart(impl))
-        return Physics(*sim_discs.put(model), model, ids, robot, substeps, discs)
-    limits = _limits(model, len(ids.hull_body), arenas) if impl == "warp" else {}
-    if solver == "swarm":
-        model = copy.copy(model)
-        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE  # as wheeled_warp reads it
-    mjx = _mjx()
-    template = mjx.make_data(model, impl=impl, **limits)
-    device_model = mjx.put_model(model, impl=impl)
-    if solver == "swarm":
-        device_model = _with_wheeled_solver(device_model)
-    return Physics(device_model, template, model, ids, robot, substeps)
-
-
-def _mjx() -> Any:
-    """MJX, which takes two to four seconds to import, and is not needed where all are discs."""
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints twice where Warp is not installed
-        from mujoco import mjx
-    return mjx
-
-
-def _push_apart(impl: str) -> sim_discs.Solve:
-    """What solves for the contacts of discs."""
-    if impl == "jax":
-        return planar_jax.push_apart
-    from swarmjax.sim.fast import planar_warp  # needs Warp
-
-    return planar_warp.push_apart
-
-
-def _with_wheeled_solver(model: Model) -> Model:
-    """Lets a model be stepped by the solver that is made for wheeled robots."""
-    from swarmjax.sim.fast import warp_step, wheeled_warp  # need Warp
-
-    warp_step.install()
-    return model.tree_replace({"opt.solver": wheeled_warp.NUMBER})
-
-
-def _limits(model: mujoco.MjModel, robots: int, arenas: int) -> dict[str, int]:
-    """Room for contacts: of all arenas together, and for the solver's rows of each one."""
-    on_floor = model.geom_type[model.pair_geom1] == mujoco.mjtGeom.mjGEOM_PLANE
-    rows = np.where(model.pair_dim[on_floor] == 1, 1, 2 * (model.pair_dim[on_floor] - 1))
-    pairs, floor = int(np.sum(~on_floor)), int(np.sum(on_floor))
-    hulls = max(arenas * CONTACTS_PER_ROBOT * robots, min(arenas, FEW_ARENAS) * pairs)
-    return {
-        "naconmax": hulls + arenas * floor,
-        "njmax": min(pairs, sim_discs.ROWS_PER_ROBOT * robots) + int(np.sum(rows)),
-    }
-
-
-def _quiet_warp() -> None:
-    """Stops Warp from printing its banner and the name of every kernel it loads."""
-    import warp
-
-    warp.config.log_level = warp.LOG_ERROR
-
-
 def build_kernels(physics: Physics, states: PhysicsState) -> None:
     """Makes Warp build MJX's kernels, which it does at their first step: half a minute, once.
 
     Args:
-      physics: the compiled side, `impl` warp, no discs: their kernel is built as they are traced.
+      physics: the compiled side, whose engine `builds_kernels`.
       states: [A] arenas; as many as the program will step, since contacts are sized for them.
     """
 
     def step_once(state: PhysicsState) -> Array:
-        return _mjx().step(physics.model, unpack(physics, state)).qpos
+        return sim_engine.import_mjx().step(physics.engine.model, unpack(physics, state)).qpos
 
     jax.block_until_ready(jax.jit(jax.vmap(step_once))(states))
 
@@ -254,7 +90,7 @@ def rest(physics: Physics, pose: Array) -> PhysicsState:
 
 def unpack(physics: Physics, state: PhysicsState) -> Data:
     """Fills the data of one arena in, to carry through a rollout."""
-    return physics.template.replace(**state._asdict())
+    return physics.engine.template.replace(**state._asdict())
 
 
 def pack(data: Data) -> PhysicsState:
@@ -303,9 +139,7 @@ def step(
 
     def once(_: int, data: Data) -> Data:
         driven = _drive(physics, data, ctrl, chassis)
-        if physics.discs is not None:
-            return sim_discs.step(physics.discs, model, driven, side, obstacle)
-        return _mjx().step(model, driven)
+        return physics.engine.step(model, driven, side, obstacle)
 
     if physics.substeps == 1:
         return once(0, data)
@@ -336,7 +170,7 @@ def _fixtures(physics: Physics, side: Array, obstacle: Array) -> tuple[Fields, F
 
     `jax` works the poses of all geoms out from the model. `warp` passes over those of the world,
     which stay in the data as they were made, or set here; it overwrites the poses of all others.
-    `discs` are told side and obstacles themselves.
+    An engine that is not MJX is told side and obstacles themselves.
 
     Args:
       physics: the compiled side.
@@ -346,9 +180,9 @@ def _fixtures(physics: Physics, side: Array, obstacle: Array) -> tuple[Fields, F
     Returns:
       Fields of the model, and of the data.
     """
-    if physics.discs is not None:
+    if not physics.engine.is_mjx:
         return {}, {}
-    model, made = physics.model, physics.template
+    model, made = physics.engine.model, physics.engine.template
     first = int(physics.ids.fixture_geom[0])
     put = functools.partial(_with_rows, first=first)
     place, turn = sim_model.fixture_poses(side, obstacle, jnp)
@@ -389,9 +223,9 @@ def _matrices(yaw: Any, xp: Any) -> Any:
 
 def _change(physics: Physics, fields: Fields, chassis: Chassis) -> Model:
     """Sets what this arena's model has of its own: these fields, and the chassis."""
-    model, rows_of = physics.model, physics.ids.robots
+    model, rows_of = physics.engine.model, physics.ids.robots
     changes = physics.body.changes(chassis, rows_of, physics.robot, physics.host)
-    if physics.discs is not None:  # which read but a few
+    if not physics.engine.is_mjx:  # then the model has only the fields that are read
         changes = {name: changes[name] for name in changes if hasattr(model, name)}
     for name, (rows, values) in changes.items():
         now = jnp.asarray(fields.get(name, getattr(model, name)))

@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 
 from swarmjax import epuck
-from swarmjax.config import RobotConfig
 from swarmjax.sim.body import Body, Changes, Chassis, Rows, Servos, scale_mass
+from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.drive import body_velocity
 from swarmjax.sim.geometry import add_hull
 

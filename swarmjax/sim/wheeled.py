@@ -19,8 +19,8 @@ import mujoco
 import numpy as np
 
 from swarmjax import epuck
-from swarmjax.config import RobotConfig
 from swarmjax.sim.body import Body, Changes, Chassis, Rows, scale_mass
+from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.geometry import FLOOR_GROUP, add_geom, add_hull
 from swarmjax.sim.planar import servo_share
 

@@ -8,15 +8,15 @@ a policy observes the rays as they are, and its wheels turn as commanded.
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from swarmjax import config as settings
-from swarmjax.config import RealismConfig, TaskConfig
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import infrared, motor, noise, response
 from swarmjax.sim.body import Chassis
 from swarmjax.sim.drive import Drive
 from swarmjax.sim.motor import Motor
 from swarmjax.sim.noise import Stream
+from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import observation
+from swarmjax.task.config import TaskConfig, resolve_encoding
 from swarmjax.task.factors import Factors
 
 Array = Any
@@ -96,7 +96,7 @@ def load(task: TaskConfig, realism: RealismConfig, encoding: Encoding | None = N
     """
     return Electronics(
         realism=realism,
-        encoding=settings.encoding(task, realism) if encoding is None else encoding,
+        encoding=resolve_encoding(task, realism) if encoding is None else encoding,
         sensor_range=task.sensor_range,
         control_step=task.control_step,
     )

@@ -4,6 +4,7 @@
 to, and the rollout decides what comes next.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -13,17 +14,21 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from swarmjax.config import TrainConfig, substeps
+from swarmjax.sim import dispatch, infrared, model, physics
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps as sim_gaps
-from swarmjax.sim import infrared, model, physics
+from swarmjax.sim.config import RobotConfig, SimConfig, physics_substeps
+from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors as task_factors
 from swarmjax.task import observation, reward
 from swarmjax.task import stage as task_stage
+from swarmjax.task.config import TaskConfig
 from swarmjax.task.electronics import Electronics, Memory, Sight
+from swarmjax.task.episode import Episode
 from swarmjax.task.factors import Factors
 from swarmjax.task.level import Level, Spacing
+from swarmjax.task.stage_config import StageConfig
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,35 +36,22 @@ class World:
     """What fixes the compiled environment.
 
     Attributes:
-      config: the run's config.
+      robot: the robot's numbers.
+      task: what robots are asked to do.
+      realism: how sensors answer, and what is drawn for each episode.
       physics: the compiled side of the physics.
       spacing: sizes that levels are drawn with.
       drive: the robot's drive.
       electronics: what lies between policy and world.
     """
 
-    config: TrainConfig
+    robot: RobotConfig
+    task: TaskConfig
+    realism: RealismConfig
     physics: physics.Physics
     spacing: Spacing
     drive: sim_drive.Drive
     electronics: Electronics
-
-
-class Episode(NamedTuple):
-    """What an episode has come to so far.
-
-    Attributes:
-      reward: [R] sum of rewards.
-      contacts: [R, 3] contacts of each kind.
-      sensed: [R] control steps with an infrared ray shorter than its range (the paper's
-        collision rule).
-      moving: [R] control steps before arrival.
-    """
-
-    reward: Array
-    contacts: Array
-    sensed: Array
-    moving: Array
 
 
 @struct.dataclass
@@ -72,8 +64,6 @@ class EnvState:
       factors: what realism makes of the episode; they follow from the level's seed.
       memory: what the robots' electronics carry along.
       observation: [R, O] what the policy sees now.
-      stage: [] index of the stage on which the episode began, int32.
-      cohort: [] the curriculum's cohort in which it began, int32.
       clock: [] control steps since the start, int32.
       arrived: [R] whether the robot has arrived.
       distance: [R] to the target, m.
@@ -86,8 +76,6 @@ class EnvState:
     factors: Factors
     memory: Memory
     observation: Array
-    stage: Array
-    cohort: Array
     clock: Array
     arrived: Array
     distance: Array
@@ -104,7 +92,6 @@ class TimeStep(NamedTuple):
       terminated: [R] the robot arrived in this step.
       truncated: [R] the time ran out for the robot.
       valid: [R] the robot was on its way, and the physics sound: a transition to learn from.
-      robot_contact: [R] a contact with another robot began, before arrival.
       done: [] the arena's episode is over.
       sound: [] the physics is finite.
     """
@@ -114,75 +101,80 @@ class TimeStep(NamedTuple):
     terminated: Array
     truncated: Array
     valid: Array
-    robot_contact: Array
     done: Array
     sound: Array
 
 
-def load(config: TrainConfig) -> World:
+def load(
+    stages: Sequence[StageConfig],
+    robot: RobotConfig | None = None,
+    task: TaskConfig | None = None,
+    realism: RealismConfig | None = None,
+    sim: SimConfig | None = None,
+    *,
+    arenas: int = 1,
+) -> World:
     """Builds the model and puts it on the device.
 
     Args:
-      config: the run's config.
+      stages: those whose levels it will run; their largest obstacle is compiled in.
+      robot: the robot; None for the default one, and so for the settings below.
+      task: what it is asked to do.
+      realism: how its sensors answer, and what is drawn for each episode.
+      sim: who steps the physics, and the room for robots and obstacles.
+      arenas: how many arenas will be stepped together, at most; only Warp needs to know.
 
     Returns:
       The world that `reset` and `step` run in.
 
     Raises:
-      ConfigError: if Warp is asked for and not installed.
+      ConfigError: if Warp is asked for and not installed, or a solver where it cannot be.
     """
-    sim, count = config.sim, substeps(config.robot, config.sim.substeps)
-    impl = physics.resolve_impl(sim.impl)
-    largest = task_stage.largest_half(config.stage)
-    size = model.ArenaSize(sim.max_robots, sim.max_obstacles, largest)
-    robot = task_factors.largest(config.robot, config.realism)
-    spec = model.build(robot, size, config.task.control_step / count, fixtures="world")
-    solver = resolve_solver(config)
-    iterations, ls_iterations = physics.solver_steps(solver, impl, config.robot.body)
-    spec.option.iterations = sim.iterations or iterations
-    spec.option.ls_iterations = sim.ls_iterations or ls_iterations
+    robot, task = robot or RobotConfig(), task or TaskConfig()
+    realism, sim = realism or RealismConfig(), sim or SimConfig()
+    size = model.ArenaSize(sim.max_robots, sim.max_obstacles, task_stage.largest_half(stages))
+    return World(
+        robot=robot,
+        task=task,
+        realism=realism,
+        physics=_load_physics(size, robot, task, realism, sim, arenas),
+        spacing=Spacing(*size[:2], robot.hull_radius, task.target_radius),
+        drive=sim_drive.from_config(robot),
+        electronics=task_electronics.load(task, realism),
+    )
+
+
+def _load_physics(
+    size: model.ArenaSize,
+    robot: RobotConfig,
+    task: TaskConfig,
+    realism: RealismConfig,
+    sim: SimConfig,
+    arenas: int,
+) -> physics.Physics:
+    """Compiles the model of one arena, and loads what steps it."""
+    substeps, choice = physics_substeps(robot, sim.substeps), dispatch.choose(sim, robot.body)
+    largest = task_factors.largest(robot, realism)
+    spec = model.build(largest, size, task.control_step / substeps, fixtures="world")
+    spec.option.iterations, spec.option.ls_iterations = choice.iterations, choice.ls_iterations
     compiled = spec.compile()
-    engine = physics.load(
-        compiled,
-        model.ids(compiled, size),
-        config.robot,
-        impl=impl,
-        solver=solver,
-        arenas=config.arenas * (config.seeds if config.seeds_by == "vmap" else 1),
-        substeps=count,
-    )
-    spacing = Spacing(
-        sim.max_robots, sim.max_obstacles, config.robot.hull_radius, config.task.target_radius
-    )
-    electronics = task_electronics.load(config.task, config.realism)
-    return World(config, engine, spacing, sim_drive.from_config(config.robot), electronics)
+    ids = model.ids(compiled, size)
+    engine = dispatch.load_engine(compiled, ids, robot, choice, arenas)
+    return physics.Physics(engine, compiled, ids, robot, substeps)
 
 
-def resolve_solver(config: TrainConfig) -> str:
-    """Says which solver a run uses: `newton` or `swarm`.
-
-    Raises:
-      ConfigError: if it asks for one that cannot be.
-    """
-    sim, impl = config.sim, physics.resolve_impl(config.sim.impl)
-    return physics.resolve_solver(sim.solver, impl, config.robot.body, sim.max_robots)
-
-
-def reset(world: World, level: Level, stage: Array, cohort: Array) -> EnvState:
+def reset(world: World, level: Level) -> EnvState:
     """Starts an episode.
 
     Args:
       world: the compiled environment.
       level: what to start from.
-      stage: [] index of the level's stage.
-      cohort: [] the curriculum's cohort that the episode counts for.
 
     Returns:
       The state, its `sim` packed.
     """
     robots, obstacles = level.present.shape[0], level.obstacle_present.shape[0]
-    realism, robot = world.config.realism, world.config.robot
-    factors = task_factors.draw(level.seed, realism, robot, robots, obstacles, jnp)
+    factors = task_factors.draw(level.seed, world.realism, world.robot, robots, obstacles, jnp)
     sight = _look(world, level.start, level, factors)
     clock = jnp.zeros((), jnp.int32)
     memory, seen = task_electronics.begin(world.electronics, factors, sight, clock, jnp)
@@ -192,8 +184,6 @@ def reset(world: World, level: Level, stage: Array, cohort: Array) -> EnvState:
         factors=factors,
         memory=memory,
         observation=seen,
-        stage=jnp.asarray(stage, jnp.int32),
-        cohort=jnp.asarray(cohort, jnp.int32),
         clock=clock,
         arrived=jnp.zeros(robots, bool),
         distance=sight.distance,
@@ -212,12 +202,13 @@ def _no_episode(robots: int) -> Episode:
     )
 
 
-def step(world: World, state: EnvState, action: Array) -> tuple[EnvState, TimeStep]:
+def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeStep]:
     """Moves one arena on by one control step.
 
     Args:
       world: the compiled environment.
-      state: the arena; `sim` is the physics' data.
+      state: the arena; `sim` is the physics' data. Whatever else a caller keeps with an arena, by
+        a class of its own made from `EnvState`, passes through.
       action: [R, 2], -1..1 spans the command's range, what is beyond is clipped.
 
     Returns:
@@ -231,25 +222,23 @@ def step(world: World, state: EnvState, action: Array) -> tuple[EnvState, TimeSt
     memory, seen = task_electronics.sense(
         world.electronics, memory, state.factors, sight, clock, jnp
     )
-    arrives = active & (sight.distance <= world.config.task.target_radius)
-    gap = sim_gaps.gaps(
-        pose, state.level.side, state.level.obstacle, world.config.robot.hull_radius, jnp
-    )
-    begins, apart = sim_gaps.count_contacts(gap, state.apart, world.config.task.control_step, jnp)
+    arrives = active & (sight.distance <= world.task.target_radius)
+    gap = sim_gaps.gaps(pose, state.level.side, state.level.obstacle, world.robot.hull_radius, jnp)
+    begins, apart = sim_gaps.count_contacts(gap, state.apart, world.task.control_step, jnp)
     begins = begins & state.level.present[:, None]
     earned = reward.Step(
         state.distance,
         sight.distance,
         sight.ray,
-        world.config.task.sensor_range,
+        world.task.sensor_range,
         arrives,
         begins & active[:, None],
     )
     valid = active & sound
-    gained = jnp.where(valid, reward.total(earned, world.config.task.reward), 0.0)
+    gained = jnp.where(valid, reward.total(earned, world.task.reward), 0.0)
     episode = _tally(state.episode, gained, begins, earned, valid)
     arrived = state.arrived | arrives
-    timeout = clock >= world.config.task.step_limit
+    timeout = clock >= world.task.step_limit
     new = replace(
         state,
         sim=data,
@@ -267,7 +256,6 @@ def step(world: World, state: EnvState, action: Array) -> tuple[EnvState, TimeSt
         terminated=arrives,
         truncated=active & ~arrives & (timeout | ~sound),
         valid=valid,
-        robot_contact=reward.robot_contact(earned),
         done=jnp.all(arrived | ~state.level.present) | timeout | ~sound,
         sound=sound,
     )
@@ -298,7 +286,7 @@ def _move(
 def _look(world: World, pose: Array, level: Level, factors: Factors) -> Sight:
     """Works out what there is to be sensed at poses [R, 3]."""
     distance, bearing = observation.to_target(pose, level.target, jnp)
-    radius, reach = world.config.robot.hull_radius, world.electronics.reach
+    radius, reach = world.robot.hull_radius, world.electronics.reach
     mount, shades = task_electronics.mount(factors), task_electronics.reflectance(factors)
     arena = (pose, level.side, level.obstacle, radius, reach)
     if shades is None:

@@ -8,9 +8,10 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from swarmjax import epuck
-from swarmjax.config import RealismConfig, RobotConfig
 from swarmjax.sim import noise
+from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.noise import Stream
+from swarmjax.sim.realism_config import RealismConfig
 
 Array = Any
 

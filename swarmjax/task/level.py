@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from swarmjax.config import PASSAGE
 from swarmjax.sim import noise
 from swarmjax.sim.noise import Stream
 from swarmjax.task import fixed_level
@@ -23,6 +22,7 @@ from swarmjax.task.placement import (
     units,
 )
 from swarmjax.task.stage import Stage
+from swarmjax.task.stage_config import PASSAGE
 
 Array = Any
 

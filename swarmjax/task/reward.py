@@ -11,9 +11,9 @@ import chex
 import jax.numpy as jnp
 from jax import Array
 
-from swarmjax.config import RewardConfig
-from swarmjax.sim.fast.unroll import least, pieces
+from swarmjax.sim.dispatch import least, pieces
 from swarmjax.sim.gaps import KINDS
+from swarmjax.task.config import RewardConfig
 
 
 class Step(NamedTuple):

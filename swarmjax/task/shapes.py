@@ -5,12 +5,14 @@ inside it; and boxes are what both engines and the analytic sensors know. NumPy.
 """
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from swarmjax.config import Shape
 from swarmjax.task.level import Level
+
+# What obstacles of a random level may look like where a policy is judged; training knows boxes.
+Shape = Literal["box", "bar", "cross", "ell", "pillar"]
 
 HALF_THICKNESS = 0.005  # m, of plates; chosen: a board that stands upright
 # Places in whole parts of a metre, which float32 holds exactly, so that a level is the same to the

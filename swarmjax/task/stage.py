@@ -5,8 +5,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from swarmjax.config import ConfigError, StageConfig
+from swarmjax.config import ConfigError
 from swarmjax.task import fixed_level
+from swarmjax.task.stage_config import StageConfig
 
 Array = Any
 

@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from swarmjax.config import TrainConfig
-from swarmjax.training import rollout
-from swarmjax.training.rollout import Ended, Robots
+from swarmjax.task.episode import Ended, Robots
+from swarmjax.training.config import ProgramConfig
 
 KEY = "episodes_log"  # of the metrics of an update, beside its numbers
 MOST_HELD = 2**19  # episodes that a call may hand on, over all updates and seeds
@@ -40,17 +39,17 @@ class Log(NamedTuple):
     robots: Robots
 
 
-def room(config: TrainConfig) -> int:
+def room(config: ProgramConfig) -> int:
     """Returns how many episodes of one update and seed fit in.
 
     One more for each arena than wait for it, the one that is under way; or as many as a step limit
     ends, where that is shorter; or one at each control step, of which there are no more.
     """
     steps, limit = config.algo.rollout, config.task.step_limit
-    return config.arenas * min(steps, max(rollout.waiting(steps), steps // limit) + 1)
+    return config.arenas * min(steps, max(config.waiting, steps // limit) + 1)
 
 
-def rows_of_call(config: TrainConfig) -> int:
+def rows_of_call(config: ProgramConfig) -> int:
     """Returns how many updates of each seed a call may hand on."""
     return max(1, MOST_HELD // (room(config) * config.seeds))
 

@@ -4,7 +4,6 @@ One program serves every chunk size, because the number of updates is an argumen
 chunk size gives the same run.
 """
 
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -13,52 +12,22 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from swarmjax.config import TrainConfig
 from swarmjax.curriculum import engine as curricula
-from swarmjax.curriculum.engine import Curriculum, Decision, Mode, Schedule
-from swarmjax.curriculum.modes import MODES
+from swarmjax.curriculum.engine import Curriculum, Decision, Schedule
 from swarmjax.ppo import learner as ppo
-from swarmjax.ppo.fast import fused
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.sim import gaps
-from swarmjax.task import env, observation
-from swarmjax.task.env import EnvState, World
+from swarmjax.task import observation
+from swarmjax.task.episode import Ended
 from swarmjax.training import episodes, promotion, rollout
-from swarmjax.training.rollout import Ended
-
-MAX_ROWS = 4096  # updates that a call can report, over all seeds; a longer chunk is several calls
+from swarmjax.training.program import ACTION_SIZE, Program
+from swarmjax.training.rollout import Arena
 
 # Two rounds of a loop as one, so that what a round hands to the next need not be copied first: the
 # step of 8,192 arenas took 542 us instead of 606 on an H100 (docs/performance.md).
 _GPU_OPTIONS = {"xla_gpu_enable_while_loop_unrolling": "WHILE_LOOP_UNROLLING_DOUBLE_BUFFER"}
 
 Metrics = dict[str, Any]
-
-
-@dataclass(frozen=True, eq=False)
-class Program:
-    """What fixes the compiled program.
-
-    Attributes:
-      config: the run's config.
-      world: the compiled environment.
-    """
-
-    config: TrainConfig
-    world: World
-
-    @property
-    def rows(self) -> int:
-        """Most updates of one call."""
-        most = max(1, MAX_ROWS // self.config.seeds)
-        if self.config.run.episodes:
-            most = min(most, episodes.rows_of_call(self.config))
-        return min(self.config.updates, most)
-
-    @property
-    def mode(self) -> Mode:
-        """How the curriculum decides."""
-        return MODES[self.config.curriculum.mode]
 
 
 @struct.dataclass
@@ -74,7 +43,7 @@ class TrainState:
     """
 
     learners: LearnerState
-    arenas: EnvState
+    arenas: Arena
     curriculum: Curriculum
     key: Array
     update: Array
@@ -100,9 +69,7 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
         program.world, schedule.stages, index, curriculum.cohort, level_key
     )
     learners = jax.vmap(
-        lambda key: ppo.init(
-            key, config.algo, observation.SIZE, rollout.ACTION_SIZE, config.updates
-        )
+        lambda key: ppo.init(key, config.algo, observation.SIZE, ACTION_SIZE, config.updates)
     )(jax.random.split(learner_key, config.learners))
     return TrainState(
         learners=learners,
@@ -153,18 +120,17 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     """
     config, world = program.config, program.world
     key, level_key, rollout_key, learn_key = jax.random.split(state.key, 4)
-    index = jnp.tile(
-        curricula.assign(state.curriculum, config.arenas), rollout.waiting(config.algo.rollout)
-    )
+    index = jnp.tile(curricula.assign(state.curriculum, config.arenas), config.waiting)
     starts = rollout.draw_starts(world, schedule.stages, index, state.curriculum.cohort, level_key)
     arenas, trajectory, ended = rollout.collect(
-        world, state.learners, state.arenas, starts, rollout_key
+        program, state.learners, state.arenas, starts, rollout_key
     )
-    charged, trajectory = rollout.charge(state.learners, trajectory, config.algo)
     batch = rollout.batch(trajectory, config.algo)
-    explored = rollout.explore(world, charged, config.algo.rollout)
+    explored = rollout.explore(program, state.learners, config.algo.rollout)
     learners, learned = jax.vmap(
-        lambda learner, b, k: ppo.update(learner, config.algo, b, k, config.updates)
+        lambda learner, b, k: ppo.update(
+            learner, config.algo, b, k, config.updates, program.backend
+        )
     )(explored, batch, jax.random.split(learn_key, config.learners))
     counted = curricula.count(state.curriculum, ended)
     curriculum, decision = curricula.advance(
@@ -173,8 +139,6 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     learners = promotion.carry_over(
         learners, config, state.curriculum.met, curriculum.met, decision.promoted
     )
-    if charged.price is not None:
-        learned["contact_price"] = charged.price.height
     metrics = {
         "update": state.update,
         "stage": state.curriculum.stage,
@@ -184,7 +148,7 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
         **_learner_metrics(learned, batch),
         **_episode_metrics(ended, state.curriculum.stage),
     }
-    if config.run.episodes:
+    if program.by_robot:
         metrics[episodes.KEY] = episodes.pack(ended, episodes.room(config))
     new = TrainState(
         learners=learners,
@@ -255,18 +219,3 @@ def _episode_metrics(ended: Ended, stage: Array) -> Metrics:
 def compiler_options() -> dict[str, str]:
     """Says what XLA is told for loops like this one on the device that JAX computes on."""
     return _GPU_OPTIONS if jax.default_backend() == "gpu" else {}
-
-
-def load(config: TrainConfig) -> tuple[Program, Schedule]:
-    """Builds the program and the curriculum's numbers of a config.
-
-    Raises:
-      ConfigError: if Warp is asked for and not installed, or a gradient that cannot be had.
-    """
-    resolve_gradient(config)
-    return Program(config, env.load(config)), curricula.schedule(config)
-
-
-def resolve_gradient(config: TrainConfig) -> str:
-    """Says how gradients are computed, `autodiff` or `fused`; raises what `fused.resolve` does."""
-    return fused.resolve(config.algo, observation.SIZE, rollout.ACTION_SIZE)

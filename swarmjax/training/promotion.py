@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from swarmjax.config import TrainConfig
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
+from swarmjax.training.config import ProgramConfig
 
 
 def carry_over(
-    learners: LearnerState, config: TrainConfig, before: Array, after: Array, promoted: Array
+    learners: LearnerState, config: ProgramConfig, before: Array, after: Array, promoted: Array
 ) -> LearnerState:
     """Prepares the learners for a stage that a promotion has begun.
 

@@ -10,25 +10,37 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jax import Array
 
-from swarmjax.config import AlgoConfig
-from swarmjax.ppo import contact_price, gae, monte_carlo
+from swarmjax.ppo import gae, monte_carlo
 from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.sim import gaps, physics
 from swarmjax.task import env, level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
+from swarmjax.task.episode import Ended, Robots
 from swarmjax.task.stage import Stage
+from swarmjax.training.program import ACTION_SIZE, Program
 
-ACTION_SIZE = 2
 # Cohort of an episode that counts for none: curricula number theirs from 0, and -1 is the one
 # before the first.
 UNCOUNTED = -2
-# Control steps of a rollout for which one episode of each arena is drawn; the shortest that the
-# six stages have take 23.
-_STEPS_PER_EPISODE = 32
+
+
+@struct.dataclass
+class Arena(EnvState):
+    """An arena that is trained in, and what its episode counts for.
+
+    Attributes:
+      stage: [] index of the stage on which the episode began, int32.
+      cohort: [] the curriculum's cohort in which it began, int32.
+    """
+
+    stage: Array
+    cohort: Array
 
 
 class Trajectory(NamedTuple):
@@ -44,7 +56,6 @@ class Trajectory(NamedTuple):
       terminated: the robot arrived in this step.
       truncated: the time ran out for the robot.
       valid: a transition to learn from.
-      robot_contact: 1 where a contact with another robot began; None without a limit on them.
     """
 
     observation: Array
@@ -56,61 +67,6 @@ class Trajectory(NamedTuple):
     terminated: Array
     truncated: Array
     valid: Array
-    robot_contact: Array | None = None
-
-
-class Robots(NamedTuple):
-    """What became of the robots of episodes that ended, [T, A, R], zero where none did.
-
-    Attributes:
-      present: took part; where not, the rest means nothing.
-      reached: arrived.
-      reward: sum over the episode, nothing discounted.
-      robot_steps: control steps before arrival.
-      sensed: those with an infrared ray shorter than its range.
-      contacts: of all kinds.
-    """
-
-    present: Array
-    reached: Array
-    reward: Array
-    robot_steps: Array
-    sensed: Array
-    contacts: Array
-
-
-class Ended(NamedTuple):
-    """Episodes that ended, [T, A, ...], zero where none did.
-
-    Attributes:
-      episodes: 1 where one ended.
-      stage: on which it began.
-      cohort: in which it began; -1 where none ended.
-      targets: robots that took part.
-      reached: robots that arrived.
-      all_reached: 1 where every robot arrived.
-      steps: control steps.
-      robot_steps: control steps before arrival, over all robots.
-      sensed: those with an infrared ray shorter than its range.
-      contacts: [.., 3] of each kind, over all robots.
-      reward: sum over all robots, nothing discounted.
-      broken: 1 where it ended because the physics was no longer finite.
-      robots: each robot by itself, if `run.episodes` asks for it.
-    """
-
-    episodes: Array
-    stage: Array
-    cohort: Array
-    targets: Array
-    reached: Array
-    all_reached: Array
-    steps: Array
-    robot_steps: Array
-    sensed: Array
-    contacts: Array
-    reward: Array
-    broken: Array
-    robots: Robots | None = None
 
 
 def to_learners(x: Array, learners: int) -> Array:
@@ -142,17 +98,12 @@ def to_arenas(x: Array) -> Array:
     return jnp.moveaxis(x[:, :, 0], 0, 1)
 
 
-def waiting(rollout: int) -> int:
-    """How many episodes are drawn for each arena ahead of a rollout of that many control steps."""
-    return max(1, rollout // _STEPS_PER_EPISODE)
-
-
-def draw_starts(world: World, stages: Stage, index: Array, cohort: Array, key: Array) -> EnvState:
+def draw_starts(world: World, stages: Stage, index: Array, cohort: Array, key: Array) -> Arena:
     """Draws fresh levels: episodes that wait until their arena is free.
 
-    They are drawn ahead of a rollout, not at every step, `waiting` for each arena. An arena that
-    ends more episodes than that begins the rest on the last of its levels. Those train, but count
-    for no cohort: short episodes would be counted more often than long ones.
+    They are drawn ahead of a rollout, not at every step, `config.waiting` for each arena. An arena
+    that ends more episodes than that begins the rest on the last of its levels. Those train, but
+    count for no cohort: short episodes would be counted more often than long ones.
 
     Args:
       world: the compiled environment.
@@ -167,20 +118,21 @@ def draw_starts(world: World, stages: Stage, index: Array, cohort: Array, key: A
     uniforms = jax.random.uniform(key, (*index.shape, level.uniform_count(world.spacing)))
     stages = jax.tree.map(jnp.asarray, stages)
 
-    def start(uniform: Array, i: Array) -> EnvState:
+    def start(uniform: Array, i: Array) -> Arena:
         drawn = level.sample(uniform, task_stage.select(stages, i), world.spacing, jnp)
-        return env.reset(world, drawn, i, cohort)
+        begun = vars(env.reset(world, drawn))
+        return Arena(**begun, stage=i.astype(jnp.int32), cohort=jnp.asarray(cohort, jnp.int32))
 
     return jax.vmap(start)(uniforms, index)
 
 
 def collect(
-    world: World, learners: LearnerState, arenas: EnvState, starts: EnvState, key: Array
-) -> tuple[EnvState, Trajectory, Ended]:
+    program: Program, learners: LearnerState, arenas: Arena, starts: Arena, key: Array
+) -> tuple[Arena, Trajectory, Ended]:
     """Drives all arenas for one rollout; an arena whose episode ends takes the one that waits.
 
     Args:
-      world: the compiled environment.
+      program: the compiled side.
       learners: [L].
       arenas: [A], packed.
       starts: [W A] episodes that wait, as `draw_starts` orders them, packed.
@@ -189,52 +141,24 @@ def collect(
     Returns:
       The arenas, packed; the trajectory; the episodes that ended.
     """
-    waits = _Waiting(starts, _values(world, learners, starts.observation))
-    step = functools.partial(_step, world, learners, waits)
-    unpack = functools.partial(physics.unpack, world.physics)
+    config = program.config.algo
+    waits = _Waiting(starts, _values(config, learners, starts.observation))
+    step = functools.partial(_step, program, learners, waits)
+    unpack = functools.partial(physics.unpack, program.world.physics)
     arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
     begun = jnp.zeros_like(arenas.clock)
-    carry = (arenas, _values(world, learners, arenas.observation), begun)
-    steps = world.config.algo.rollout
+    carry = (arenas, _values(config, learners, arenas.observation), begun)
+    steps = config.rollout
     keys = jax.random.split(key, steps)
     (arenas, *_), (trajectory, counts) = jax.lax.scan(step, carry, (keys, 1 + jnp.arange(steps)))
     packed = jax.vmap(physics.pack)(arenas.sim)
     return replace(arenas, sim=packed), trajectory, _to_ended(*counts)
 
 
-def explore(world: World, learners: LearnerState, steps: Array | int) -> LearnerState:
+def explore(program: Program, learners: LearnerState, steps: Array | int) -> LearnerState:
     """Moves the learners [L] on along the schedule of exploration, by steps of every arena."""
-    config, arenas = world.config.algo, world.config.arenas
+    config, arenas = program.config.algo, program.config.arenas
     return jax.vmap(lambda learner: ppo.explore(learner, config, steps * arenas))(learners)
-
-
-def charge(
-    learners: LearnerState, trajectory: Trajectory, config: AlgoConfig
-) -> tuple[LearnerState, Trajectory]:
-    """Takes the price of contacts with other robots off the reward, and moves it on.
-
-    Args:
-      learners: [L].
-      trajectory: [T, L, A, N, ...].
-      config: of the learners.
-
-    Returns:
-      The learners with the price of the next update, and the trajectory; both as they are if there
-      is no limit on such contacts.
-    """
-    price = learners.price
-    if price is None:
-        return learners, trajectory
-    assert trajectory.robot_contact is not None
-    contact = jnp.where(trajectory.valid, trajectory.robot_contact, 0.0)
-    arrivals = trajectory.valid & trajectory.terminated
-    over = arrivals | _timed_out(trajectory)
-    seen = contact_price.Seen(
-        *(jnp.sum(each, axis=(0, 2, 3), dtype=float) for each in (contact, over, arrivals))
-    )
-    moved = jax.vmap(lambda p, s: contact_price.update(p, config, s, contact.shape[0]))(price, seen)
-    due = price.height[:, None, None] * contact
-    return replace(learners, price=moved), trajectory._replace(reward=trajectory.reward - due)
 
 
 def batch(trajectory: Trajectory, config: AlgoConfig) -> Batch:
@@ -305,7 +229,7 @@ class _Waiting(NamedTuple):
       value: [L, W A, N] of their first observations.
     """
 
-    starts: EnvState
+    starts: Arena
     value: Array
 
 
@@ -325,11 +249,11 @@ _COUNTS = {
 }
 
 _Counts = tuple[Array, Array, Robots | None]  # counts [A, K], rewards [A], robots
-_Carry = tuple[EnvState, Array, Array]  # arenas, their values, how many episodes each has begun
+_Carry = tuple[Arena, Array, Array]  # arenas, their values, how many episodes each has begun
 
 
 def _step(
-    world: World,
+    program: Program,
     learners: LearnerState,
     waits: _Waiting,
     carry: _Carry,
@@ -340,13 +264,13 @@ def _step(
     count = value.shape[0]
     mine = to_learners(arenas.observation, count)
     noise = jax.random.normal(key, (*mine.shape[:-1], ACTION_SIZE))
-    config = world.config.algo
+    config = program.config.algo
     action, log_prob = jax.vmap(lambda learner, o, n: ppo.act(learner, config, o, n))(
-        explore(world, learners, number), mine, noise
+        explore(program, learners, number), mine, noise
     )
-    arenas, came = jax.vmap(functools.partial(env.step, world))(arenas, to_arenas(action))
-    next_value = _values(world, learners, came.observation)
-    ended = _ended(arenas, came, by_robot=world.config.run.episodes)
+    arenas, came = jax.vmap(functools.partial(env.step, program.world))(arenas, to_arenas(action))
+    next_value = _values(config, learners, came.observation)
+    ended = _ended(arenas, came, by_robot=program.by_robot)
     starts, start_value = _next(waits, begun)
     arenas = restart(arenas, starts, came.done)
     over = jnp.broadcast_to(came.done[None, :, None], next_value.shape)
@@ -360,13 +284,12 @@ def _step(
         terminated=to_learners(came.terminated, count),
         truncated=to_learners(came.truncated, count),
         valid=to_learners(came.valid, count),
-        robot_contact=to_learners(came.robot_contact, count) if config.contact_limit else None,
     )
     carry = (arenas, jnp.where(over, start_value, next_value), begun + came.done)
     return carry, (transition, _to_counts(ended))
 
 
-def _next(waits: _Waiting, begun: Array) -> tuple[EnvState, Array]:
+def _next(waits: _Waiting, begun: Array) -> tuple[Arena, Array]:
     """Picks the episode [A] that each arena begins next, and its value [L, A, N]."""
     arenas = begun.shape[0]
     count = waits.starts.cohort.shape[0] // arenas
@@ -377,16 +300,15 @@ def _next(waits: _Waiting, begun: Array) -> tuple[EnvState, Array]:
     return replace(starts, cohort=jnp.where(begun < count, starts.cohort, UNCOUNTED)), value
 
 
-def _values(world: World, learners: LearnerState, seen: Array) -> Array:
+def _values(config: AlgoConfig, learners: LearnerState, seen: Array) -> Array:
     """Values [L, A, N] of observations [A, R, O]."""
     count = jax.tree.leaves(learners)[0].shape[0]
-    config = world.config.algo
     return jax.vmap(lambda learner, o: ppo.values(learner, config, o))(
         learners, to_learners(seen, count)
     )
 
 
-def restart(arenas: EnvState, starts: EnvState, done: Array) -> EnvState:
+def restart[S: EnvState](arenas: S, starts: S, done: Array) -> S:
     """Puts the waiting episode in the place of one that is over.
 
     Args:
@@ -411,7 +333,7 @@ def _pick[Tree](done: Array, yes: Tree, no: Tree) -> Tree:
     return jax.tree.map(pick, yes, no)
 
 
-def _ended(arenas: EnvState, came: env.TimeStep, *, by_robot: bool) -> Ended:
+def _ended(arenas: Arena, came: env.TimeStep, *, by_robot: bool) -> Ended:
     """Sums up the episodes that ended in this step, [A]."""
     done, episode = came.done, arenas.episode
     present = arenas.level.present

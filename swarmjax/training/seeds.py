@@ -14,16 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from swarmjax.config import TrainConfig
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.sim.physics import PhysicsState
 from swarmjax.training import loop
-from swarmjax.training.loop import Metrics, Program, TrainState
+from swarmjax.training.config import ProgramConfig
+from swarmjax.training.loop import Metrics, TrainState
+from swarmjax.training.program import Program, side_by_side
 
 
-def numbers(config: TrainConfig) -> range:
+def numbers(config: ProgramConfig) -> range:
     """Returns the seeds of a run, lane by lane."""
-    return range(config.seed, config.seed + config.seeds)
+    return config.numbers
 
 
 def init(program: Program, schedule: Schedule) -> TrainState:
@@ -57,7 +58,7 @@ def train_chunk(
     return each(program.config, lambda lane: loop.train_chunk(program, schedule, lane, n), state)
 
 
-def each(config: TrainConfig, function: Callable[[Any], Any], lanes: Any) -> Any:
+def each(config: ProgramConfig, function: Callable[[Any], Any], lanes: Any) -> Any:
     """Applies a function of one seed to all of them, as `config.seeds_by` says.
 
     Side by side (`vmap`) the matrix products are batched, which rounds differently from one seed
@@ -79,18 +80,6 @@ def each(config: TrainConfig, function: Callable[[Any], Any], lanes: Any) -> Any
         alone = function(jax.tree.map(lambda x: x[0], lanes))
         return jax.tree.map(lambda x: x[None], alone)
     return jax.vmap(function)(lanes)
-
-
-def groups(config: TrainConfig, cores: int) -> int:
-    """Returns into how many groups of as many seeds a run is cut, to be called at once.
-
-    Args:
-      config: the run's config.
-      cores: that the process may use.
-    """
-    if config.seeds_by != "cores" or jax.default_backend() != "cpu":
-        return 1
-    return next(n for n in range(min(cores, config.seeds), 0, -1) if config.seeds % n == 0)
 
 
 def split(lanes: Any, parts: int) -> list[Any]:
@@ -118,5 +107,5 @@ def stepped_together(program: Program, state: TrainState) -> PhysicsState:
     Returns:
       [N A] arenas where seeds go side by side, [A] where they go in turn.
     """
-    lanes = 1 if program.config.seeds_by == "map" else program.config.seeds
+    lanes = side_by_side(program.config)
     return jax.tree.map(lambda x: x[:lanes].reshape(-1, *x.shape[2:]), state.arenas.sim)

@@ -10,11 +10,15 @@ import numpy as np
 import pytest
 
 from benchmarks import race
-from swarmjax.config import AlgoConfig, SimConfig, StageConfig, TaskConfig, TrainConfig
-from swarmjax.curriculum import engine as curriculum
 from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.run.settings import TrainConfig
+from swarmjax.sim.config import SimConfig
 from swarmjax.task import env
-from swarmjax.task.env import World
+from swarmjax.task.config import TaskConfig
+from swarmjax.task.stage_config import StageConfig
+from swarmjax.training import program as programs
+from swarmjax.training.program import Program
 from tests.sentences import refusal
 
 with warnings.catch_warnings():
@@ -25,17 +29,18 @@ STEPS = 20  # the step limit is 16, so that every arena begins anew once
 
 
 @pytest.fixture(scope="module")
-def world() -> World:
+def program() -> Program:
     """Two robots where three are compiled in; one solver iteration, which compiles sooner."""
     stage = StageConfig(name="pair", robots=2, side=0.5)
     sim = SimConfig(impl="jax", max_robots=3, max_obstacles=0, iterations=1, ls_iterations=1)
     task, algo = TaskConfig(step_limit=16), AlgoConfig(rollout=8, minibatches=2)
-    return env.load(TrainConfig(stage=(stage,), task=task, algo=algo, sim=sim, arenas=4, budget=32))
+    config = TrainConfig(stage=(stage,), task=task, algo=algo, sim=sim, arenas=4, budget=32)
+    return Program(config, programs.load_world(config))
 
 
 @pytest.mark.slow  # 22 s of compiling, for a peer of a benchmark
-def test_it_is_the_environment_robot_by_robot(world: World) -> None:
-    swarm = brax_env.SwarmEnv(world, curriculum.schedule(world.config).stages)
+def test_it_is_the_environment_robot_by_robot(program: Program) -> None:
+    world, swarm = program.world, brax_env.SwarmEnv(program, programs.schedule(program.config))
     state = jax.jit(swarm.reset)(jax.random.split(jax.random.PRNGKey(0), 4 * 3))
 
     @jax.jit

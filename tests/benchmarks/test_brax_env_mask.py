@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax.config import TrainConfig
-from swarmjax.curriculum import engine as curriculum
-from swarmjax.task import env
+from swarmjax.run.settings import TrainConfig
+from swarmjax.training import program as programs
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # JAXopt, which Brax imports, says that nobody keeps it up
@@ -24,7 +23,7 @@ def _swarm(base: TrainConfig) -> Any:
     """Without obstacles and with one solver iteration, which compiles sooner."""
     sim = replace(base.sim, max_obstacles=0, iterations=1, ls_iterations=1)
     config = replace(base, stage=base.stage[:1], sim=sim)
-    return brax_env.SwarmEnv(env.load(config), curriculum.schedule(config).stages)
+    return brax_env.SwarmEnv(*programs.load(config))
 
 
 def test_brax_learns_nothing_from_robots_that_wait_for_the_others(tiny_config: TrainConfig) -> None:

@@ -16,13 +16,15 @@ from sentences import refusal
 from benchmarks import curriculum, curriculum_arms, curriculum_table
 from benchmarks.curriculum_arms import StudyConfig
 from benchmarks.curriculum_table import Key
-from swarmjax import command, config
-from swarmjax.config import TrainConfig
+from swarmjax import command
+from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.evaluate import engine_mjx
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
-from swarmjax.task import env, level
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.task import level
 from swarmjax.task import stage as task_stage
+from swarmjax.training import program as programs
 
 HARD = ("crowd", "crowd_dense", "dense", "narrow")
 ROOM = ["sim.max_robots=10", "sim.max_obstacles=8"]
@@ -64,17 +66,15 @@ def test_arms_differ_in_mode_and_stages_alone(arm: str, mode: str, stages: list[
     made = curriculum_arms.load_arm(StudyConfig(), arm, "independent", ["arenas=16", "budget=1e6"])
     assert made.curriculum.mode == mode
     assert [stage.name for stage in made.stage] == stages
-    same = replace(
-        made, stage=made.stage[-1:], curriculum=config.CurriculumConfig(), stage_name="s6"
-    )
-    assert same == config.load_train(
+    same = replace(made, stage=made.stage[-1:], curriculum=CurriculumConfig(), stage_name="s6")
+    assert same == load_train(
         ["stage=s6", "seeds=10", "arenas=16", "budget=1e6", "algo.policy=independent"]
     )
 
 
 def test_the_grid_ends_in_the_goal() -> None:
     last = curriculum_arms.load_arm(StudyConfig(), "adaptive-grid", "shared", []).stage[-1]
-    (goal,) = config.load_train(["stage=s6"]).stage
+    (goal,) = load_train(["stage=s6"]).stage
     assert replace(last, name="s6") == goal
 
 
@@ -92,7 +92,7 @@ def test_a_hard_goal_ends_its_own_curriculum(goal: str) -> None:
 
 @pytest.mark.parametrize("name", [*HARD, "crowd7", "dense5", "narrow2"])
 def test_levels_of_hard_stages_leave_nothing_out(name: str) -> None:
-    (stage,) = config.load_train([*ROOM, f"stage={name}"]).stage
+    (stage,) = load_train([*ROOM, f"stage={name}"]).stage
     one = task_stage.select(task_stage.stack([stage]), np.intp(0))
     spacing = level.Spacing(stage.robots, stage.obstacles, 0.037, 0.05)
     random = np.random.default_rng(0)
@@ -106,7 +106,7 @@ def test_levels_of_hard_stages_leave_nothing_out(name: str) -> None:
 
 def test_points_are_even_in_the_logarithm() -> None:
     # 16 arenas of 32 steps make updates of 512; 1e5 of these are 195.3 of them, 1e6 are 1953.1.
-    trained = config.load_train(["arenas=16", "budget=1e6"])
+    trained = load_train(["arenas=16", "budget=1e6"])
     found = curriculum_arms.points(StudyConfig(points=3, first=100_000), trained)
     # The middle one: sqrt(195 * 1953) = 617.1.
     np.testing.assert_array_equal(found, [195, 617, 1953])
@@ -117,7 +117,7 @@ def test_points_are_even_in_the_logarithm() -> None:
 
 
 def test_the_held_out_arena_is_for_swarms_of_its_size() -> None:
-    five = config.load_train(["stage=s6"])
+    five = load_train(["stage=s6"])
     found = curriculum_arms.roles(StudyConfig(), five, [])
     names = {role: (stage.name, stage.sides) for role, stage in found.items()}
     assert names == {
@@ -125,7 +125,7 @@ def test_the_held_out_arena_is_for_swarms_of_its_size() -> None:
         "first": ("s1", (0.5, 0.5)),
         "held_out": ("expanded", (1.5, 1.5)),
     }
-    ten = config.load_train([*ROOM, "stage=crowd"])
+    ten = load_train([*ROOM, "stage=crowd"])
     # Nor is the first stage: the baseline has trained with ten robots alone.
     assert curriculum_arms.roles(StudyConfig(goal="crowd"), ten, ROOM).keys() == {"goal"}
 
@@ -175,8 +175,12 @@ def test_the_judge_gives_means_by_seed_and_stage(trained: TrainConfig) -> None:
     # Untrained policies hardly move: these drive ahead, at two speeds.
     learners.params["actor"]["mean"]["bias"] += np.array([[[1.0, 0.0]], [[0.5, 0.3]]], np.float32)
     found = curriculum.load_judge(study, trained, judged)(learners)
-    world = env.load(replace(trained, arenas=4, algo=replace(trained.algo, minibatches=1)))
-    alone = jax.jit(partial(engine_mjx.outcomes, world, steps=trained.task.step_limit))
+    world = programs.load_world(
+        replace(trained, arenas=4, algo=replace(trained.algo, minibatches=1))
+    )
+    alone = jax.jit(
+        partial(engine_mjx.outcomes, world, trained.algo, steps=trained.task.step_limit)
+    )
     for role, stage in judged.items():
         levels = engine_mjx.draw_levels(world, stage, 5, 4)
         for seed in range(2):

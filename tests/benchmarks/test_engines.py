@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from benchmarks import engines
-from swarmjax.config import StageConfig
+from swarmjax.config import ConfigError
 from swarmjax.evaluate.cells import Cell
 from swarmjax.evaluate.trials import Trial
-from swarmjax.settings import ConfigError
+from swarmjax.task.stage_config import StageConfig
 
 
 def _trial(**found: list[float]) -> Trial:

@@ -12,9 +12,10 @@ from sentences import refusal
 from benchmarks import fidelity, fidelity_body, fidelity_infrared, fidelity_motion, pages, rig
 from benchmarks.fidelity_row import Row, beside
 from benchmarks.rig import Rig
-from swarmjax import config
-from swarmjax.config import RobotConfig
 from swarmjax.evaluate import judge as evaluate_judge
+from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.sim.config import RobotConfig
+from swarmjax.task.stage_files import load_levels
 
 BODIES = pytest.mark.parametrize("body", ["planar", "wheeled"])
 
@@ -31,7 +32,7 @@ def wheeled() -> Rig:
 
 @BODIES
 def test_the_rig_steps_as_the_judge_does(body: str) -> None:
-    settings = config.load_evaluate(["policy=none", f"robot={body}"])
+    settings = load_levels(EvaluateConfig, ["policy=none", f"robot={body}"])
     assert rig.SUBSTEPS[body] == evaluate_judge.substeps(settings)
     assert settings.task.control_step == rig.CONTROL_STEP
 

@@ -15,14 +15,14 @@ import pytest
 
 from benchmarks import steps_per_second, timing
 from benchmarks.steps_per_second import Prepared
-from swarmjax.config import TrainConfig
-from swarmjax.curriculum import engine as curriculum
 from swarmjax.run import trainer
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import physics
 from swarmjax.task import env
 from swarmjax.task.env import EnvState, TimeStep, World
 from swarmjax.training import loop, seeds
-from swarmjax.training.loop import Program
+from swarmjax.training import program as programs
+from swarmjax.training.program import Program
 
 Line = dict[str, Any]
 
@@ -55,7 +55,7 @@ def program(tiny_config: TrainConfig, tiny_world: World) -> Program:
         run=replace(tiny_config.run, chunk="all", tensorboard=False),
         budget=ARENAS * ROLLOUT * 2,  # two updates of each seed
     )
-    return Program(config, replace(tiny_world, config=config))
+    return Program(config, tiny_world)
 
 
 class Calls(NamedTuple):
@@ -79,7 +79,7 @@ def calls(program: Program, pass_time: Callable[[float], None]) -> Calls:
     stub = timing.Program(call, compile_s=0.0, size=0)
     prepared = Prepared(
         program=program,
-        schedule=curriculum.schedule(program.config),
+        schedule=programs.schedule(program.config),
         start=lambda _: SimpleNamespace(arenas=()),
         keys=jnp.zeros(SEEDS),
         physics=stub,
@@ -118,7 +118,7 @@ def test_speeds_of_training_are_those_of_the_updates_that_were_asked_for(calls: 
 def _begun(program: Program) -> EnvState:
     """All zeros, in the shapes of arenas that have just begun."""
     shapes = jax.eval_shape(
-        functools.partial(loop.init, program, curriculum.schedule(program.config))
+        functools.partial(loop.init, program, programs.schedule(program.config))
     )
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes.arenas)
 
@@ -130,11 +130,11 @@ def test_a_call_of_the_environment_makes_the_steps_that_are_counted(
         """Does nothing but count."""
         nothing, no = jnp.zeros(ROBOTS), jnp.zeros(ROBOTS, bool)
         done = jnp.zeros((), bool)
-        came = TimeStep(state.observation, nothing, no, no, no, no, done=done, sound=~done)
+        came = TimeStep(state.observation, nothing, no, no, no, done=done, sound=~done)
         return replace(state, clock=state.clock + 1), came
 
     monkeypatch.setattr(env, "step", step)
-    schedule = curriculum.schedule(program.config)
+    schedule = programs.schedule(program.config)
     arenas = _begun(program)
     call = jax.jit(functools.partial(steps_per_second.environment, program, schedule))
     after, _ = call(arenas, jax.random.key(1))
@@ -164,7 +164,7 @@ class _State(NamedTuple):
 def test_speeds_of_a_run_are_its_steps_by_the_seconds_of_a_call(
     program: Program, pass_time: Callable[[float], None], tmp_path: Path
 ) -> None:
-    schedule = curriculum.schedule(program.config)
+    schedule = programs.schedule(program.config)
     state = jax.eval_shape(functools.partial(seeds.init, program), schedule)
     train = functools.partial(seeds.train_chunk, program)
     blank = jax.eval_shape(train, schedule, state, np.int32(2))[1]

@@ -11,8 +11,8 @@ from sentences import refusal
 from benchmarks import cpu_paper_way, mujoco_arena
 from benchmarks.mujoco_arena import Arena
 from swarmjax import policy
-from swarmjax.config import EvaluateConfig
 from swarmjax.evaluate import engine_c
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.task import observation, reward
 
 STEPS = 150

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks import curriculum_cost, pairs
-from swarmjax import config
+from swarmjax.run.settings import load_train
 
 
 class Clock:
@@ -58,7 +58,7 @@ def test_too_few_pairs_are_refused() -> None:
 
 @pytest.mark.parametrize("name", list(curriculum_cost.COPIES))
 def test_an_arm_differs_from_the_single_stage_by_the_engine_alone(name: str) -> None:
-    single = config.load_train(["stage=s6"])
+    single = load_train(["stage=s6"])
     arm = curriculum_cost.curriculum(single, name)
     assert arm.curriculum.mode == name.removesuffix("-grid")
     assert len({stage.name for stage in arm.stage}) == curriculum_cost.COPIES[name]

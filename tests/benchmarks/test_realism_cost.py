@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 
 from benchmarks import realism_cost
-from swarmjax import config
-from swarmjax.config import ConfigError, RealismConfig
+from swarmjax.config import ConfigError
+from swarmjax.sim.realism_config import COUNTED, RealismConfig
 
 NAMES = {item.name for item in dataclasses.fields(RealismConfig)} - {"name", "stall_time"}
 
@@ -18,7 +18,7 @@ def test_arms_are_the_presets_and_each_factor_alone() -> None:
     for name in NAMES:
         on = {key for key in NAMES if getattr(arms[name], key) != getattr(ideal, key)}
         assert on - {"infrared"} == {name} - {"infrared"}
-        assert ("infrared" in on) == (name in {*config.COUNTED, "infrared"})
+        assert ("infrared" in on) == (name in {*COUNTED, "infrared"})
         assert getattr(arms[name], name) == getattr(arms["real"], name)
 
 

@@ -14,7 +14,7 @@ from sentences import refusal
 from benchmarks import peers, robots_speed, run, run_page, run_tables, steps_per_second
 from benchmarks.run import Entry, Line, Output, RunConfig
 from benchmarks.suites import SUITES
-from swarmjax import config
+from swarmjax.run.settings import load_train
 
 ENTRY = Entry(name="e", module="m", over="arenas", values=("8", "4", "2"), seconds=20.0)
 ALONE = Entry(name="a", module="m", seconds=20.0)
@@ -64,7 +64,7 @@ def test_an_entry_of_a_name_is_the_same_in_all_suites() -> None:
 def test_words_of_training_are_taken() -> None:
     for entry in SUITES["gpu"] + SUITES["cpu"]:
         if entry.module == "steps_per_second":
-            settings = config.load_train([*entry.words, "stage=s6", f"arenas={entry.values[0]}"])
+            settings = load_train([*entry.words, "stage=s6", f"arenas={entry.values[0]}"])
             assert settings.arenas == int(entry.values[0])
 
 

@@ -6,10 +6,11 @@ from pathlib import Path
 import pytest
 from sentences import refusal
 
-from swarmjax import compose
-from swarmjax.config import StageConfig, TrainConfig, load_train
+from swarmjax.config import files
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.task.stage_config import StageConfig
 
-ROOT = Path(compose.__file__).resolve().parent.parent
+ROOT = Path(files.__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -17,7 +18,7 @@ def own_configs(tmp_path, monkeypatch):
     """A copy of configs/ beside a project file, in which a test may write."""
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
     (tmp_path / "pyproject.toml").touch()
-    monkeypatch.setattr(compose, "_PACKAGE", tmp_path / "swarmjax")
+    monkeypatch.setattr(files, "_PACKAGE", tmp_path / "swarmjax")
     return tmp_path / "configs"
 
 
@@ -132,7 +133,7 @@ def test_configs_of_an_installed_package(tmp_path, monkeypatch):
     shutil.copytree(ROOT / "configs", package / "configs")
     # Another package's folder of that name, which must not be taken for ours.
     (tmp_path / "site-packages" / "configs").mkdir()
-    monkeypatch.setattr(compose, "_PACKAGE", package)
+    monkeypatch.setattr(files, "_PACKAGE", package)
     assert load_train(["stage=s1"]).stage_name == "s1"
     shutil.rmtree(package / "configs")
     assert refusal(load_train, []).startswith("configs is missing: ")

@@ -3,25 +3,22 @@
 import dataclasses
 import json
 import math
+from functools import partial
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sentences import refusal
 
-from swarmjax.config import (
-    RewardConfig,
-    RunConfig,
-    SimConfig,
-    StageConfig,
-    TrainConfig,
-    load_evaluate,
-    load_export,
-    load_report,
-    load_train,
-    smallest_side,
-)
-from swarmjax.settings import ConfigError, build, to_dict
+from swarmjax.config import ConfigError, build, files, to_dict
+from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.export.config import ExportConfig
+from swarmjax.report.config import ReportConfig
+from swarmjax.run.settings import RunConfig, TrainConfig, load_train
+from swarmjax.sim.config import SimConfig
+from swarmjax.task.config import RewardConfig
+from swarmjax.task.stage_config import StageConfig, smallest_side
+from swarmjax.task.stage_files import load_levels
 
 STAGE = {"name": "s", "robots": 2, "side": 1.0}
 
@@ -35,8 +32,8 @@ STAGE = {"name": "s", "robots": 2, "side": 1.0}
         (load_train, []),
         (load_train, ["stage=s3", "algo.hidden=[8,16,32]", "run.chunk=all", "run.dir=a b"]),
         (load_train, ["stage.sequence=[s2,s1]", "sim.iterations=4", "run.chunk=7"]),
-        (load_evaluate, ["policy=p", "stage=expanded", "workers=2"]),
-        (load_export, ["run=r", "step=3"]),
+        (partial(load_levels, EvaluateConfig), ["policy=p", "stage=expanded", "workers=2"]),
+        (partial(files.load, ExportConfig), ["run=r", "step=3"]),
     ],
 )
 def test_round_trip_through_json(load, words):
@@ -156,7 +153,7 @@ def test_stages_of_a_curriculum_are_named_in_sentences():
 
 
 def test_a_missing_key_is_named():
-    assert refusal(load_report, []) == "run is missing and has no default: give it."
+    assert refusal(files.load, ReportConfig, []) == "run is missing and has no default: give it."
     assert refusal(build, TrainConfig, {"stage": [{"name": "s", "side": 1.0}]}) == (
         "stage.robots is missing and has no default: give it."
     )

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swarmjax.config import CurriculumConfig, StageConfig, TaskConfig, TrainConfig
 from swarmjax.curriculum import engine as curriculum
+from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.curriculum.engine import (
     BY_BUDGET,
     BY_DEMOTION,
@@ -25,7 +25,12 @@ from swarmjax.curriculum.engine import (
     Schedule,
     Tally,
 )
+from swarmjax.curriculum.log import log
 from swarmjax.curriculum.modes import MODES
+from swarmjax.run.settings import TrainConfig
+from swarmjax.task.config import TaskConfig
+from swarmjax.task.stage_config import StageConfig
+from swarmjax.training import program as programs
 from swarmjax.training.rollout import Ended
 
 OPTIONS = CurriculumConfig(mode="sequential")
@@ -69,7 +74,7 @@ def _config(base: TrainConfig, stages: int, **changes: object) -> TrainConfig:
 @pytest.fixture
 def schedule(tiny_config: TrainConfig) -> Schedule:
     """Three stages, left after updates 5 and 10 at the latest."""
-    return curriculum.schedule(_config(tiny_config, 3))
+    return programs.schedule(_config(tiny_config, 3))
 
 
 def _late(schedule: Schedule) -> Schedule:
@@ -141,7 +146,7 @@ def _advance(
 
 
 def test_schedule(tiny_config: TrainConfig) -> None:
-    found = curriculum.schedule(_config(tiny_config, 3, curriculum=OPTIONS))
+    found = programs.schedule(_config(tiny_config, 3, curriculum=OPTIONS))
     assert found.stages.robots.tolist() == [1, 2, 3]
     # Half of 20 updates in two equal parts; the last stage has no end.
     assert found.deadline.tolist() == [5, 10, NEVER]
@@ -159,7 +164,7 @@ def test_schedule_rounds_up(tiny_config: TrainConfig) -> None:
         task=TaskConfig(step_limit=17),
         curriculum=CurriculumConfig(budget_share=0.4, threshold=0.5, demotion=0.25),
     )
-    found = curriculum.schedule(config)
+    found = programs.schedule(config)
     # 0.4 of 20 updates, 8, in three parts: 2.67, 5.33, 8.
     assert found.deadline.tolist() == [3, 6, 8, NEVER]
     assert found.cohort_updates == 3  # 17 steps take more than two updates of 8
@@ -167,11 +172,11 @@ def test_schedule_rounds_up(tiny_config: TrainConfig) -> None:
 
 
 def test_schedule_of_the_other_modes(tiny_config: TrainConfig) -> None:
-    mixed = curriculum.schedule(
+    mixed = programs.schedule(
         _config(tiny_config, 3, curriculum=CurriculumConfig(mode="mixed", earlier_share=0.25))
     )
     assert (mixed.earlier_share, mixed.deadline.tolist()) == (0.25, [5, 10, NEVER])
-    adaptive = curriculum.schedule(
+    adaptive = programs.schedule(
         _config(tiny_config, 3, curriculum=CurriculumConfig(mode="adaptive", floor=0.5))
     )
     assert adaptive.floor == 0.5
@@ -180,7 +185,7 @@ def test_schedule_of_the_other_modes(tiny_config: TrainConfig) -> None:
 
 
 def test_schedule_of_one_stage(tiny_config: TrainConfig) -> None:
-    assert curriculum.schedule(_config(tiny_config, 1)).deadline.tolist() == [NEVER]
+    assert programs.schedule(_config(tiny_config, 1)).deadline.tolist() == [NEVER]
 
 
 @pytest.mark.parametrize(
@@ -195,7 +200,7 @@ def test_start(
     tiny_config: TrainConfig, mode: str, stage: int, weights: list[float], met: int
 ) -> None:
     options = CurriculumConfig(mode=mode)  # type: ignore[arg-type]  # one of the literals
-    schedule = curriculum.schedule(_config(tiny_config, 3, curriculum=options))
+    schedule = programs.schedule(_config(tiny_config, 3, curriculum=options))
     state = _start(schedule, options)
     assert (int(state.stage), int(state.met)) == (stage, met)
     assert (int(state.cohort), int(state.age), int(state.since)) == (0, 0, 0)
@@ -518,7 +523,7 @@ def test_stages_whose_deadlines_are_past_take_a_step_limit_each(schedule: Schedu
 
 
 def test_the_last_stage_stays(tiny_config: TrainConfig) -> None:
-    schedule = curriculum.schedule(_config(tiny_config, 1))
+    schedule = programs.schedule(_config(tiny_config, 1))
     _, rows = _run(schedule, [PERFECT] * 8, first=1000)
     assert {(row.reason, row.stage) for row in rows} == {(STAYED, 0)}
     assert [row.success for row in rows[3:]] == [1.0] * 5  # measured nevertheless
@@ -563,7 +568,7 @@ def test_log() -> None:
     first = {"targets_reached": 0.9, "all_reached": 0.7, "episodes": 40}
     second = {"targets_reached": 0.25, "all_reached": 0.125, "episodes": 8}
     third = {"targets_reached": None, "all_reached": None, "episodes": 0}
-    assert curriculum.log(rows, ["a", "b", "c"], 7) == [
+    assert log(rows, ["a", "b", "c"], 7) == [
         {"update": 3, "seed": 7, "from": "a", "to": "b", "why": "threshold"} | first,
         {"update": 9, "seed": 7, "from": "b", "to": "c", "why": "budget"} | second,
         {"update": 12, "seed": 7, "from": "c", "to": "b", "why": "demotion"} | third,

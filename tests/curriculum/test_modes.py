@@ -13,16 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swarmjax.config import (
-    AlgoConfig,
-    CurriculumConfig,
-    RobotConfig,
-    SimConfig,
-    StageConfig,
-    TaskConfig,
-    TrainConfig,
-)
 from swarmjax.curriculum import engine as curriculum
+from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.curriculum.engine import (
     BY_BUDGET,
     BY_DEMOTION,
@@ -39,10 +31,16 @@ from swarmjax.curriculum.engine import (
 )
 from swarmjax.curriculum.modes import MODES
 from swarmjax.ppo import learner as ppo
-from swarmjax.task import env, observation
-from swarmjax.task.env import EnvState
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.run.settings import TrainConfig
+from swarmjax.sim.config import RobotConfig, SimConfig
+from swarmjax.task import observation
+from swarmjax.task.config import TaskConfig
+from swarmjax.task.episode import Ended
+from swarmjax.task.stage_config import StageConfig
+from swarmjax.training import program as programs
 from swarmjax.training import rollout
-from swarmjax.training.rollout import Ended
+from swarmjax.training.rollout import Arena
 
 COHORT = 4  # updates
 SEQUENTIAL, MIXED = (CurriculumConfig(mode=mode) for mode in ("sequential", "mixed"))
@@ -56,7 +54,7 @@ def _schedule(stages: int, **changes: Any) -> Schedule:
     """Stages of 1, 2, .. robots, without deadlines."""
     chosen = tuple(StageConfig(name=f"s{i}", robots=1 + i, side=1.0) for i in range(stages))
     config = TrainConfig(stage=chosen, sim=SimConfig(max_robots=9))
-    numbers = curriculum.schedule(config)._replace(
+    numbers = programs.schedule(config)._replace(
         deadline=np.full(stages, NEVER, np.int32),
         demotion=np.float32(0.3),
         earlier_share=np.float32(0.25),
@@ -341,7 +339,7 @@ class Reference:
         return weights
 
 
-Step = Callable[[jax.Array, EnvState | None, jax.Array, jax.Array], tuple[EnvState, Ended]]
+Step = Callable[[jax.Array, Arena | None, jax.Array, jax.Array], tuple[Arena, Ended]]
 
 
 @pytest.fixture(scope="module")
@@ -356,17 +354,17 @@ def step() -> Step:
         sim=SimConfig(impl="jax", max_robots=2, max_obstacles=0),
         arenas=ARENAS,
     )
-    world, stages = env.load(config), curriculum.schedule(config).stages
+    program, schedule = programs.load(config)
     keys = jax.random.split(jax.random.key(1), 1)
-    sizes = (observation.SIZE, rollout.ACTION_SIZE, config.updates)
+    sizes = (observation.SIZE, programs.ACTION_SIZE, config.updates)
     learners = jax.vmap(lambda key: ppo.init(key, config.algo, *sizes))(keys)
 
-    draw = jax.jit(functools.partial(rollout.draw_starts, world, stages))
-    collect = jax.jit(functools.partial(rollout.collect, world))
+    draw = jax.jit(functools.partial(rollout.draw_starts, program.world, schedule.stages))
+    collect = jax.jit(functools.partial(rollout.collect, program))
 
     def run(
-        index: jax.Array, arenas: EnvState | None, cohort: jax.Array, key: jax.Array
-    ) -> tuple[EnvState, Ended]:
+        index: jax.Array, arenas: Arena | None, cohort: jax.Array, key: jax.Array
+    ) -> tuple[Arena, Ended]:
         level_key, rollout_key = jax.random.split(key)
         starts = draw(index, cohort, level_key)
         before = starts if arenas is None else arenas

@@ -14,12 +14,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sentences import refusal
 
-from swarmjax import compose, config
-from swarmjax.config import ConfigError, EvaluateConfig, StageConfig
+from swarmjax.config import ConfigError, files
 from swarmjax.evaluate import cells
 from swarmjax.evaluate.cells import Suite
+from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.evaluate.suite_config import SUITE_SEED, CellConfig, read_suite
+from swarmjax.sim.config import RobotConfig
+from swarmjax.task.config import TaskConfig
+from swarmjax.task.stage_config import StageConfig
 
-NAMES = compose.choices("suites")
+NAMES = files.choices("suites")
 # Suites of levels that others have too: to be compared with them level by level, or picked out.
 REPEATED = {"shapes", "noise", "headline"}
 
@@ -39,7 +43,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Suite:
             "seed: 1000003, episodes: [7, 4]",
         )
     )
-    found = config.read_suite(str(file))
+    found = read_suite(str(file))
     return Suite(found.name, tuple(cells.draw_cell(each) for each in found.cells))
 
 
@@ -215,7 +219,7 @@ def test_the_suites_are_those_of_the_manual() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_suite_is_sound_and_its_first_levels_are_drawn(name: str) -> None:
-    file = config.read_suite(name)
+    file = read_suite(name)
     assert file.name == name
     for cell in file.cells:
         assert cell.digest is not None
@@ -226,7 +230,7 @@ def test_a_suite_is_sound_and_its_first_levels_are_drawn(name: str) -> None:
         assert drawn.levels.obstacle.shape[1] == parts * cell.stage.obstacles
 
 
-def _first(cell: config.CellConfig) -> config.CellConfig:
+def _first(cell: CellConfig) -> CellConfig:
     """The same cell with two levels."""
     numbers = cell.episodes[:2] or (0, 1)
     return dataclasses.replace(cell, levels=2, episodes=numbers, digest=None)
@@ -234,7 +238,7 @@ def _first(cell: config.CellConfig) -> config.CellConfig:
 
 def test_levels_are_the_same_to_the_last_bit_wherever_they_are_drawn() -> None:
     (cell,) = cells.draw("adversarial").cells
-    assert cell.digest == config.read_suite("adversarial").cells[0].digest
+    assert cell.digest == read_suite("adversarial").cells[0].digest
 
 
 @pytest.mark.slow
@@ -246,28 +250,28 @@ def test_every_suite_has_its_digests(name: str) -> None:
 def test_no_level_is_in_two_suites_but_where_it_is_meant() -> None:
     found: dict[tuple[int, int, int], str] = {}
     for name in sorted(NAMES, key=lambda name: name in REPEATED):
-        for cell in config.read_suite(name).cells:
+        for cell in read_suite(name).cells:
             key = (cell.seed, cell.stage.robots, cell.stage.obstacles)
             assert (key in found) == (name in REPEATED)
             found.setdefault(key, name)
-    seeds = {name: {cell.seed for cell in config.read_suite(name).cells} for name in NAMES}
+    seeds = {name: {cell.seed for cell in read_suite(name).cells} for name in NAMES}
     others = set().union(*(seeds[name] for name in NAMES if name != "dev"))
     assert not seeds["dev"] & others
-    assert min(seeds["dev"] | others) >= config.SUITE_SEED
+    assert min(seeds["dev"] | others) >= SUITE_SEED
 
 
 def test_the_headline_is_of_cells_that_other_suites_have() -> None:
-    others = [config.read_suite(name).cells for name in ("stages", "expanded", "swarm")]
-    for cell in config.read_suite("headline").cells:
+    others = [read_suite(name).cells for name in ("stages", "expanded", "swarm")]
+    for cell in read_suite("headline").cells:
         assert cell in [each for suite in others for each in suite]
 
 
 def test_swarms_are_as_dense_as_the_last_stage() -> None:
-    for cell in config.read_suite("swarm").cells:
+    for cell in read_suite("swarm").cells:
         area = cell.stage.sides[0] ** 2
         assert area / cell.stage.robots == pytest.approx(1.2**2 / 5, rel=2e-3)  # mm
         assert cell.stage.obstacles == round(0.6 * cell.stage.robots)
-    assert [cell.stage.robots for cell in config.read_suite("swarm").cells] == [1, 4, 8, 10, 20, 50]
+    assert [cell.stage.robots for cell in read_suite("swarm").cells] == [1, 4, 8, 10, 20, 50]
 
 
 @pytest.mark.parametrize(
@@ -290,7 +294,7 @@ def test_swarms_are_as_dense_as_the_last_stage() -> None:
 def test_a_suite_that_is_unsound_is_refused(tmp_path: Path, text: str, reason: str) -> None:
     path = tmp_path / "suite.yaml"
     path.write_text(text)
-    assert reason in refusal(config.read_suite, str(path))
+    assert reason in refusal(read_suite, str(path))
 
 
 def test_a_digest_that_is_off_is_refused(tmp_path: Path) -> None:
@@ -306,7 +310,7 @@ def test_a_digest_that_is_off_is_refused(tmp_path: Path) -> None:
 
 
 def test_suites_are_for_robots_of_the_nominal_size() -> None:
-    robot = config.RobotConfig(hull_radius=0.04)
+    robot = RobotConfig(hull_radius=0.04)
     stage = StageConfig(name="s", robots=1, side=1.0)
     settings_ = EvaluateConfig(policy="", stage=stage, robot=robot, suite="stages")
     assert refusal(cells.load, settings_).startswith("robot.hull_radius is 0.04")
@@ -315,7 +319,7 @@ def test_suites_are_for_robots_of_the_nominal_size() -> None:
 def test_suites_are_for_targets_of_the_nominal_size() -> None:
     stage = StageConfig(name="s", robots=1, side=1.0)
     for radius in (0.04, 0.06):
-        task = config.TaskConfig(target_radius=radius)
+        task = TaskConfig(target_radius=radius)
         settings_ = EvaluateConfig(policy="", stage=stage, task=task, suite="stages")
         sentence = refusal(cells.load, settings_)
         assert (

@@ -14,26 +14,25 @@ import pytest
 import steering
 from steering import AHEAD, SPEED, SPIN, STAY, STEER, STEP, STRIDE
 
-from swarmjax import config, policy
-from swarmjax.config import (
-    ConfigError,
-    EvaluateConfig,
-    RealismConfig,
-    RobotConfig,
-    SimConfig,
-    StageConfig,
-    TaskConfig,
-    TrainConfig,
-)
+from swarmjax import policy
+from swarmjax.config import ConfigError
 from swarmjax.evaluate import engine_c
 from swarmjax.evaluate import rays as evaluate_rays
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.engine_c import Arenas
 from swarmjax.evaluate.judge import Judge
 from swarmjax.policy import PolicyError
+from swarmjax.run.settings import TrainConfig, load_train
 from swarmjax.sim import gaps, infrared, model, noise, physics
+from swarmjax.sim.config import RobotConfig, SimConfig
+from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import electronics, env, observation, shapes
+from swarmjax.task.config import TaskConfig
 from swarmjax.task.env import EnvState, TimeStep, World
 from swarmjax.task.level import Level
+from swarmjax.task.stage_config import StageConfig
+from swarmjax.task.stage_files import load_levels
+from swarmjax.training import program as programs
 
 
 def _stage(
@@ -254,9 +253,8 @@ def test_the_judge_counts_what_the_training_environment_counts(tmp_path: Path) -
     drawn = engine_c.draw_level(judge.stage, judge.spacing, 1, 65)
     arenas = engine_c.start(judge, [drawn])
     sim = SimConfig(impl="jax", max_robots=3, max_obstacles=1)
-    world = env.load(TrainConfig(stage=(stage,), sim=sim))
-    zero = jnp.zeros((), jnp.int32)
-    state = env.reset(world, jax.tree.map(jnp.asarray, drawn), zero, zero)
+    world = programs.load_world(TrainConfig(stage=(stage,), sim=sim))
+    state = env.reset(world, jax.tree.map(jnp.asarray, drawn))
     seen = np.asarray(state.observation)
     state = dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
     step = jax.jit(lambda state, action: env.step(world, state, action))
@@ -299,14 +297,13 @@ def engines(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     arena = ["stage=s6", "stage.robots=3", "stage.side=0.7", "stage.obstacles=1"]
     words = [*arena, f"robot={body}", f"realism={realism}"]
     sim = ["sim.impl=jax", "sim.max_robots=3", "sim.max_obstacles=1"]
-    world = env.load(config.load_train([*words, *sim]))
+    world = programs.load_world(load_train([*words, *sim]))
     steps = f"substeps={world.physics.substeps}"
-    judged = config.load_evaluate([f"policy={path}", steps, *words])
+    judged = load_levels(EvaluateConfig, [f"policy={path}", steps, *words])
     assert judged.realism.name == realism
-    zero = jnp.zeros((), jnp.int32)
 
     def reset(drawn: Level) -> EnvState:
-        state = env.reset(world, drawn, zero, zero)
+        state = env.reset(world, drawn)
         return dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
 
     step = jax.jit(lambda state, action: env.step(world, state, action))
@@ -376,7 +373,7 @@ def test_a_level_replays_exactly(engines: Engines) -> None:
     other = drawn._replace(seed=drawn.seed ^ np.uint32(1))
     _, elsewhere = _train(engines, other, steps)
     judged = _run(engines.judge, engine_c.start(engines.judge, [other]), steps)
-    is_random = engines.world.config.realism.name == "real"
+    is_random = engines.world.realism.name == "real"
     assert (np.array(elsewhere) != np.array(seen)).any() == is_random
     assert (judged.observation[0] != first.observation[0]).any() == is_random
 

@@ -14,25 +14,21 @@ from policies import EMBODIMENT
 from sentences import refusal
 
 from swarmjax import policy_file
-from swarmjax.config import (
-    AlgoConfig,
-    EvaluateConfig,
-    RobotConfig,
-    SimConfig,
-    StageConfig,
-    TrainConfig,
-)
 from swarmjax.evaluate import cells, engine_mjx
 from swarmjax.evaluate import judge as evaluate_judge
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.engine_mjx import Outcomes
 from swarmjax.evaluate.evaluation import Evaluation, evaluate
 from swarmjax.evaluate.measures import MEASURES
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.ppo.normalizer import Normalizer
+from swarmjax.sim.config import RobotConfig, SimConfig
 from swarmjax.task import env, level, observation
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import World
 from swarmjax.task.level import Level
+from swarmjax.task.stage_config import StageConfig
 
 STAGES = (
     StageConfig(name="s1", robots=2, side=0.5),
@@ -50,14 +46,13 @@ Run = Callable[[LearnerState, Level], Outcomes]
 
 @pytest.fixture(scope="module")
 def world() -> World:
-    sim = SimConfig(impl="jax", max_robots=3, max_obstacles=2)
-    algo = AlgoConfig(hidden=(2,), activation="relu")
-    return env.load(TrainConfig(stage=STAGES, sim=sim, algo=algo))
+    return env.load(STAGES, sim=SimConfig(impl="jax", max_robots=3, max_obstacles=2))
 
 
 @pytest.fixture(scope="module")
 def judge(world: World) -> Run:
-    return jax.jit(partial(engine_mjx.outcomes, world, steps=STEPS))
+    algo = AlgoConfig(hidden=(2,), activation="relu")
+    return jax.jit(partial(engine_mjx.outcomes, world, algo, steps=STEPS))
 
 
 @pytest.fixture(scope="module", params=STAGES, ids=lambda stage: stage.name)

@@ -13,18 +13,23 @@ import pytest
 import steering
 from steering import SPEED, STAY, STEP
 
-from swarmjax import command, compose, config, policy
-from swarmjax.config import EvaluateConfig, RealismConfig, RobotConfig, StageConfig, TaskConfig
+from swarmjax import command, policy
+from swarmjax.config import build, files, to_dict
 from swarmjax.evaluate import __main__ as evaluate_command
 from swarmjax.evaluate import cells, statistics
 from swarmjax.evaluate import summary as evaluate_summary
-from swarmjax.evaluate import trials as evaluate_run
+from swarmjax.evaluate import trials as evaluate_trials
 from swarmjax.evaluate.cells import Cell
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import evaluate, list_files
 from swarmjax.evaluate.measures import MEASURES
+from swarmjax.evaluate.suite_config import read_suite
 from swarmjax.evaluate.trials import Trial
-from swarmjax.settings import build, to_dict
+from swarmjax.sim.config import RobotConfig
+from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import observation
+from swarmjax.task.config import TaskConfig
+from swarmjax.task.stage_config import StageConfig
 
 
 def _stage(robots: int, side: float = 1.0, obstacles: int = 0) -> StageConfig:
@@ -47,11 +52,11 @@ def test_a_result_does_not_depend_on_batches_and_workers(
     path = steering.write(tmp_path / "policy.npz")
     found = []
     for workers, batch in ((1, 64), (1, 2), (2, 3)):
-        monkeypatch.setattr(evaluate_run, "BATCH", batch)
+        monkeypatch.setattr(evaluate_trials, "BATCH", batch)
         settings = _config(path, stage=_stage(2, 0.7, 1), steps=120, episodes=7, workers=workers)
         told: list[int] = []
-        entrants = evaluate_run.read_policies([str(path)])
-        (trial,) = evaluate_run.run(settings, cells.load(settings).cells, entrants, told.append)
+        entrants = evaluate_trials.read_policies([str(path)])
+        (trial,) = evaluate_trials.run(settings, cells.load(settings).cells, entrants, told.append)
         assert sum(told) == 7
         found.append(trial)
     for other in found[1:]:
@@ -232,7 +237,7 @@ def suite(tmp_path: Path) -> Path:
         "  - {name: one, stage: s1, levels: 4, seed: 1000001}\n"
         "  - {name: two, stage: s3, levels: 5, seed: 1000002, shape: bar, realism: webots}\n"
     )
-    drawn = [cells.draw_cell(each) for each in config.read_suite(str(file)).cells]
+    drawn = [cells.draw_cell(each) for each in read_suite(str(file)).cells]
     cells.write(tmp_path / "tiny.npz", cells.Suite("tiny", tuple(drawn)))
     return tmp_path / "tiny.npz"
 
@@ -250,7 +255,7 @@ def test_a_suite_and_several_policies_fill_a_folder(
     assert [each["path"][-9:] for each in result["policies"]] == [f"seed{i}.npz" for i in range(3)]
     assert [cell["cell"] for cell in result["cells"]] == ["one", "two"]
     assert [cell["realism"]["name"] for cell in result["cells"]] == ["ideal", "webots"]
-    preset = build(RealismConfig, compose.read_preset("realism", "webots"))
+    preset = build(RealismConfig, files.read_preset("realism", "webots"))
     assert result["cells"][1]["realism"] == _plain(preset)
     with (out / "levels.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -315,7 +320,7 @@ def test_unreachable_targets_are_shown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(
-        evaluate_run.shortest_path, "shortest", lambda side, start, *_: _lost(start)
+        evaluate_trials.shortest_path, "shortest", lambda side, start, *_: _lost(start)
     )
     path = steering.write(tmp_path / "policy.npz")
     words = (f"policy={path}", "stage=s1", "episodes=3", "steps=2", "workers=1")

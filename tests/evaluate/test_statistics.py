@@ -12,14 +12,8 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from scipy import stats
 
 from swarmjax.evaluate import statistics
-from swarmjax.evaluate.statistics import (
-    bootstrap,
-    curve,
-    cvar,
-    iqm,
-    paired,
-    probability_of_improvement,
-)
+from swarmjax.evaluate.curves import area_under, curve, steps_to
+from swarmjax.evaluate.statistics import bootstrap, cvar, iqm, paired, probability_of_improvement
 
 ROUNDING = 1e-12  # of sums of numbers up to 100 in double precision, some in another order
 FINITE = st.floats(-100, 100, width=32)
@@ -576,10 +570,8 @@ def test_curve_refuses() -> None:
 def test_area_by_hand() -> None:
     # From 0 to 10: 1 to 3 in 4 steps, area 8; 3 to 0 in 6 steps, area 9; together 17 over 10.
     values = [[1.0, 3.0, 0.0], [2.0, 2.0, 2.0]]
-    np.testing.assert_allclose(
-        statistics.area_under([0, 4, 10], values), [1.7, 2.0], rtol=0, atol=ROUNDING
-    )
-    assert statistics.area_under([100, 104, 110], values[0]) == pytest.approx(1.7, abs=ROUNDING)
+    np.testing.assert_allclose(area_under([0, 4, 10], values), [1.7, 2.0], rtol=0, atol=ROUNDING)
+    assert area_under([100, 104, 110], values[0]) == pytest.approx(1.7, abs=ROUNDING)
 
 
 def test_steps_to_by_hand() -> None:
@@ -590,7 +582,7 @@ def test_steps_to_by_hand() -> None:
         [0.0, 0.1, 0.2, 0.3],  # never
         [0.5, 0.5, 0.5, 0.7],  # half way from 30 to 40
     ]
-    found = statistics.steps_to([0, 10, 30, 40], curves, 0.6)
+    found = steps_to([0, 10, 30, 40], curves, 0.6)
     np.testing.assert_allclose(found, [20, 10, 0, math.inf, 35], rtol=0, atol=ROUNDING)
     # Of 0, 10, 20, 35, inf one comes off either end: (10 + 20 + 35) / 3.
     assert iqm(found) == pytest.approx(65 / 3, abs=ROUNDING)
@@ -600,7 +592,7 @@ def test_steps_to_by_hand() -> None:
 @given(arrays(np.float64, st.integers(2, 12), elements=FINITE), st.floats(-110, 110))
 def test_steps_to_is_where_the_curve_first_is_at_the_threshold(values, threshold: float) -> None:
     steps = np.arange(len(values)) ** 2 + 5.0
-    found = float(statistics.steps_to(steps, values, threshold))
+    found = float(steps_to(steps, values, threshold))
     if found == math.inf:
         assert values.max() < threshold
     else:
@@ -625,10 +617,10 @@ def test_steps_to_is_where_the_curve_first_is_at_the_threshold(values, threshold
     ],
 )
 def test_curves_are_refused(steps, values, expected: str) -> None:
-    assert expected in _refusal(statistics.area_under, steps, values)
-    assert expected in _refusal(statistics.steps_to, steps, values, 0.5)
+    assert expected in _refusal(area_under, steps, values)
+    assert expected in _refusal(steps_to, steps, values, 0.5)
 
 
 @pytest.mark.parametrize("threshold", [math.nan, math.inf])
 def test_steps_to_refuses_a_threshold_that_is_none(threshold: float) -> None:
-    assert "threshold is" in _refusal(statistics.steps_to, [0, 1], [0.0, 1.0], threshold)
+    assert "threshold is" in _refusal(steps_to, [0, 1], [0.0, 1.0], threshold)

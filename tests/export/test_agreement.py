@@ -14,12 +14,12 @@ import pytest
 from policies import Arrays, saved, several
 
 from swarmjax import policy
-from swarmjax.config import AlgoConfig
 from swarmjax.export import c as export_c
 from swarmjax.export import folder as export_folder
 from swarmjax.export import onnx as export_onnx
 from swarmjax.policy import Policy
 from swarmjax.ppo import networks, normalizer
+from swarmjax.ppo.config import AlgoConfig
 
 OBSERVATIONS = 10_000
 # What is asked for. Sums of 64 float32 terms differ in their order alone: actions up to 2.5 units

@@ -12,11 +12,12 @@ import pytest
 from policies import saved, several
 
 from swarmjax import epuck, policy
-from swarmjax.config import AlgoConfig, RobotConfig
 from swarmjax.export import c as export_c
 from swarmjax.export import folder as export_folder
 from swarmjax.policy import Policy
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.sim import drive
+from swarmjax.sim.config import RobotConfig
 
 STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wshadow",
           "-Wconversion", "-Wdouble-promotion")  # fmt: skip

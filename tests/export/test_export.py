@@ -11,12 +11,13 @@ import pytest
 from policies import saved
 from sentences import refusal
 
-from swarmjax import command, config, policy_file
-from swarmjax.config import ConfigError, ExportConfig, TrainConfig
+from swarmjax import command, policy_file
+from swarmjax.config import ConfigError, build, to_dict
 from swarmjax.export import __main__ as export
 from swarmjax.export import folder as export_folder
+from swarmjax.export.config import ExportConfig
 from swarmjax.run.policy_export import policy_meta
-from swarmjax.run.settings import read_config
+from swarmjax.run.settings import TrainConfig, load_train, read_config
 
 FORMATS = {"npz": "policy.npz", "onnx": "policy.onnx", "c": "policy_c", "webots": "swarmjax_epuck"}
 
@@ -73,7 +74,7 @@ def test_a_policy_file_is_copied_as_it_is(tmp_path: Path) -> None:
 
 
 def test_the_policy_says_what_it_was_trained_with(tmp_path: Path) -> None:
-    trained = config.load_train(
+    trained = load_train(
         ["stage=s1", "robot=wheeled_v2", "realism=real", "task.control_step=0.064", "seed=4"]
     )
     said = policy_meta(trained, update=7, seed=4)
@@ -88,7 +89,7 @@ def test_the_policy_says_what_it_was_trained_with(tmp_path: Path) -> None:
     assert said["task"] == {"control_step": 0.064, "target_radius": 0.05}
     assert said["observation"]["encoding"] == "metric"
     assert (said["update"], said["seed"]) == (7, 4)
-    assert config.build(TrainConfig, said["config"]) == trained
+    assert build(TrainConfig, said["config"]) == trained
     policy_file.write(tmp_path / "policy.npz", policies.arrays(), said)  # refuses nothing of it
 
 
@@ -102,7 +103,7 @@ def test_the_policy_says_what_it_was_trained_with(tmp_path: Path) -> None:
     ],
 )
 def test_a_robot_is_named_by_the_file_that_has_its_numbers(words: list[str], name: str) -> None:
-    trained = config.load_train(["stage=s1", *words])
+    trained = load_train(["stage=s1", *words])
     assert policy_meta(trained, 0, 0)["robot"]["preset"] == name
 
 
@@ -155,8 +156,8 @@ def test_a_config_that_is_none_is_refused(content: str, tmp_path: Path) -> None:
 
 
 def test_a_step_is_named_in_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    trained = config.load_train(["stage=s1"])
-    (tmp_path / "config.json").write_text(json.dumps(config.to_dict(trained)))
+    trained = load_train(["stage=s1"])
+    (tmp_path / "config.json").write_text(json.dumps(to_dict(trained)))
     final = tmp_path / "policy.npz"
     before = saved(final)
     monkeypatch.setattr(export.checkpoint, "restore", lambda run, step: ({}, step, []))

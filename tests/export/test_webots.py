@@ -16,13 +16,15 @@ from hypothesis import strategies as st
 from policies import saved, several
 
 from swarmjax import epuck, policy
-from swarmjax.config import RealismConfig, RobotConfig, TaskConfig
 from swarmjax.export import __main__ as export
 from swarmjax.export import webots, webots_controller
 from swarmjax.policy import Policy
 from swarmjax.sim import drive, response
+from swarmjax.sim.config import RobotConfig
+from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors, observation
+from swarmjax.task.config import TaskConfig
 
 # What a controller sees of Webots: written from the manual's names and units. It plays a script,
 # {"basic": ms, "custom": text, "missing": [names], "steps": [{"counts": [8], "gps": [3],

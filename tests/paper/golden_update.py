@@ -14,10 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmjax.config import AlgoConfig, load_train
+from swarmjax.ppo import dispatch, networks
 from swarmjax.ppo import learner as ppo
-from swarmjax.ppo import networks
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import LearnerState
+from swarmjax.run.settings import load_train
 from swarmjax.training import rollout
 from swarmjax.training.rollout import Trajectory
 
@@ -111,7 +112,9 @@ def _learn(
 ) -> tuple[LearnerState, dict[str, jax.Array]]:
     config = replace(PAPER, epochs=epochs)
     keys = jax.random.split(jax.random.key(0), 1)
-    return jax.vmap(lambda s, b, k: ppo.update(s, config, b, k, TOTAL))(state, batch, keys)
+    backend = dispatch.resolve(config, inputs.OBSERVATION, inputs.ACTION)  # as a run has it
+    update = jax.vmap(lambda s, b, k: ppo.update(s, config, b, k, TOTAL, backend))
+    return update(state, batch, keys)
 
 
 def _loss(metrics: dict[str, jax.Array], config: AlgoConfig) -> float:

@@ -7,21 +7,25 @@ import numpy as np
 import pytest
 from sentences import refusal
 
-from swarmjax import compose, config, epuck
-from swarmjax.config import AlgoConfig, RewardConfig, TrainConfig, load_train
+from swarmjax import epuck
+from swarmjax.command import help_text
+from swarmjax.config import build, files, to_dict
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.run.settings import TrainConfig, load_train
 from swarmjax.sim import drive
 from swarmjax.task import observation
 from swarmjax.task import stage as task_stage
-from swarmjax.training import rollout
+from swarmjax.task.config import RewardConfig
+from swarmjax.training import program as programs
 
-FILES = Path(compose.__file__).resolve().parent.parent / "configs"
+FILES = Path(files.__file__).resolve().parents[2] / "configs"
 PAPER = load_train(["algo=paper"])
 # "timesteps" is Table 1's own word; a key of two words names what it stands for here.
 TABLE_1 = {
     "max training timesteps": (PAPER.budget, 1_000_000),
     "Max timesteps per episode": (PAPER.task.step_limit, 1500),
     "state space dimension": (observation.SIZE, 10),
-    "action space dimension": (rollout.ACTION_SIZE, 2),
+    "action space dimension": (programs.ACTION_SIZE, 2),
     "discount factor (gamma)": (PAPER.algo.discount, 0.99),
     "PPO epsilon clip": (PAPER.algo.clip, 0.2),
     "PPO K epochs": (PAPER.algo.epochs, 80),
@@ -42,15 +46,15 @@ def test_every_row_of_table_1_is_in_the_preset_by_its_name(row: str) -> None:
 
 
 def test_the_help_names_the_rows_of_the_algorithm() -> None:
-    text = config.help_text(TrainConfig, "swarmjax.train")
+    text = help_text(TrainConfig, "swarmjax.train")
     algorithm = list(TABLE_1)[4:]
     assert [row for row in algorithm if f"'{row}'" not in text] == []
 
 
 def test_the_preset_leaves_no_number_of_the_learner_to_a_default() -> None:
-    given = compose.read_preset("algo", "paper")
-    # One has no meaning, one says how numbers come about, not which, two belong to the limit.
-    others = {"gae_lambda", "gradient", "contact_price_rate", "contact_price_arrivals"}
+    given = files.read_preset("algo", "paper")
+    # One has no meaning, one says how numbers come about, not which.
+    others = {"gae_lambda", "gradient"}
     assert set(given["algo"]) | others == {f.name for f in dataclasses.fields(AlgoConfig)}
     assert PAPER.algo.gae_lambda is None
     rewards = {f.name for f in dataclasses.fields(RewardConfig)}
@@ -140,4 +144,4 @@ def test_options_take_their_defaults_where_they_have_a_meaning() -> None:
     other = AlgoConfig(returns="monte_carlo", exploration="scheduled")
     assert (other.gae_lambda, other.time_out) == (None, "terminal")
     assert (other.std_decrement, other.std_interval, other.std_floor) == (0.05, 250_000, 0.1)
-    assert config.build(AlgoConfig, config.to_dict(other)) == other
+    assert build(AlgoConfig, to_dict(other)) == other

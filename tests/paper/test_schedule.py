@@ -12,11 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax.config import SimConfig, StageConfig, TrainConfig, load_train
 from swarmjax.curriculum import engine as curriculum
 from swarmjax.ppo import exploration
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.sim.config import SimConfig
+from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import loop, rollout
-from swarmjax.training.loop import Program, TrainState
+from swarmjax.training import program as programs
+from swarmjax.training.loop import TrainState
+from swarmjax.training.program import Program
 
 PAPER = load_train(["algo=paper", "sim.impl=jax"])
 
@@ -74,7 +78,7 @@ def test_the_updates_of_a_million_steps() -> None:
 
 def _drive(config: TrainConfig, updates: int) -> dict[str, np.ndarray]:
     """Drives one arena for so many rollouts, learning nothing; [updates, T, ...] of each step."""
-    program, schedule = loop.load(config)
+    program, schedule = programs.load(config)
     state = jax.jit(partial(loop.init, program))(schedule)
     rounds = jax.jit(lambda s: jax.lax.scan(partial(_round, program, schedule), s, length=updates))
     _, found = rounds(state)
@@ -87,10 +91,12 @@ def _round(
     """One rollout as in `loop.update`, and what is needed to see with which deviation."""
     config, world = program.config, program.world
     key, level_key, rollout_key = jax.random.split(state.key, 3)
-    index = jnp.zeros(rollout.waiting(config.algo.rollout), jnp.int32)
+    index = jnp.zeros(config.waiting, jnp.int32)
     starts = rollout.draw_starts(world, schedule.stages, index, jnp.int32(0), level_key)
-    arenas, path, ended = rollout.collect(world, state.learners, state.arenas, starts, rollout_key)
-    learners = rollout.explore(world, state.learners, config.algo.rollout)
+    arenas, path, ended = rollout.collect(
+        program, state.learners, state.arenas, starts, rollout_key
+    )
+    learners = rollout.explore(program, state.learners, config.algo.rollout)
     mean = jax.vmap(lambda one, seen: loop.ppo.mode(one, config.algo, seen), in_axes=(0, 1))(
         learners, path.observation
     )

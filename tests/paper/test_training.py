@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from swarmjax import policy
-from swarmjax.config import TrainConfig, load_train
 from swarmjax.ppo import learner as ppo
 from swarmjax.run.checkpoint import to_leaves
 from swarmjax.run.policy_export import write_policy
+from swarmjax.run.settings import TrainConfig, load_train
 from swarmjax.training import loop, seeds
+from swarmjax.training import program as programs
 
 ROLLOUT, LIMIT, UPDATES = 128, 32, 8
 KERNEL = "learners/params/actor/mean/kernel"
@@ -36,7 +37,7 @@ def config() -> TrainConfig:
 
 
 def test_it_trains_and_judges_in_one_trace(config: TrainConfig) -> None:
-    program, schedule = loop.load(config)
+    program, schedule = programs.load(config)
     traces = []
 
     def chunk(state: loop.TrainState, n: np.int32) -> tuple[loop.TrainState, dict]:
@@ -76,7 +77,7 @@ def test_it_trains_and_judges_in_one_trace(config: TrainConfig) -> None:
 
 
 def test_an_exported_policy_has_the_output_of_tanh(config: TrainConfig, tmp_path: Path) -> None:
-    program, schedule = loop.load(config)
+    program, schedule = programs.load(config)
     state = jax.jit(partial(seeds.init, program))(schedule)
     # As drawn the last layer is small; ten times as large, tanh bends it.
     actor = state.learners.params["actor"]

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmjax.config import AlgoConfig
 from swarmjax.ppo import exploration, learner
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch
 
 SCHEDULED = AlgoConfig(
@@ -68,7 +68,7 @@ def test_an_update_leaves_a_scheduled_deviation_alone() -> None:
         return_=observation[..., 1],
         valid=jnp.ones((4, 6), bool),
     )
-    updated, metrics = learner.update(state, SCHEDULED, batch, jax.random.key(2), 5)
+    updated, metrics = learner.update(state, SCHEDULED, batch, jax.random.key(2), 5, "blocks")
     np.testing.assert_array_equal(
         updated.params["actor"]["log_std"], state.params["actor"]["log_std"]
     )

@@ -9,8 +9,8 @@ import numpy as np
 import optax
 import pytest
 
-from swarmjax.config import AlgoConfig
-from swarmjax.ppo import learner, losses, networks
+from swarmjax.ppo import dispatch, learner, losses, networks
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch, LearnerState
 
 G, N, OBSERVATION, U, UPDATES = 8, 6, 3, 2, 5
@@ -22,7 +22,8 @@ ONE_STEP = AlgoConfig(hidden=(8,), epochs=1, minibatches=1)
 def _update(
     state: LearnerState, batch: Batch, key: jax.Array, config: AlgoConfig = CONFIG
 ) -> tuple[LearnerState, losses.Metrics]:
-    return learner.update(state, config, batch, key, UPDATES)
+    backend = dispatch.resolve(config, OBSERVATION, U)  # as a run has it
+    return learner.update(state, config, batch, key, UPDATES, backend)
 
 
 def _batch(state: LearnerState, seed: int = 0, config: AlgoConfig = CONFIG) -> Batch:

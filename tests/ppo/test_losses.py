@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from swarmjax.config import AlgoConfig
 from swarmjax.ppo import networks
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.losses import Minibatch, ppo_loss
 
 B, OBSERVATION, U = 24, 3, 2

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from swarmjax.config import AlgoConfig
 from swarmjax.ppo import networks
+from swarmjax.ppo.config import AlgoConfig
 
 OBSERVATION, U = 3, 2
 CONFIG = AlgoConfig(hidden=(8, 5), initial_std=0.6)

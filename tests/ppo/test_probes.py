@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax.config import AlgoConfig
 from swarmjax.ppo import learner
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.dispatch import Backend
 from swarmjax.ppo.fast import fused
 from swarmjax.ppo.gae import generalized_advantages
 from swarmjax.ppo.learner import Batch, LearnerState
@@ -78,7 +79,7 @@ def _act(
 
 
 def _iterate(
-    probe: Probe, carry: tuple[LearnerState, World], key: jax.Array
+    probe: Probe, backend: Backend, carry: tuple[LearnerState, World], key: jax.Array
 ) -> tuple[tuple[LearnerState, World], None]:
     state, world = carry
     rollout_key, update_key = jax.random.split(key)
@@ -96,17 +97,17 @@ def _iterate(
     samples = {name: steps[name] for name in ("observation", "action", "log_prob")}
     samples |= {"advantage": advantage, "return_": return_, "valid": jnp.ones_like(advantage)}
     batch = Batch(**jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), samples))
-    state, _ = learner.update(state, CONFIG, batch, update_key, UPDATES)
+    state, _ = learner.update(state, CONFIG, batch, update_key, UPDATES, backend)
     return (state, world), None
 
 
-def _solve(probe: Probe, first: float = 0.0) -> LearnerState:
+def _solve(probe: Probe, first: float = 0.0, backend: Backend = "autodiff") -> LearnerState:
     """Trains from a mean action of about `first`."""
     init_key, world_key, loop_key = jax.random.split(jax.random.key(0), 3)
 
     @jax.jit
     def run(state: LearnerState, world: World, keys: jax.Array) -> LearnerState:
-        return jax.lax.scan(functools.partial(_iterate, probe), (state, world), keys)[0][0]
+        return jax.lax.scan(functools.partial(_iterate, probe, backend), (state, world), keys)[0][0]
 
     state = learner.init(init_key, CONFIG, 1, 1, UPDATES)
     state.params["actor"]["mean"]["bias"] = jnp.array([first])
@@ -183,11 +184,12 @@ def test_an_actor_beyond_the_range_of_commands_comes_back() -> None:
 
 
 def test_the_kernels_teach_the_actor_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fused, "resolve", lambda *_: "fused")
     interpreted = functools.partial(fused.flat_gradient, interpret=True)
     monkeypatch.setattr(fused, "flat_gradient", interpreted)
     probe = Probe(
         1, lambda draw, clock: draw, lambda draw, action, clock: -((action - 0.5 * draw) ** 2)
     )
     # As above.
-    np.testing.assert_allclose(_modes(_solve(probe), -1.0, 1.0), [-0.5, 0.5], atol=0.02)
+    np.testing.assert_allclose(
+        _modes(_solve(probe, backend="fused"), -1.0, 1.0), [-0.5, 0.5], atol=0.02
+    )

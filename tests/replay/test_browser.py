@@ -11,7 +11,7 @@ import pytest
 import replays
 import steering
 
-from swarmjax import config, policy_file
+from swarmjax import policy_file
 from swarmjax.replay import pack as replay_pack
 from swarmjax.replay import page as replay_page
 from swarmjax.replay.record import Recording
@@ -20,6 +20,9 @@ pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
+
+from swarmjax.replay.config import ReplayConfig
+from swarmjax.task.stage_files import load_levels
 
 pytestmark = chromium.needed
 HOSTILE = "</script><script>document.title='in'</script>.npz"
@@ -45,7 +48,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[list[Recording]]:
 def file(tmp_path_factory: pytest.TempPathFactory, runs: list[list[Recording]]) -> Path:
     """The page of both."""
     folder = tmp_path_factory.mktemp("page")
-    settings = config.load_replay([f"policy={HOSTILE},ahead.npz", *WORDS])
+    settings = load_levels(ReplayConfig, [f"policy={HOSTILE},ahead.npz", *WORDS])
     trained = policy_file.read(steering.write(folder / "steer.npz"))
     episodes = [
         replays.episode(*each, level=level)
@@ -168,7 +171,7 @@ def test_it_plays_to_the_last_frame(browser, file):
 def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A page of 400 steps, 12.8 s, and of robots whose trails are cut after 10 s."""
     folder = tmp_path_factory.mktemp("long")
-    settings = config.load_replay(["policy=a.npz"])
+    settings = load_levels(ReplayConfig, ["policy=a.npz"])
     trained = policy_file.read(steering.write(folder / "steer.npz"))
     episodes = [replays.episode(replays.wandering(1, 401))]
     path = folder / "replay.html"

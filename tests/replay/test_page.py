@@ -8,8 +8,10 @@ from html.parser import HTMLParser
 import replays
 import steering
 
-from swarmjax import config, policy_file
+from swarmjax import policy_file
 from swarmjax.replay import page as replay_page
+from swarmjax.replay.config import ReplayConfig
+from swarmjax.task.stage_files import load_levels
 
 HOSTILE = "</script><script>document.title='in'</script><img src=x onerror=alert(1)>&amp;"
 
@@ -45,7 +47,7 @@ def test_a_hostile_title_stays_text():
 def test_hostile_names_are_nowhere_in_the_page(tmp_path):
     path = steering.write(tmp_path / "steer.npz")
     names = [f"policy={HOSTILE},{HOSTILE}b", "worst=2", "realism=real"]
-    settings = config.load_replay(names)
+    settings = load_levels(ReplayConfig, names)
     trained = policy_file.read(path)
     run = replays.wandering(2, 5)
     text = replay_page.page(settings, [trained] * 2, [replays.episode(run, run)], f"run {HOSTILE}")

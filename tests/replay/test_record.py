@@ -12,14 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sentences import refusal
 
-from swarmjax import config, policy_file
-from swarmjax.config import RewardConfig, TaskConfig
+from swarmjax import policy_file
 from swarmjax.evaluate import cells, engine_c
 from swarmjax.policy import PolicyError
 from swarmjax.replay import record as replay_record
+from swarmjax.replay.config import ReplayConfig
 from swarmjax.replay.record import Steps
 from swarmjax.sim import infrared
 from swarmjax.task import reward
+from swarmjax.task.config import RewardConfig, TaskConfig
+from swarmjax.task.stage_files import load_levels
 
 WEIGHTS = RewardConfig(
     progress=2.0, proximity=-0.01, arrival=0.5, contact=-0.3, robot_contact=-0.2, time=-1e-4
@@ -91,7 +93,7 @@ def test_weights_are_those_of_training(tmp_path):
 def test_a_recording_is_what_the_judge_saw(steer):
     words = [*replays.SMALL, "level=0,3", "steps=200", "realism=real"]
     judge, found = replays.recorded(steer, *words)
-    settings = config.load_replay([f"policy={steer}", *words])
+    settings = load_levels(ReplayConfig, [f"policy={steer}", *words])
     levels = cells.split(cells.load(settings.evaluation).cells[0].levels)
     for number, recording in zip(settings.levels, found, strict=True):
         alone = engine_c.simulate(judge, [levels[number]])

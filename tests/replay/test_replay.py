@@ -13,12 +13,17 @@ import replays
 import steering
 from sentences import refusal
 
-from swarmjax import command, config, policy_file
-from swarmjax.config import CellConfig, ReplayConfig, StageConfig
-from swarmjax.evaluate import cells
+from swarmjax import command, policy_file
+from swarmjax.evaluate import cells, judge, trials
+from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.evaluate.suite_config import SUITE_SEED, CellConfig
 from swarmjax.policy import PolicyError
 from swarmjax.replay import __main__ as replay
+from swarmjax.replay import video
 from swarmjax.replay.__main__ import Pick
+from swarmjax.replay.config import ReplayConfig
+from swarmjax.task.stage_config import StageConfig
+from swarmjax.task.stage_files import load_levels
 
 ROOT = Path(replay.__file__).resolve().parents[2]
 QUICK = (*replays.SMALL, "steps=40", "workers=1")
@@ -39,13 +44,13 @@ def _trial(reached: list, contacts: list, time: list):
 
 
 def test_the_worst_reached_least_then_touched_most_then_took_longest():
-    trials = [
+    judged = [
         _trial([1.0, 0.4, 0.4, 0.4], [9.0, 1.0, 2.0, 1.0], [48.0, 48.0, 48.0, 30.0]),
         _trial([0.4, 0.2], [1.0, 0.0], [48.0, 48.0]),
     ]
     order = [Pick(1, 1), Pick(0, 2), Pick(0, 1), Pick(1, 0), Pick(0, 3), Pick(0, 0)]
-    assert replay.worst(trials, 6) == order
-    assert replay.worst(trials, 2) == order[:2]
+    assert replay.worst(judged, 6) == order
+    assert replay.worst(judged, 2) == order[:2]
 
 
 def _labels(capsys: pytest.CaptureFixture[str]) -> str:
@@ -73,8 +78,10 @@ def test_the_worst_are_replayed(steer, tmp_path, capsys):
 
 def test_policies_replay_the_same_levels(steer, tmp_path):
     ahead = steering.write(tmp_path / "ahead.npz", steering.AHEAD)
-    settings = config.load_replay([f"policy={steer},{ahead}", *QUICK, "level=2", "shape=cross"])
-    entrants = replay.evaluate_run.read_policies(settings.policies)
+    settings = load_levels(
+        ReplayConfig, [f"policy={steer},{ahead}", *QUICK, "level=2", "shape=cross"]
+    )
+    entrants = trials.read_policies(settings.policies)
     progress = replay.Progress(disable=True)
     (episode,) = replay.replay(settings, entrants, progress)
     first, second = episode.runs
@@ -98,7 +105,7 @@ def suite(tmp_path: Path) -> Path:
                     stage=stage,
                     levels=len(numbers),
                     episodes=numbers,
-                    seed=config.SUITE_SEED,
+                    seed=SUITE_SEED,
                 )
             )
         )
@@ -119,16 +126,16 @@ def test_the_worst_of_a_suite_are_replayed(steer, suite, tmp_path, capsys):
 
 def test_only_levels_that_are_named_are_drawn(steer, monkeypatch):
     words = [f"policy={steer}", *QUICK, "shape=cross", "seed=5", "robot.hull_radius=0.035"]
-    settings = config.load_replay([*words, "level=7,2"])
+    settings = load_levels(ReplayConfig, [*words, "level=7,2"])
     every = cells.load(settings.evaluation).cells[0]
-    drawn, draw = [], replay.evaluate_judge.draw_level
+    drawn, draw = [], judge.draw_level
 
     def count(stage, spacing, seed, episode):
         drawn.append(episode)
         return draw(stage, spacing, seed, episode)
 
-    monkeypatch.setattr(replay.evaluate_judge, "draw_level", count)
-    entrants = replay.evaluate_run.read_policies(settings.policies)
+    monkeypatch.setattr(judge, "draw_level", count)
+    entrants = trials.read_policies(settings.policies)
     seven, two = replay.replay(settings, entrants, replay.Progress(disable=True))
     assert drawn[:2] == [7, 2]
     assert set(drawn[2:]) <= {0}  # which the engine is compiled with
@@ -176,8 +183,8 @@ def test_a_film_that_cannot_be_written_says_why(steer, tmp_path, monkeypatch):
     def fail(*_: object) -> None:
         raise OSError("ffmpeg ended")  # as imageio does, without a number
 
-    monkeypatch.setattr(replay.replay_video, "check", lambda: None)
-    monkeypatch.setattr(replay.replay_video, "write", fail)
+    monkeypatch.setattr(video, "check", lambda: None)
+    monkeypatch.setattr(video, "write", fail)
     film = tmp_path / "a.mp4"
     words = [f"policy={steer}", *QUICK, f"out={tmp_path / 'a.html'}", f"video={film}"]
     sentence = f"video is {film}, which cannot be written: ffmpeg ended."
@@ -198,17 +205,19 @@ def test_what_a_suite_has_not_is_refused(steer, suite):
         ),
     }.items():
         assert refusal(replay.main, [*words, *more]) == sentence
-    assert refusal(config.load_replay, [*words, "seed=3"]).startswith("seed cannot be given with")
+    assert refusal(load_levels, ReplayConfig, [*words, "seed=3"]).startswith(
+        "seed cannot be given with"
+    )
 
 
 def test_defaults():
-    settings = config.load_replay(["policy=a.npz,b.npz"])
-    stage = config.load_evaluate(["policy=a"]).stage
+    settings = load_levels(ReplayConfig, ["policy=a.npz,b.npz"])
+    stage = load_levels(EvaluateConfig, ["policy=a"]).stage
     assert settings == ReplayConfig(policy="a.npz,b.npz", stage=stage)
     assert settings.policies == ("a.npz", "b.npz")
     assert (settings.levels, settings.robot.body, settings.steps) == ((0,), "wheeled", 1500)
     assert settings.evaluation.episodes == 1
-    assert config.load_replay(["policy=a", "worst=5"]).evaluation.episodes == 1000
+    assert load_levels(ReplayConfig, ["policy=a", "worst=5"]).evaluation.episodes == 1000
 
 
 @pytest.mark.parametrize(
@@ -230,12 +239,12 @@ def test_defaults():
     ],
 )
 def test_settings_are_refused(words, sentence):
-    assert refusal(config.load_replay, ["policy=a.npz", *words]) == sentence
+    assert refusal(load_levels, ReplayConfig, ["policy=a.npz", *words]) == sentence
 
 
 @pytest.mark.parametrize("policies", ["a,b,c", "a,", ",a"])
 def test_one_or_two_policies(policies):
-    assert refusal(config.load_replay, [f"policy={policies}"]) == (
+    assert refusal(load_levels, ReplayConfig, [f"policy={policies}"]) == (
         f"policy is '{policies}': give one file, or two with a comma between them."
     )
 

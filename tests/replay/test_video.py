@@ -11,20 +11,21 @@ import numpy as np
 import pytest
 import replays
 
-from swarmjax import config
-from swarmjax.config import ConfigError, ReplayConfig
-from swarmjax.replay import video as replay_video
+from swarmjax.config import ConfigError
+from swarmjax.replay import video
+from swarmjax.replay.config import ReplayConfig
+from swarmjax.task.stage_files import load_levels
 
-ROOT = Path(replay_video.__file__).resolve().parents[2]
+ROOT = Path(video.__file__).resolve().parents[2]
 
 
 def _settings(*words: str) -> ReplayConfig:
-    return config.load_replay(["policy=a", *words])
+    return load_levels(ReplayConfig, ["policy=a", *words])
 
 
 def test_the_camera_has_all_of_the_arena_in_its_picture():
     for side, aspect in ((1.2, 16 / 9), (4.0, 4 / 3), (0.5, 0.5)):
-        away = replay_video.camera_distance(side, aspect)
+        away = video.camera_distance(side, aspect)
         tall = wide = 0.0
         for x in (-1, 1):
             for y in (-1, 1):
@@ -45,15 +46,15 @@ def test_pictures_are_spread_evenly_over_time():
     settings = _settings("task.control_step=0.1", "video_speed=2")
     episode = replays.episode(replays.wandering(1, 11), replays.wandering(1, 6))
     # Two seconds of the film are 30 pictures of 1/15 s each: 10 steps of 0.1 s make 15.
-    rows = replay_video.rows(settings, episode.runs)
+    rows = video.rows(settings, episode.runs)
     assert rows[:15] == [math.floor(k / 1.5) for k in range(15)]
     assert rows[15:] == [10] * 30  # and one second of the end
-    assert replay_video.count(settings, [episode] * 2) == 90
+    assert video.count(settings, [episode] * 2) == 90
 
 
 def test_things_have_their_true_sizes():
     settings, run = _settings(), replays.wandering(3, 2)
-    model = replay_video.build(settings, run, 1280).compile()
+    model = video.build(settings, run, 1280).compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     kinds, sizes, places = model.geom_type, model.geom_size, data.geom_xpos
@@ -80,10 +81,10 @@ def test_without_opengl_or_ffmpeg_it_says_what_to_install(monkeypatch):
     monkeypatch.setattr(mujoco, "Renderer", fail)
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     with pytest.raises(ConfigError, match=r"^video needs OpenGL, which MUJOCO_GL=glfw does not"):
-        replay_video.check()
+        video.check()
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(ConfigError, match=r"^video needs imageio .* uv sync --extra video\.$"):
-        replay_video.check()
+        video.check()
 
 
 # MuJoCo chooses its OpenGL when it is imported, so that a process of its own is needed.
@@ -95,20 +96,22 @@ except Exception:
     sys.exit(77)
 import numpy as np, imageio.v2 as imageio, replays
 from pathlib import Path
-from swarmjax import config, replay_video
-from swarmjax.settings import ConfigError
+from swarmjax.config import ConfigError
+from swarmjax.replay import video
+from swarmjax.replay.config import ReplayConfig
+from swarmjax.task.stage_files import load_levels
 try:
-    replay_video.check()
+    video.check()
 except ConfigError:
     sys.exit(77)
-replay_video.HEIGHT, replay_video.HOLD = 240, 0.1
+video.HEIGHT, video.HOLD = 240, 0.1
 run = replays.wandering(2, 4)
 run.pose[:, :, :2] = run.scene.target[:] = [[-0.3, -0.3], [0.3, 0.3]]
 run.ray[:], run.touching[:] = 0.04, False
 run.touching[:, 1] = True
-settings = config.load_replay(["policy=a", "video_speed=0.5"])
+settings = load_levels(ReplayConfig, ["policy=a", "video_speed=0.5"])
 out = Path(sys.argv[1])
-replay_video.write(out, settings, [replays.episode(run, run)])
+video.write(out, settings, [replays.episode(run, run)])
 film = imageio.get_reader(out)
 pictures = [film.get_data(i) for i in range(film.count_frames())]
 np.savez(sys.argv[2], count=len(pictures), picture=pictures[0])

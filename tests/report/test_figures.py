@@ -9,10 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from runs import CONFIG, row, write
 
-from swarmjax.config import StageConfig
 from swarmjax.report import figures as report_figures
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History
+from swarmjax.task.stage_config import StageConfig
 
 BOLD, THIN = "#0b4f9e", "0.62"
 

@@ -9,8 +9,8 @@ import pytest
 from runs import row, write
 
 from swarmjax import command
-from swarmjax.config import ReportConfig
 from swarmjax.report import __main__ as report
+from swarmjax.report.config import ReportConfig
 
 
 def _run(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
@@ -88,7 +88,8 @@ def test_matplotlib_is_loaded_to_draw_only_and_jax_never(tmp_path: Path) -> None
     run = write(tmp_path, [row(0)])
     code = (
         "import sys\n"
-        "from swarmjax import display, recorder, report\n"
+        "from swarmjax.report import __main__ as report\n"
+        "from swarmjax.run import display, recorder\n"
         "assert 'matplotlib' not in sys.modules\n"
         f"report.main(['run={run}'])\n"
         "assert 'matplotlib' in sys.modules\n"

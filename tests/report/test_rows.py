@@ -8,8 +8,9 @@ import pytest
 from runs import CONFIG, row, write
 from sentences import refusal
 
-from swarmjax.config import CurriculumConfig, StageConfig
+from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.report import rows as report_rows
+from swarmjax.task.stage_config import StageConfig
 
 NAN = np.nan
 

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 from sentences import refusal
 
-from swarmjax import config
-from swarmjax.config import ARMS, ReproduceConfig, TrainConfig, load_train
+from swarmjax.config import build, to_dict
 from swarmjax.reproduce import arms as reproduce_arms
+from swarmjax.reproduce.config import ARMS, ReproduceConfig
+from swarmjax.run.settings import TrainConfig, load_train
 from swarmjax.run.trainer import Stop
 
 OUT = Path("somewhere") / "a=b, c"
@@ -60,7 +61,7 @@ def test_a_directory_of_another_config_is_refused(tmp_path: Path) -> None:
     made = reproduce_arms.settings(ReproduceConfig(), "baseline", tmp_path)
     run = tmp_path / "baseline"
     run.mkdir()
-    other = config.to_dict(replace(made, budget=12_000))
+    other = to_dict(replace(made, budget=12_000))
     (run / "config.json").write_text(json.dumps(other))
     assert refusal(reproduce_arms.run, made, Stop()) == (
         f"{run} holds a run of another config than this version makes of the reproduction's: "
@@ -77,4 +78,4 @@ def test_an_arm_is_done_when_its_budget_is_spent(spent: bool, tmp_path: Path) ->
 
 def test_the_config_is_one_that_is_stored() -> None:
     for made in MADE.values():
-        assert config.build(TrainConfig, config.to_dict(made)) == made
+        assert build(TrainConfig, to_dict(made)) == made

@@ -8,6 +8,16 @@ from reproductions import log, reproduction
 
 from swarmjax.reproduce import claims
 from swarmjax.reproduce.claims import CLAIMS, Outcome, Reading
+from swarmjax.reproduce.criteria import (
+    about,
+    above_zero,
+    at_least,
+    below,
+    crowded,
+    earlier,
+    higher,
+    lower,
+)
 from swarmjax.reproduce.measures import NUMBER, SHARE
 from swarmjax.reproduce.rows import ARMS, EXPANDED, LAST, Reproduction
 
@@ -41,16 +51,16 @@ def _outcome(data: Reproduction, name: str) -> Outcome:
     ],
 )
 def test_all_arms_come_to_a_share(values: list[np.ndarray], holds: bool | None) -> None:
-    assert claims.at_least(*values, least=0.8)[0] is holds
+    assert at_least(*values, least=0.8)[0] is holds
 
 
 def test_the_numbers_are_said() -> None:
-    _, text = claims.at_least(_three(0.7, 0.8, 0.9), _three(1.0), least=0.8)
+    _, text = at_least(_three(0.7, 0.8, 0.9), _three(1.0), least=0.8)
     assert text == "80.0 % (70.0 to 90.0) and 100.0 % (100.0 to 100.0)"
-    _, text = claims.higher(_three(0.75), _three(0.25, 0.5, 0.25), unit=SHARE)
+    _, text = higher(_three(0.75), _three(0.25, 0.5, 0.25), unit=SHARE)
     # Interquartile means of three are means: 0.75 - 1 / 3, and 0.75 - 0.5 to 0.75 - 0.25.
     assert text == "75.0 % against 33.3 %, difference +41.7 points (+25.0 to +50.0)"
-    _, text = claims.earlier(_three(300.0), _three(math.inf))
+    _, text = earlier(_three(300.0), _three(math.inf))
     assert text == "300 against never, probability of being earlier 1 (1 to 1)"
 
 
@@ -59,7 +69,7 @@ def test_the_numbers_are_said() -> None:
     [(_three(0.4), True), (_three(0.4, 0.5, 0.6), None), (_three(0.5), False)],
 )
 def test_an_arm_stays_below_a_share(values: np.ndarray, holds: bool | None) -> None:
-    assert claims.below(values, limit=0.5)[0] is holds
+    assert below(values, limit=0.5)[0] is holds
 
 
 @pytest.mark.parametrize(
@@ -75,7 +85,7 @@ def test_an_arm_stays_below_a_share(values: np.ndarray, holds: bool | None) -> N
 def test_about_six_hundred_is_three_hundred_to_nine_hundred(
     values: np.ndarray, holds: bool | None
 ) -> None:
-    assert claims.about(values, number=600.0)[0] is holds
+    assert about(values, number=600.0)[0] is holds
 
 
 @pytest.mark.parametrize(
@@ -94,9 +104,9 @@ def test_about_six_hundred_is_three_hundred_to_nine_hundred(
 def test_a_difference_counts_where_its_interval_excludes_none(
     ours: np.ndarray, theirs: np.ndarray, holds: bool | None
 ) -> None:
-    assert claims.higher(ours, theirs, unit=NUMBER)[0] is holds
+    assert higher(ours, theirs, unit=NUMBER)[0] is holds
     opposite = None if holds is None else not holds
-    assert claims.lower(ours, theirs, unit=NUMBER)[0] is opposite
+    assert lower(ours, theirs, unit=NUMBER)[0] is opposite
 
 
 @pytest.mark.parametrize(
@@ -111,19 +121,19 @@ def test_a_difference_counts_where_its_interval_excludes_none(
 def test_one_that_never_gets_there_is_later_than_all(
     ours: np.ndarray, theirs: np.ndarray, holds: bool | None
 ) -> None:
-    assert claims.earlier(ours, theirs)[0] is holds
+    assert earlier(ours, theirs)[0] is holds
 
 
 @pytest.mark.parametrize(
     ("values", "holds"), [(_three(0.1), True), (_three(0, 0.1, 0.1), None), (_three(0.0), False)]
 )
 def test_collisions_that_are_none(values: np.ndarray, holds: bool | None) -> None:
-    assert claims.above_zero(values)[0] is holds
+    assert above_zero(values)[0] is holds
 
 
 @pytest.mark.parametrize(("more", "holds"), [(-2.0, False), (0.0, False), (2.0, None)])
 def test_crowding_is_contradicted_but_never_proven(more: float, holds: bool | None) -> None:
-    assert claims.crowded(_three(more))[0] is holds
+    assert crowded(_three(more))[0] is holds
 
 
 @pytest.mark.parametrize("turned", [False, True])

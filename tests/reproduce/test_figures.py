@@ -12,6 +12,7 @@ from reproductions import log, reproduction, whole
 
 from swarmjax.reproduce import figures, measures
 from swarmjax.reproduce import rows as reproduce_rows
+from swarmjax.reproduce.raster import columns, raster
 from swarmjax.reproduce.rows import LAST
 
 PAIR = ("curriculum", "baseline")
@@ -21,7 +22,7 @@ def test_a_column_shows_what_ended_in_it_or_was_under_way() -> None:
     # Ends at 100, 250, 260 and 420.
     one = log([True, False, True, True], arena_steps=np.array([100, 250, 260, 420]))
     edges = np.array([0.0, 100.0, 200.0, 300.0, 400.0, 500.0, 600.0])
-    found = figures.columns(one, measures.first_reached, "steps", None, edges)
+    found = columns(one, measures.first_reached, "steps", None, edges)
     # 100 lies in the first; in the second the episode that ends at 250 is under way; in the third
     # one of two succeeds; nothing follows 420.
     np.testing.assert_array_equal(found, [1.0, 0.0, 0.5, 1.0, 1.0, math.nan])
@@ -31,7 +32,7 @@ def test_a_column_leaves_other_stages_out() -> None:
     stage = np.array(["paper1", "paper1", LAST, LAST])
     one = log([True, False, True, True], arena_steps=np.array([100, 250, 260, 420]), stage=stage)
     edges = np.array([0.0, 100.0, 200.0, 300.0, 400.0, 500.0])
-    found = figures.columns(one, measures.first_reached, "steps", LAST, edges)
+    found = columns(one, measures.first_reached, "steps", LAST, edges)
     np.testing.assert_array_equal(found, [math.nan, math.nan, 1.0, 1.0, 1.0])
 
 
@@ -39,7 +40,7 @@ def test_a_raster_has_a_row_a_seed_and_a_column_an_episode() -> None:
     slow = log([False] * 10 + [True] * 30)
     never = log([False] * 30)
     data = reproduction({"curriculum": [slow, slow, never], "baseline": [never] * 3})
-    figure = figures.raster(data, PAIR, axis="episode", stage=None)
+    figure = raster(data, PAIR, axis="episode", stage=None)
     panels = figure.axes
     assert [panel.get_title(loc="left") for panel in panels] == [
         f"{arm}: {name}" for name in measures.SUCCESS for arm in PAIR

@@ -8,19 +8,17 @@ import pytest
 import steering
 from steering import STAY, STEER, STRIDE
 
-from swarmjax import config, policy
-from swarmjax.config import (
-    EvaluateConfig,
-    ReproduceConfig,
-    RewardConfig,
-    RobotConfig,
-    StageConfig,
-    TaskConfig,
-    TrainConfig,
-)
+from swarmjax import policy
+from swarmjax.config import ConfigError, to_dict
 from swarmjax.evaluate import cells, engine_c
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.reproduce import judge as reproduce_judge
+from swarmjax.reproduce.config import ReproduceConfig
 from swarmjax.reproduce.judge import Task
+from swarmjax.run.settings import TrainConfig
+from swarmjax.sim.config import RobotConfig
+from swarmjax.task.config import RewardConfig, TaskConfig
+from swarmjax.task.stage_config import StageConfig
 
 RADIUS = TaskConfig().target_radius
 
@@ -63,7 +61,7 @@ def test_a_row_says_what_became_of_a_policy(tmp_path: Path) -> None:
         stage=(StageConfig(name="pair", robots=2, side=0.6),),
         task=TaskConfig(step_limit=5, reward=RewardConfig(proximity=-0.001)),
     )
-    path = steering.write(tmp_path / "p.npz", STAY, config=config.to_dict(trained))
+    path = steering.write(tmp_path / "p.npz", STAY, config=to_dict(trained))
     tasks = [Task("baseline", 3, path, stage) for stage in reproduce_judge.STAGES]
     given = ReproduceConfig(episodes=2, workers=1)
     done: list[None] = []
@@ -88,7 +86,5 @@ def test_rows_that_were_written_are_read(tmp_path: Path) -> None:
 def test_rows_that_are_damaged_are_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "evaluation.json"
     path.write_text(text)
-    with pytest.raises(
-        config.ConfigError, match=r"cannot be read \(.*\): remove it to judge anew\.$"
-    ):
+    with pytest.raises(ConfigError, match=r"cannot be read \(.*\): remove it to judge anew\.$"):
         reproduce_judge.read(tmp_path)

@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 from sentences import refusal
 
-from swarmjax import command, compose
-from swarmjax.config import ReproduceConfig, load_reproduce
+from swarmjax import command
+from swarmjax.config import files
 from swarmjax.reproduce import __main__ as reproduce
 from swarmjax.reproduce import page as reproduce_page
 from swarmjax.reproduce import rows as reproduce_rows
+from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
 
 # Eight updates of 64 control steps; the world is the paper's.
 TINY = [
@@ -142,4 +143,4 @@ def test_help_lists_every_key(
     assert command.run("reproduce", reproduce.main, ReproduceConfig) == 0
     text = capsys.readouterr().out
     assert "  minutes=null" in text
-    assert compose.defaults("reproduce") == {}
+    assert files.defaults("reproduce") == {}

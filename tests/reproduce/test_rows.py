@@ -8,8 +8,8 @@ import pytest
 from reproductions import SEEDS, episode, row, whole, write
 from sentences import refusal
 
-from swarmjax import config
 from swarmjax.reproduce import rows as reproduce_rows
+from swarmjax.reproduce.config import ARMS
 from swarmjax.reproduce.rows import EXPANDED, LAST
 
 PAIR = ("curriculum", "baseline")
@@ -80,7 +80,7 @@ def test_an_arm_that_has_not_finished_is_left_out(tmp_path: Path) -> None:
 
 
 def test_the_arms_are_those_that_are_trained() -> None:
-    assert tuple(reproduce_rows.ARMS) == config.ARMS
+    assert tuple(reproduce_rows.ARMS) == ARMS
 
 
 def _change(out: Path, name: str, **given: object) -> None:

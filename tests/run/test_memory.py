@@ -9,9 +9,12 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from swarmjax import config, train
-from swarmjax.config import AlgoConfig, ConfigError, RunConfig, StageConfig, TrainConfig
-from swarmjax.run import memory, trainer
+from swarmjax import train
+from swarmjax.config import ConfigError
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.run import lifecycle, memory, trainer
+from swarmjax.run.settings import RunConfig, TrainConfig, load_train
+from swarmjax.task.stage_config import StageConfig
 
 GIB = 2**30
 SETTINGS = TrainConfig(stage=(StageConfig(name="pair", robots=2, side=0.5),), budget=10**9)
@@ -137,7 +140,7 @@ def test_the_command_line_takes_auto() -> None:
     assert not auto
     assert settings.arenas == 64
     with pytest.raises(ConfigError, match=r"^arenas is 'auto': give a whole number\.$"):
-        config.load_train(["arenas=auto"])
+        load_train(["arenas=auto"])
     with pytest.raises(ConfigError, match=r"^algo\.minibatches is 'many': give a whole number\.$"):
         train._settings(["arenas=auto", "algo.minibatches=many"])
 
@@ -221,7 +224,7 @@ def test_a_state_too_large_is_refused_before_anything_is_compiled_or_made(
 ) -> None:
     monkeypatch.setattr(memory, "limit", lambda: 2**20)
     for each in ("_first_state", "prepare", "compile_chunk"):
-        monkeypatch.setattr(train, each, lambda *_: pytest.fail("nothing to do"))
+        monkeypatch.setattr(lifecycle, each, lambda *_: pytest.fail("nothing to do"))
     with pytest.raises(ConfigError, match=r"^arenas is 1048576, but its state alone needs "):
         train.main([*WORDS, "arenas=1048576", f"run.dir={tmp_path / 'run'}"])
     assert not (tmp_path / "run").exists()
@@ -237,9 +240,9 @@ def test_a_program_too_large_is_refused_before_anything_is_written(
 ) -> None:
     run = tmp_path / "run"
     compiled = trainer.Compiled(lambda *_: pytest.fail("never called"), 1.0, GIB, GIB)
-    for module in (trainer, train):
+    for module in (trainer, lifecycle):
         monkeypatch.setattr(module, "compile_chunk", lambda *_: compiled)
-    monkeypatch.setattr(train, "_first_state", lambda *_: (None, []))
+    monkeypatch.setattr(lifecycle, "_first_state", lambda *_: (None, []))
     monkeypatch.setattr(memory, "limit", lambda: 2 * GIB - 1)
     for words in ([], ["run.dry=true"]):
         with pytest.raises(

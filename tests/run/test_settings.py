@@ -1,4 +1,4 @@
-"""Every default, every check and every sentence of swarmjax/config.py."""
+"""Every default, every check and every sentence of the settings."""
 
 import dataclasses
 import json
@@ -12,27 +12,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sentences import refusal
 
-from swarmjax import config, epuck
-from swarmjax.config import (
-    EvaluateConfig,
-    ExportConfig,
-    RewardConfig,
-    RobotConfig,
-    RunConfig,
-    StageConfig,
-    TrainConfig,
-    build,
-    help_text,
-    load_evaluate,
-    load_export,
-    load_resume,
-    load_train,
-    smallest_side,
-    to_dict,
-)
+from swarmjax import epuck
+from swarmjax.command import help_text
+from swarmjax.config import build, files, to_dict
+from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.export.config import ExportConfig
+from swarmjax.run.settings import RunConfig, TrainConfig, from_stored, load_resume, load_train
+from swarmjax.sim.config import RobotConfig
+from swarmjax.task.config import RewardConfig
+from swarmjax.task.stage_config import StageConfig, smallest_side
+from swarmjax.task.stage_files import load_levels
 
-ROOT = Path(config.__file__).resolve().parent.parent
+ROOT = Path(files.__file__).resolve().parents[2]
 STAGE = {"name": "s", "robots": 2, "side": 1.0}
+GONE = ("contact_limit", "contact_price_rate", "contact_price_arrivals")
 CHOICES = ", ".join(sorted(path.stem for path in (ROOT / "configs" / "stage").glob("*.yaml")))
 
 
@@ -68,7 +61,7 @@ def test_train_defaults_to_the_whole_curriculum():
     train = load_train([])
     assert [stage.name for stage in train.stage] == ["s1", "s2", "s3", "s4", "s5", "s6"]
     assert train.stage_name == "curriculum"
-    # No file of configs/ sets what config.py already says.
+    # No file of configs/ sets what the sections already say.
     assert train == TrainConfig(stage=train.stage, stage_name="curriculum")
     # 3e6 // (128 * 32) = 3e6 // 4096 = 732, and 732 * 4096 = 2 998 272 is the last whole update.
     assert train.updates == 732
@@ -90,13 +83,13 @@ def test_independent_policies_have_one_learner_a_robot():
 
 
 def test_evaluate_defaults():
-    evaluate = load_evaluate(["policy=p.npz"])
+    evaluate = load_levels(EvaluateConfig, ["policy=p.npz"])
     assert evaluate == EvaluateConfig(policy="p.npz", stage=load_train(["stage=s6"]).stage[0])
     assert (evaluate.steps, evaluate.episodes, evaluate.seed) == (1500, 1000, 1)
 
 
 def test_export_defaults():
-    assert load_export(["run=runs/a"]) == ExportConfig(run="runs/a")
+    assert files.load(ExportConfig, ["run=runs/a"]) == ExportConfig(run="runs/a")
 
 
 def test_configurations_are_frozen_and_hashable():
@@ -107,7 +100,9 @@ def test_configurations_are_frozen_and_hashable():
 
 
 def test_import_needs_neither_jax_nor_hydra():
-    code = "import sys, swarmjax.config; print({'jax', 'hydra', 'omegaconf'} & set(sys.modules))"
+    rooms = ("evaluate", "export", "replay", "report", "reproduce")
+    modules = ", ".join(["swarmjax.run.settings", *(f"swarmjax.{room}.config" for room in rooms)])
+    code = f"import sys, {modules}; print({{'jax', 'hydra', 'omegaconf'}} & set(sys.modules))"
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
     )
@@ -136,7 +131,7 @@ def test_import_needs_neither_jax_nor_hydra():
          "algo.actor_learning_rate?"),
         (["stage_name=x"], "stage_name is not a key: did you mean stage?"),
         (["hydra.verbose=1"], "hydra is not a key: give one of stage, robot, task, algo, "
-         "curriculum, sim, run, seed, seeds, seeds_by, arenas, budget, realism, resume, start, "
+         "curriculum, sim, seed, seeds, seeds_by, arenas, budget, realism, run, resume, start, "
          "start_std."),
         # What Hydra's grammar refuses.
         (["algo.hidden=[64"], "'algo.hidden=[64' cannot be read: quote a value with special "
@@ -289,11 +284,11 @@ def test_train_refuses(words, sentence):
     ],
 )  # fmt: skip
 def test_evaluate_refuses(words, sentence):
-    assert refusal(load_evaluate, ["policy=p", *words]) == sentence
+    assert refusal(load_levels, EvaluateConfig, ["policy=p", *words]) == sentence
 
 
 def test_export_refuses_an_unknown_format():
-    assert refusal(load_export, ["run=r", "format=pt"]) == (
+    assert refusal(files.load, ExportConfig, ["run=r", "format=pt"]) == (
         "format is 'pt': give npz, onnx, c or webots."
     )
 
@@ -315,7 +310,7 @@ def test_export_refuses_an_unknown_format():
     ],
 )  # fmt: skip
 def test_export_refuses(words, sentence):
-    assert refusal(load_export, words) == sentence
+    assert refusal(files.load, ExportConfig, words) == sentence
 
 
 def test_a_budget_of_one_update_is_enough():
@@ -454,6 +449,38 @@ def test_resume_changes_budget_and_run_only():
     assert json.dumps(stored) == before
     changed = {"budget": resumed.budget, "resume": "old", "run": resumed.run}
     assert resumed == dataclasses.replace(build(TrainConfig, stored), **changed)
+
+
+@pytest.mark.parametrize("key", GONE)
+def test_keys_of_a_price_that_adapts_are_refused_with_what_to_give_instead(key):
+    assert refusal(load_train, [f"algo.{key}=0.5"]) == (
+        f"algo.{key} is no longer a key: give fixed prices instead, task.reward.contact or "
+        "task.reward.robot_contact."
+    )
+
+
+def test_a_solver_is_refused_by_its_old_name():
+    sentence = "sim.solver is newton, which is called mjx now: give mjx."
+    assert refusal(load_train, ["sim.solver=newton"]) == sentence
+    stored = to_dict(load_train([]))
+    stored["sim"]["solver"] = "newton"
+    assert refusal(build, TrainConfig, stored) == sentence
+
+
+def test_what_older_versions_stored_is_read_with_its_old_names_and_keys():
+    expected = load_train(["sim.solver=mjx", "algo.clip=0.1"])
+    stored = to_dict(expected)
+    stored["sim"]["solver"] = "newton"
+    stored["algo"] |= dict.fromkeys(GONE, 0.5)
+    before = json.dumps(stored)
+    assert from_stored(stored) == expected
+    assert load_resume(stored, []) == expected
+    assert json.dumps(stored) == before
+    assert from_stored(to_dict(expected)) == expected
+    # What never was a key is still refused, and so is what is no section.
+    stored["algo"]["contact_prize"] = 0.5
+    assert refusal(from_stored, stored, "stored ").startswith("stored algo.contact_prize is not a ")
+    assert refusal(from_stored, stored | {"algo": 3}, "stored ").startswith("stored algo is 3: ")
 
 
 def test_resume_may_stop_again():

@@ -11,12 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarmjax import command, config, policy, train
-from swarmjax.config import ExportConfig, TrainConfig
-from swarmjax.curriculum import engine as curriculum
+from swarmjax import command, policy, train
+from swarmjax.config import build, to_dict
 from swarmjax.export import __main__ as export
+from swarmjax.export.config import ExportConfig
 from swarmjax.run import checkpoint, lifecycle
 from swarmjax.run.checkpoint import CheckpointError, Checkpoints, digest
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.training import program as programs
 
 TINY = [
     "stage=s1",
@@ -96,7 +98,7 @@ def test_a_run_directory_holds_what_it_promises(whole: Path) -> None:
     assert summary["seeds"] == [0]
     assert summary["transitions"] == [sum(row["transitions"] for row in rows)]
     stored = json.loads((whole / "config.json").read_text())
-    assert config.build(TrainConfig, stored).algo.hidden == (8,)
+    assert build(TrainConfig, stored).algo.hidden == (8,)
 
 
 @pytest.mark.parametrize("chunk", ["7", "all", "auto"])
@@ -117,6 +119,25 @@ def test_a_resumed_run_ends_where_an_uninterrupted_one_does(whole: Path, tmp_pat
     kept = json.loads((whole / "summary.json").read_text())
     for name in ("arena_steps", "transitions", "targets_reached", "decisions"):
         assert summary[name] == kept[name], name
+
+
+def test_a_run_with_a_price_of_contacts_goes_on_without_it(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As a version wrote it that had `algo.contact_limit`, which is no longer a key."""
+    stopped = tmp_path / "stopped"
+    assert _train(f"run.dir={stopped}", "run.stop_after=4") == 0
+    stored = json.loads((stopped / "config.json").read_text())
+    stored["algo"] |= {"contact_limit": 0.5, "contact_price_rate": 0.1}
+    (tmp_path / "config.json").write_text(json.dumps(stored))
+    leaves = checkpoint.restore(stopped)[0] | {"learners/price/height": np.full((1, 1), 0.25)}
+    with Checkpoints(tmp_path, keep=1) as checkpoints:
+        checkpoints.save(leaves, 4)
+    capsys.readouterr()
+    assert train.main([f"resume={tmp_path}"]) == 0
+    said = f"a price on contacts (algo.contact_limit) in {tmp_path}: it was passed over."
+    assert said in " ".join(capsys.readouterr().out.split())
+    assert _digest(tmp_path) == _digest(whole)
 
 
 @pytest.fixture(scope="module")
@@ -189,8 +210,8 @@ def test_several_seeds_resume_exactly(several: Path, tmp_path: Path) -> None:
 )
 def test_a_budget_too_short_for_its_stages_is_said(updates: int, said: str) -> None:
     words = [*TINY, "stage=curriculum", "stage.sequence=[s1,s2]", "task.step_limit=8"]
-    settings = config.load_train([*words, "arenas=4", "algo.rollout=4", f"budget={16 * updates}"])
-    sentence = " ".join(lifecycle._short_budget(settings, curriculum.schedule(settings)))
+    settings = load_train([*words, "arenas=4", "algo.rollout=4", f"budget={16 * updates}"])
+    sentence = " ".join(lifecycle._short_budget(settings, programs.schedule(settings)))
     assert said in sentence
     assert bool(said) == bool(sentence)
 
@@ -295,7 +316,7 @@ def test_foreign_and_missing_runs_are_refused(
     assert "no config.json" in _refusal(capsys, "export", f"run={tmp_path / 'nowhere'}")
     (tmp_path / "config.json").write_text("{")
     assert "cannot be read" in _refusal(capsys, "export", f"run={tmp_path}")
-    stored = config.to_dict(config.load_train(TINY))
+    stored = to_dict(load_train(TINY))
     (tmp_path / "config.json").write_text(json.dumps(stored))
     assert "no checkpoints" in _refusal(capsys, "train", f"resume={tmp_path}")
 

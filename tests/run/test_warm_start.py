@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarmjax import command, config, train
-from swarmjax.config import TrainConfig
+from swarmjax import command, train
+from swarmjax.config import to_dict
 from swarmjax.run import checkpoint, warm_start
 from swarmjax.run.checkpoint import CheckpointError, Checkpoints, digest
-from swarmjax.run.settings import read_config
+from swarmjax.run.settings import TrainConfig, load_train, read_config
 from swarmjax.run.warm_start import Source
-from swarmjax.training import loop, seeds
+from swarmjax.training import program as programs
+from swarmjax.training import seeds
 from swarmjax.training.loop import TrainState
 
 UPDATES = 3
@@ -69,10 +70,10 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _load(words: list[str]) -> tuple[Source, TrainState, TrainConfig]:
     """What is carried over, the state of the same run without it, and the config."""
-    settings = config.load_train([*TINY, *words])
+    settings = load_train([*TINY, *words])
     source = warm_start.read(settings)
     assert source is not None
-    return source, seeds.init(*loop.load(settings)), settings
+    return source, seeds.init(*programs.load(settings)), settings
 
 
 def _rows(run: Path) -> list[dict]:
@@ -137,7 +138,7 @@ def test_exploration_is_reset_only_where_that_is_said(trained: Path) -> None:
     words = [f"start={trained}", "algo.initial_std=0.25"]
     source, state, keeping = _load(words)
     kept = checkpoint.to_leaves(warm_start.carry(source, state, keeping))
-    resetting = config.load_train([*TINY, *words, "start_std=reset"])
+    resetting = load_train([*TINY, *words, "start_std=reset"])
     reset = checkpoint.to_leaves(warm_start.carry(source, state, resetting))
     learned = checkpoint.restore(trained)[0]
     np.testing.assert_array_equal(kept[LOG_STD], learned[LOG_STD], strict=True)
@@ -158,7 +159,7 @@ def test_a_schedule_of_exploration_goes_on_unless_it_is_reset(
     assert train.main(words) == 0
 
     def explored(*words: str) -> list[int] | None:
-        settings = config.load_train([*TINY, *words])
+        settings = load_train([*TINY, *words])
         source, state, _ = _load([w for w in words if w not in TINY])
         found = checkpoint.to_leaves(warm_start.carry(source, state, settings)).get(EXPLORED)
         return None if found is None else found[0].tolist()
@@ -290,7 +291,7 @@ def test_other_networks_are_refused(
 def test_independent_learners_are_told_how_many_they_were(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stored = config.to_dict(config.load_train([*TINY, "algo.policy=independent"]))
+    stored = to_dict(load_train([*TINY, "algo.policy=independent"]))
     (tmp_path / "config.json").write_text(json.dumps(stored))
     monkeypatch.chdir(tmp_path)
     assert _refusal(capsys, monkeypatch, *TINY, "start=.") == (

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarmjax import epuck
-from swarmjax.config import RobotConfig
 from swarmjax.sim import drive
+from swarmjax.sim.config import RobotConfig
 
 EPUCK = drive.from_config(RobotConfig())
 PAPER = EPUCK._replace(max_speed=0.25)  # the speed the paper commands, which no e-puck reaches

@@ -28,10 +28,10 @@ from engines import (
     wheels_of,
 )
 
-from swarmjax.config import RobotConfig, substeps
 from swarmjax.sim import model, physics
 from swarmjax.sim.body import AS_BUILT
-from swarmjax.task import env
+from swarmjax.sim.config import RobotConfig, physics_substeps
+from swarmjax.training import program as programs
 
 SIZE = model.ArenaSize(ROBOTS, OBSTACLES, BIGGEST_HALF)
 AHEAD = wheels_of(np.array([FULL, 0.0]))
@@ -94,7 +94,7 @@ def loaded(request: pytest.FixtureRequest) -> Iterator[physics.Physics]:
     seconds = jax.config.jax_persistent_cache_min_compile_time_secs
     if request.param[0] == "warp":
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 1e9)
-    yield env.load(settings(*request.param)).physics
+    yield programs.load_world(settings(*request.param)).physics
     jax.config.update("jax_persistent_cache_min_compile_time_secs", seconds)
 
 
@@ -125,7 +125,7 @@ def _drive_in_c(
     robot: RobotConfig, pose: np.ndarray, scenes: Scenes, fixtures: model.Fixtures = "mocap"
 ) -> np.ndarray:
     """The same, one arena [R, 3] with side [3] and obstacles [3, M, 5] by MuJoCo C: [T, R, 3]."""
-    count, body = substeps(robot, None), model.BODIES[robot.body]
+    count, body = physics_substeps(robot, None), model.BODIES[robot.body]
     built = compile_in_c(robot, scenes.obstacle[0], count, fixtures)
     data, ids = mujoco.MjData(built), model.ids(built, SIZE)
     data.qpos = body.qpos(pose, np)

@@ -11,13 +11,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from swarmjax.config import EvaluateConfig, RobotConfig, StageConfig
 from swarmjax.evaluate import engine_c
 from swarmjax.evaluate import rays as evaluate_rays
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.judge import Judge
 from swarmjax.policy import Policy
 from swarmjax.sim import infrared
+from swarmjax.sim.config import RobotConfig
 from swarmjax.task import observation
+from swarmjax.task.stage_config import StageConfig
 
 RANGE = 0.04  # m
 RADIUS = 0.037  # m

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from swarmjax import epuck
-from swarmjax.config import RobotConfig
 from swarmjax.sim import model
+from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.model import ArenaSize
 
 SIZE = ArenaSize(robots=3, obstacles=2, largest_half=0.15)

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarmjax.config import RealismConfig
 from swarmjax.sim import motor, noise
 from swarmjax.sim.motor import Motor
 from swarmjax.sim.noise import Stream
+from swarmjax.sim.realism_config import RealismConfig
 
 STEP = 0.032  # s
 IDEAL = RealismConfig()

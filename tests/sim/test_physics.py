@@ -35,11 +35,11 @@ from engines import (
     wheels_of,
 )
 
-from swarmjax import config, epuck
-from swarmjax.config import RobotConfig, SimConfig
+from swarmjax import epuck
 from swarmjax.sim import drive, gaps, model, physics, wheeled
 from swarmjax.sim.body import Chassis
-from swarmjax.task import env
+from swarmjax.sim.config import RobotConfig, SimConfig
+from swarmjax.training import program as programs
 
 SIDE = 0.6  # m
 GRIP = 9.81  # m/s^2; friction 1
@@ -290,10 +290,11 @@ def _lagging(engine: Engine, robot: RobotConfig) -> tuple[Engine, Any]:
     """
     if _body(engine) == "planar":
         slower = load_as(dataclasses.replace(engine.config, robot=robot))
-        return slower, slower.loaded.model
+        return slower, slower.loaded.engine.model
     slow = compile_in_c(robot, AWAY, engine.loaded.substeps)
-    given = jnp.asarray(engine.loaded.model.actuator_gainprm).dtype
-    changed = engine.loaded.model.replace(
+    built = engine.loaded.engine.model
+    given = jnp.asarray(built.actuator_gainprm).dtype
+    changed = built.replace(
         actuator_gainprm=jnp.asarray(slow.actuator_gainprm, given),
         actuator_biasprm=jnp.asarray(slow.actuator_biasprm, given),
     )
@@ -419,42 +420,30 @@ def test_a_step_reads_nothing_but_what_is_packed(engine: Engine) -> None:
     arena = (jnp.float32(SIDE), jnp.asarray(obstacle))
     for now in _random_wheels(3, 60, 1).reshape(3, CHUNK, ARENAS, ROBOTS, 2):
         rest = (*arena, jnp.asarray(now), Chassis())
-        carried, path = engine.run(engine.loaded.model, carried, *rest)
-        again, same = engine.run(engine.loaded.model, repack(again), *rest)
+        carried, path = engine.run(engine.loaded.engine.model, carried, *rest)
+        again, same = engine.run(engine.loaded.engine.model, repack(again), *rest)
         jax.tree.map(np.testing.assert_array_equal, path, same)
         for expected, found in zip(physics.pack(carried), physics.pack(again), strict=True):
             np.testing.assert_array_equal(found, expected)
-
-
-def test_warp_is_asked_for_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(physics.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(config.ConfigError, match=r"sim\.impl is warp"):
-        physics.resolve_impl("warp")
-    assert physics.resolve_impl("auto") == "jax"
-
-
-def test_auto_is_jax_without_an_nvidia_gpu() -> None:
-    assert physics.resolve_impl("auto") == "jax"
-    assert physics.resolve_impl("jax") == "jax"
-    assert physics.resolve_impl("warp") == "warp"
 
 
 @pytest.mark.parametrize(("arenas", "room"), [(1, 50), (64, 64 * 50), (1000, 1000 * 15)])
 def test_few_arenas_have_room_for_every_pair(arenas: int, room: int) -> None:
     """5 robots, 4 boxes, 4 walls: 10 pairs of robots and 5 x 8 others; of many, 3 a robot."""
     given = settings("warp", "planar")
-    sim = dataclasses.replace(given.sim, solver="newton", max_robots=5, max_obstacles=4)
+    sim = dataclasses.replace(given.sim, solver="mjx", max_robots=5, max_obstacles=4)
     minibatches = dataclasses.replace(given.algo, minibatches=1)
     many = dataclasses.replace(given, sim=sim, algo=minibatches, arenas=arenas, budget=10**6)
-    assert env.load(many).physics.template._impl.naconmax == room
+    assert programs.load_world(many).physics.engine.template._impl.naconmax == room
 
 
 def test_substeps_make_up_one_control_step() -> None:
     sim = SimConfig(impl="jax", substeps=2, max_robots=ROBOTS, max_obstacles=OBSTACLES)
-    loaded = env.load(dataclasses.replace(settings("jax", "planar"), sim=sim)).physics
+    loaded = programs.load_world(dataclasses.replace(settings("jax", "planar"), sim=sim)).physics
     assert loaded.substeps == 2
-    assert loaded.discs is not None
-    assert loaded.discs.timestep == 0.016
+    assert not loaded.engine.is_mjx
+    assert isinstance(loaded.engine.step, functools.partial)
+    assert loaded.engine.step.args[0].timestep == loaded.host.opt.timestep == 0.016
 
 
 def test_servos_are_felt_anew_in_every_physics_step() -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from engines import ROBOTS, STEP
 
-from swarmjax.config import RobotConfig
 from swarmjax.sim import model
 from swarmjax.sim.body import AS_BUILT, Chassis
+from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.planar import PLANAR
 
 SIZE = model.ArenaSize(1, 0, 0.05)

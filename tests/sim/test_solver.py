@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 from engines import BodyName
 
-from swarmjax.config import ConfigError, RobotConfig, SimConfig, StageConfig, TrainConfig, substeps
-from swarmjax.sim import drive, model, physics
+from swarmjax.run.settings import TrainConfig
+from swarmjax.sim import dispatch, drive, model, physics
 from swarmjax.sim.body import AS_BUILT
-from swarmjax.sim.fast import discs
-from swarmjax.sim.fast import planar_jax as solver_planar_jax
-from swarmjax.task import env
+from swarmjax.sim.config import RobotConfig, SimConfig, physics_substeps
+from swarmjax.sim.fast import discs, planar_jax
+from swarmjax.task.stage_config import StageConfig
+from swarmjax.training import program as programs
 
 Impl = Literal["jax", "warp"]
-Solver = Literal["newton", "swarm"]
+Solver = Literal["mjx", "swarm"]
 ROBOTS, ARENAS, STEP = 5, 24, 0.032
 SIZE = model.ArenaSize(ROBOTS, 1, 0.05)
 BOX = np.array([[0.05, 0.02, 0.4, 0.05, 0.05]], np.float32)
@@ -29,7 +30,7 @@ def _load(impl: Impl, body: BodyName, solver: Solver, obstacles: int = 1) -> phy
     sim = SimConfig(impl=impl, solver=solver, max_robots=ROBOTS, max_obstacles=obstacles)
     robot = RobotConfig(body=body)
     settings = TrainConfig(stage=(stage,), robot=robot, sim=sim, arenas=ARENAS, budget=10_000)
-    return env.load(settings).physics
+    return programs.load_world(settings).physics
 
 
 def _crowds(side: float) -> tuple[np.ndarray, np.ndarray]:
@@ -59,7 +60,7 @@ def _in_c(
     robot: RobotConfig, side: float, pose: np.ndarray, wheels: np.ndarray
 ) -> tuple[np.ndarray, int]:
     """The same by MuJoCo C in float64, converged; and how many pairs of robots touch at first."""
-    count = substeps(robot, None)
+    count = physics_substeps(robot, None)
     spec = model.build(robot, SIZE, STEP / count)
     spec.option.iterations, spec.option.tolerance = 100, 1e-14
     spec.option.ls_iterations, spec.option.ls_tolerance = 100, 1e-6
@@ -79,39 +80,55 @@ def _in_c(
 
 
 # In 0.16 m more pairs touch than the wheeled robots' solver takes as terms of their own (8), and
-# the planar ones' sweeps come to rest slowly. Float32 rounds at 1e-7, and a wheel's grip is 1e3
-# times as stiff as its robot. Off by these shares of the fastest joint and of the fastest robot
-# were the velocities seen; twice that is allowed.
-@pytest.mark.parametrize(
-    ("impl", "body", "solver", "side", "most", "seen"),
-    [
-        ("warp", "planar", "swarm", 0.16, 9, (2.0e-4, 1.2e-3)),
-        ("jax", "planar", "swarm", 0.16, 9, (1.2e-4, 7.1e-4)),
-        ("warp", "wheeled", "swarm", 0.16, 9, (1.4e-5, 2.9e-6)),
-        ("warp", "planar", "swarm", 0.5, 2, (4.6e-7, 3.5e-6)),
-        ("jax", "planar", "swarm", 0.5, 2, (4.0e-7, 2.7e-6)),
-        ("warp", "wheeled", "swarm", 0.5, 2, (6.7e-6, 8.0e-7)),
-        ("warp", "planar", "newton", 0.5, 2, (1.7e-6, 2.1e-6)),
-        ("warp", "wheeled", "newton", 0.5, 2, (2.1e-5, 1.7e-5)),
-        ("jax", "planar", "newton", 0.5, 2, (4.2e-6, 1.6e-6)),
-    ],
-)
+# the planar ones' sweeps come to rest slowly; MJX's few Newton steps by JAX do not get there at
+# all. Float32 rounds at 1e-7, and a wheel's grip is 1e3 times as stiff as its robot. Off by these
+# shares of the fastest joint and of the fastest robot were the velocities seen; twice that is
+# allowed.
+CROWDS = {
+    ("warp", "planar", "swarm", 0.16): (4.0e-6, 2.1e-5),
+    ("jax", "planar", "swarm", 0.16): (2.4e-6, 1.2e-5),
+    ("warp", "wheeled", "swarm", 0.16): (1.4e-5, 2.9e-6),
+    ("warp", "planar", "mjx", 0.16): (2.4e-5, 5.4e-7),
+    ("jax", "planar", "mjx", 0.16): (0.25, 0.56),
+    ("warp", "wheeled", "mjx", 0.16): (5.1e-5, 1.7e-5),
+    ("warp", "planar", "swarm", 0.5): (4.6e-7, 3.5e-6),
+    ("jax", "planar", "swarm", 0.5): (4.0e-7, 2.7e-6),
+    ("warp", "wheeled", "swarm", 0.5): (6.7e-6, 8.0e-7),
+    ("warp", "planar", "mjx", 0.5): (1.7e-6, 2.1e-6),
+    ("warp", "wheeled", "mjx", 0.5): (2.1e-5, 1.7e-5),
+    ("jax", "planar", "mjx", 0.5): (4.2e-6, 1.6e-6),
+}
+PAIRS = {0.16: 9, 0.5: 2}  # of robots that touch, at least
+
+
+@pytest.mark.parametrize(("impl", "body", "solver", "side"), CROWDS)
 def test_crowds_push_each_other_apart_as_in_c(
     impl: Impl,
     body: BodyName,
     solver: Solver,
     side: float,
-    most: int,
-    seen: tuple[float, float],
 ) -> None:
     pose, wheels = _crowds(side)
+    seen = CROWDS[impl, body, solver, side]
     found = _on_device(_load(impl, body, solver), side, pose, wheels)
     each = [_in_c(RobotConfig(body=body), side, p, w) for p, w in zip(pose, wheels, strict=True)]
     expected, pairs = np.array([one[0] for one in each]), [one[1] for one in each]
-    assert max(pairs) >= most
+    assert max(pairs) >= PAIRS[side]
     assert np.abs(expected).max(axis=1).min() > 1.0  # they do fly apart
     assert _off(found, expected) <= 2.0 * seen[0]
     assert _off(_places(found), _places(expected)) <= 2.0 * seen[1]
+
+
+@pytest.mark.parametrize("side", PAIRS)
+@pytest.mark.parametrize(
+    ("impl", "body"), [("jax", "planar"), ("warp", "planar"), ("warp", "wheeled")]
+)
+def test_auto_takes_a_faster_step_only_where_it_is_held_as_closely_as_mjx(
+    impl: Impl, body: BodyName, side: float
+) -> None:
+    assert dispatch.resolve_solver("auto", impl, body, ROBOTS) == "swarm"
+    # Over all joints; that of discs is off by up to 8e-6 m/s along x and y in the jam, by rounding.
+    assert CROWDS[impl, body, "swarm", side][0] <= CROWDS[impl, body, "mjx", side][0]
 
 
 @pytest.mark.parametrize("impl", ["jax", "warp"])
@@ -154,7 +171,7 @@ def test_arenas_of_several_seeds_are_arenas_of_one_kernel(obstacles: int) -> Non
 def test_every_pair_of_robots_meets_once(robots: int) -> None:
     size = model.ArenaSize(robots, 1, 0.05)
     built = model.build(RobotConfig(), size, STEP).compile()
-    rounds = discs.load(built, model.ids(built, size), 0.037, solver_planar_jax.push_apart).opponent
+    rounds = discs.load(built, model.ids(built, size), 0.037, planar_jax.push_apart).opponent
     met = [(a, b) for row in rounds for a, b in enumerate(row) if a < b]
     assert sorted(met) == list(itertools.combinations(range(robots), 2))
     for row in rounds:
@@ -169,21 +186,3 @@ def _places(rate: np.ndarray) -> np.ndarray:
 def _off(found: np.ndarray, expected: np.ndarray) -> float:
     """The largest error of an arena's numbers [A, ...], as a share of its largest number."""
     return float((np.abs(found - expected).max(axis=1) / np.abs(expected).max(axis=1)).max())
-
-
-def test_the_solver_is_chosen() -> None:
-    resolve = physics.resolve_solver
-    assert resolve("auto", "warp", "planar", 50) == "swarm"
-    assert resolve("auto", "warp", "wheeled", 5) == "swarm"
-    assert resolve("auto", "warp", "wheeled", 6) == "newton"
-    assert resolve("auto", "jax", "planar", 50) == "swarm"
-    assert resolve("auto", "jax", "wheeled", 5) == "newton"
-    assert resolve("newton", "warp", "planar", 5) == "newton"
-    with pytest.raises(
-        ConfigError, match=r"robot\.body is wheeled and sim\.impl is jax: give newton"
-    ):
-        resolve("swarm", "jax", "wheeled", 5)
-    with pytest.raises(
-        ConfigError, match=r"sim\.max_robots is 6: give newton or auto, or 5 robots"
-    ):
-        resolve("swarm", "warp", "wheeled", 6)

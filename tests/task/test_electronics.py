@@ -9,15 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax import config
-from swarmjax.config import RealismConfig, RobotConfig, TaskConfig
+from swarmjax.run.settings import load_train
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import infrared, noise
+from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.motor import Motor
 from swarmjax.sim.noise import Stream
+from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors as task_factors
 from swarmjax.task import observation
+from swarmjax.task.config import TaskConfig
 from swarmjax.task.electronics import Electronics, Memory, Sight
 from swarmjax.task.factors import Factors
 
@@ -534,7 +536,7 @@ def _live(
 @ENCODINGS
 def test_a_real_robot_is_the_same_in_numpy_and_jax(encoding: Encoding) -> None:
     """Many arenas along leading axes, as the judge has them, and mapped over, as training."""
-    realism = config.load_train(["realism=real"]).realism
+    realism = load_train(["realism=real"]).realism
     electronics, seeds = (
         task_electronics.load(TaskConfig(), realism, encoding),
         np.arange(16, dtype=np.uint32),

@@ -10,14 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax import config
+from swarmjax.run.settings import load_train
 from swarmjax.sim import gaps, infrared, physics
 from swarmjax.task import env, observation
 from swarmjax.task import factors as task_factors
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, TimeStep, World
 from swarmjax.task.level import Level
+from swarmjax.training import program as programs
 from swarmjax.training import rollout
+from swarmjax.training.rollout import Arena
 
 ArenaStep = Callable[[EnvState, jax.Array], tuple[EnvState, TimeStep]]
 
@@ -95,8 +97,7 @@ def _crowd(random: np.random.Generator) -> list[Robot]:
 
 def _start(world: World, levels: list[Level]) -> EnvState:
     stacked = jax.tree.map(lambda *fields: jnp.asarray(np.stack(fields)), *levels)
-    number = jnp.arange(len(levels))
-    state = jax.jit(jax.vmap(functools.partial(env.reset, world)))(stacked, number, number)
+    state = jax.jit(jax.vmap(functools.partial(env.reset, world)))(stacked)
     sim = jax.vmap(functools.partial(physics.unpack, world.physics))(state.sim)
     return dataclasses.replace(state, sim=sim)
 
@@ -245,7 +246,7 @@ def test_observation_is_of_the_state_after_the_step_before_any_reset(episode: Ep
 
 def test_first_observation(tiny_world: World, start: EnvState) -> None:
     level = jax.tree.map(np.asarray, start.level)
-    state = env.reset(tiny_world, jax.tree.map(lambda x: x[STANDING], start.level), 1, 7)
+    state = env.reset(tiny_world, jax.tree.map(lambda x: x[STANDING], start.level))
     found = state.observation
     expected = infrared.distances(
         level.start[STANDING], level.side[STANDING], level.obstacle[STANDING], HULL, RANGE, np
@@ -258,7 +259,7 @@ def test_first_observation(tiny_world: World, start: EnvState) -> None:
     # Its target is 0.34 m back and 0.3 m to the left.
     assert found[0, 8] == pytest.approx(np.hypot(0.34, 0.3), abs=1e-6)
     assert found[0, 9] == pytest.approx(np.arctan2(0.3, -0.34), abs=1e-6)
-    assert (int(state.stage), int(state.cohort), int(state.clock)) == (1, 7, 0)
+    assert int(state.clock) == 0
     np.testing.assert_array_equal(state.distance, found[:, 8])
     assert not state.arrived.any()
 
@@ -307,8 +308,6 @@ def test_contacts_are_counted_by_kind(episode: Episode) -> None:
     assert counts[BUMPING].tolist() == [[0, 0, 1], [0, 1, 0], [0, 0, 0]]
     # A contact of two robots is one of each, arrived or not.
     assert counts[PUSHING].tolist() == [[1, 0, 0], [1, 0, 0], [0, 0, 0]]
-    # Charged is the one that is still on its way.
-    assert episode.came.robot_contact[:, PUSHING].sum(axis=0).tolist() == [0.0, 1.0, 0.0]
     assert not counts[STANDING].any()
     # All of them again, from the poses.
     apart = np.full((ARENAS, ROBOTS, 3), gaps.CONTACT_PAUSE)
@@ -322,6 +321,20 @@ def test_contacts_are_counted_by_kind(episode: Episode) -> None:
         expected += begins & level.present[..., None]
     np.testing.assert_array_equal(counts, expected)
     assert expected[RANDOM].sum() >= 3
+
+
+def test_a_contact_of_robots_is_charged_to_the_one_on_its_way(
+    tiny_world: World, start: EnvState, actions: np.ndarray, episode: Episode
+) -> None:
+    task = tiny_world.task
+    priced = dataclasses.replace(task, reward=dataclasses.replace(task.reward, robot_contact=-0.5))
+    step = functools.partial(env.step, dataclasses.replace(tiny_world, task=priced))
+    arena = jax.tree.map(lambda x: x[PUSHING], start)
+    drive = jax.jit(lambda state, chosen: jax.lax.scan(step, state, chosen))
+    _, came = drive(arena, jnp.asarray(actions[:, PUSHING]))
+    charged = np.asarray(came.reward) - episode.came.reward[:, PUSHING]
+    # 1e-5: another program, whose roundings contacts multiply.
+    np.testing.assert_allclose(charged.sum(axis=0), [0.0, -0.5, 0.0], atol=1e-5)
 
 
 # --- one arena and the others
@@ -390,8 +403,8 @@ class Drawn(NamedTuple):
     """Real robots: a program that moves and restarts arenas, and where it was traced."""
 
     world: World
-    start: EnvState
-    step: ArenaStep
+    start: Arena
+    step: Callable[[Arena, jax.Array], tuple[Arena, TimeStep]]
     traces: list[Any]
 
 
@@ -403,13 +416,13 @@ def real() -> Drawn:
     """Two robots that drive about an obstacle, with all that realism makes of them."""
     arena = ["stage=s2", "stage.obstacles=1", "sim.max_robots=3", "sim.max_obstacles=1"]
     size = [f"arenas={FEW}", f"task.step_limit={LIFE}", "algo.minibatches=2", "budget=1000000"]
-    world = env.load(config.load_train([*arena, *size, "realism=real", "sim.impl=jax"]))
-    stages = task_stage.stack(world.config.stage)
+    config = load_train([*arena, *size, "realism=real", "sim.impl=jax"])
+    world, stages = programs.load_world(config), task_stage.stack(config.stage)
     draw = jax.jit(functools.partial(rollout.draw_starts, world, stages, np.zeros(FEW, np.int32)))
     starts = [draw(jnp.int32(cohort), jax.random.key(cohort)) for cohort in range(2)]
     traces = []
 
-    def step(state: EnvState, action: jax.Array) -> tuple[EnvState, TimeStep]:
+    def step(state: Arena, action: jax.Array) -> tuple[Arena, TimeStep]:
         traces.append(jax.tree.structure(state))
         state, came = jax.vmap(functools.partial(env.step, world))(state, action)
         return rollout.restart(state, starts[1], came.done), came
@@ -449,8 +462,9 @@ def test_a_restarted_arena_has_the_robots_of_its_new_episode(real: Drawn) -> Non
     assert after.clock.tolist() == [1, 0, 1, 0]
     new = np.asarray(came.done)
     np.testing.assert_array_equal(after.level.seed != state.level.seed, new)
-    seeds, settings = np.asarray(after.level.seed), real.world.config
-    expected = task_factors.draw(seeds, settings.realism, settings.robot, 3, 1, np)
+    np.testing.assert_array_equal(after.cohort, new)  # that of the waiting ones is 1
+    seeds, world = np.asarray(after.level.seed), real.world
+    expected = task_factors.draw(seeds, world.realism, world.robot, 3, 1, np)
     for found, mine in zip(after.factors, expected, strict=True):
         assert found is not None
         assert mine is not None

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from swarmjax.config import RealismConfig, RobotConfig
+from swarmjax.sim.config import RobotConfig
+from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import factors
 from swarmjax.task.factors import Factors
 

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax.config import ConfigError, StageConfig
+from swarmjax.config import ConfigError
 from swarmjax.sim import gaps
 from swarmjax.task import fixed_level, level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.level import Level, Spacing
+from swarmjax.task.stage_config import StageConfig
 
 HULL = 0.037  # m
 SPACING = Spacing(robots=5, obstacles=4, hull_radius=HULL, target_radius=0.05)

@@ -11,12 +11,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy import ndimage, stats
 
-from swarmjax.config import ConfigError, StageConfig, smallest_side
+from swarmjax.config import ConfigError
 from swarmjax.sim import gaps
 from swarmjax.task import level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.level import Level, Spacing
 from swarmjax.task.placement import LATTICE, UNITS
+from swarmjax.task.stage_config import StageConfig, smallest_side
 
 STAGES = (
     StageConfig(name="s1", robots=2, side=0.5),

@@ -8,19 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sentences import refusal
 
-from swarmjax import config
-from swarmjax.config import (
-    EvaluateConfig,
-    RealismConfig,
-    RobotConfig,
-    TaskConfig,
-    TrainConfig,
-    build,
-    help_text,
-    load_evaluate,
-    load_train,
-    to_dict,
-)
+from swarmjax.command import help_text
+from swarmjax.config import build, to_dict
+from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.sim.config import RobotConfig, physics_substeps
+from swarmjax.sim.realism_config import RealismConfig
+from swarmjax.task.config import TaskConfig, resolve_encoding
+from swarmjax.task.stage_files import load_levels
 
 OFF = {item.name: None for item in dataclasses.fields(RealismConfig)}
 IDEAL = OFF | {"name": "ideal", "infrared": "ideal", "stall_time": (0.1, 0.3)}
@@ -61,7 +56,7 @@ REAL = {
     "target_bearing_noise": 0.0524,  # 3 degrees: 3 * 3.1416 / 180 = 0.05236
 }
 FACTORS = sorted(REAL.keys() - {"name", "infrared", "stall_time"})
-LOADS = [load_train, lambda words: load_evaluate(["policy=p", *words])]
+LOADS = [load_train, lambda words: load_levels(EvaluateConfig, ["policy=p", *words])]
 
 
 # Presets
@@ -162,12 +157,12 @@ def test_a_range_has_its_lower_number_first(first, second):
     ],
 )
 def test_substeps_are_those_given_or_those_of_the_body(body, given, count):
-    assert config.substeps(RobotConfig(body=body), given) == count
+    assert physics_substeps(RobotConfig(body=body), given) == count
 
 
 def test_substeps_are_not_given_by_default():
     assert load_train([]).sim.substeps is None
-    assert load_evaluate(["policy=p"]).substeps is None
+    assert load_levels(EvaluateConfig, ["policy=p"]).substeps is None
 
 
 @pytest.mark.parametrize(
@@ -182,7 +177,7 @@ def test_substeps_are_not_given_by_default():
 )
 def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved):
     task, realism = TaskConfig(encoding=encoding), RealismConfig(infrared=infrared)
-    assert config.encoding(task, realism) == resolved
+    assert resolve_encoding(task, realism) == resolved
 
 
 # Refusals
@@ -289,7 +284,7 @@ def test_train_refuses(words, sentence):
     ],
 )  # fmt: skip
 def test_evaluate_refuses(words, sentence):
-    assert refusal(load_evaluate, ["policy=p", *words]) == sentence
+    assert refusal(load_levels, EvaluateConfig, ["policy=p", *words]) == sentence
 
 
 @pytest.mark.parametrize("factor", FACTORS)

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax.config import RewardConfig
 from swarmjax.task import reward
+from swarmjax.task.config import RewardConfig
 
 RANGE = 0.04  # m
 NOTHING = RewardConfig(progress=0.0, proximity=0.0, contact=0.0, time=0.0)

@@ -5,11 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from swarmjax.config import Shape, StageConfig
 from swarmjax.evaluate.judge import draw_level
 from swarmjax.task import shapes
 from swarmjax.task import stage as task_stage
 from swarmjax.task.level import Level, Spacing
+from swarmjax.task.shapes import Shape
+from swarmjax.task.stage_config import StageConfig
 
 HALF = 0.05  # m, of the trained box
 OUTER = HALF * math.sqrt(2)

@@ -4,8 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax.config import ConfigError, StageConfig
+from swarmjax.config import ConfigError
 from swarmjax.task import stage
+from swarmjax.task.stage_config import StageConfig
 
 PLAIN = StageConfig(name="a", robots=2, side=0.5)
 BOXES = StageConfig(name="b", robots=5, side=1.2, obstacles=3, obstacle_size=0.2)

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from sentences import refusal
 
-from swarmjax.config import TrainConfig, load_train
 from swarmjax.run import checkpoint, trainer
 from swarmjax.run.display import Display
-from swarmjax.training import episodes, loop, rollout, seeds
-from swarmjax.training.rollout import Ended, Robots
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.task.episode import Ended, Robots
+from swarmjax.training import episodes, seeds
+from swarmjax.training import program as programs
 
 
 def _ended(done: np.ndarray, robots: int) -> Ended:
@@ -82,7 +83,7 @@ def test_there_is_room_for_all_that_can_be_drawn() -> None:
     assert episodes.room(paper) == 6000 // 32 + 1
     short = replace(paper, arenas=2, task=replace(paper.task, step_limit=10))
     assert episodes.room(short) == 2 * 601  # every ten steps, and the one under way
-    assert rollout.waiting(paper.algo.rollout) < episodes.room(paper)
+    assert paper.waiting < episodes.room(paper)
 
 
 Train = Callable[..., None]
@@ -98,7 +99,7 @@ def train_for(tiny_config: TrainConfig) -> Train:
         budget=64 * 6,
         run=replace(tiny_config.run, episodes=True, tensorboard=False),
     )
-    program, schedule = loop.load(base)
+    program, schedule = programs.load(base, by_robot=True)
     init = jax.jit(partial(seeds.init, program))
     compiled = trainer.compile_chunk(program, schedule, init(schedule))
 
@@ -109,7 +110,7 @@ def train_for(tiny_config: TrainConfig) -> Train:
         state = init(schedule)
         if resume:
             state = checkpoint.from_leaves(checkpoint.restore(run)[0], state)
-        mine = loop.Program(settings, program.world)
+        mine = replace(program, config=settings)
         with trainer.Stop() as stop, Display(6) as display:
             trainer.train(run, mine, schedule, compiled, state, display, stop)
 

@@ -11,13 +11,15 @@ import numpy as np
 import optax
 import pytest
 
-from swarmjax.config import AlgoConfig, StageConfig, TrainConfig
-from swarmjax.curriculum import engine as curriculum
 from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch
-from swarmjax.task import env
+from swarmjax.run.settings import TrainConfig
+from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import loop, rollout
-from swarmjax.training.loop import Metrics, Program, TrainState
+from swarmjax.training import program as programs
+from swarmjax.training.loop import Metrics, TrainState
+from swarmjax.training.program import Program
 
 Update = Callable[[TrainState], tuple[TrainState, Metrics]]
 
@@ -35,18 +37,18 @@ def program(tiny_config: TrainConfig) -> Program:
         algo=replace(algo, initialization="uniform"),
         sim=replace(tiny_config.sim, max_robots=1, max_obstacles=0),
     )
-    return Program(config, env.load(config))
+    return Program(config, programs.load_world(config))
 
 
 @pytest.fixture(scope="module")
 def start(program: Program) -> TrainState:
-    return jax.jit(functools.partial(loop.init, program))(curriculum.schedule(program.config))
+    return jax.jit(functools.partial(loop.init, program))(programs.schedule(program.config))
 
 
 @pytest.fixture(scope="module")
 def update(program: Program) -> Update:
     jitted = jax.jit(functools.partial(loop.update, program))
-    return functools.partial(jitted, curriculum.schedule(program.config))
+    return functools.partial(jitted, programs.schedule(program.config))
 
 
 def _with_mean(state: TrainState, action: float) -> TrainState:
@@ -75,7 +77,7 @@ def test_every_rollout_draws_levels_of_its_own(start: TrainState, update: Update
 def test_every_control_step_of_a_rollout_has_noise_of_its_own(
     program: Program, start: TrainState
 ) -> None:
-    collect = jax.jit(functools.partial(rollout.collect, program.world))
+    collect = jax.jit(functools.partial(rollout.collect, program))
     learners = _with_mean(start, 0.0).learners
     _, trajectory, _ = collect(learners, start.arenas, start.arenas, jax.random.key(0))
     # With mean 0 and deviation 1 an action is its noise.

@@ -10,13 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax.config import CurriculumConfig, StageConfig, TrainConfig
-from swarmjax.curriculum import engine as curriculum
+from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.curriculum.engine import BY_BUDGET, NEVER, Schedule
 from swarmjax.run.checkpoint import digest, to_leaves
+from swarmjax.run.settings import TrainConfig
 from swarmjax.task.env import World
+from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import loop
-from swarmjax.training.loop import Program, TrainState
+from swarmjax.training import program as programs
+from swarmjax.training.loop import TrainState
+from swarmjax.training.program import Program
 
 Chunk = Callable[[Schedule, TrainState, np.int32], tuple[TrainState, dict]]
 
@@ -29,7 +32,7 @@ def program(tiny_config: TrainConfig, tiny_world: World) -> Program:
 @pytest.fixture(scope="module")
 def start(program: Program) -> Callable[[], TrainState]:
     init = jax.jit(partial(loop.init, program))
-    return lambda: init(curriculum.schedule(program.config))
+    return lambda: init(programs.schedule(program.config))
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +62,7 @@ def _run(chunk: Chunk, schedule: Schedule, state: TrainState, sizes: list[int]) 
 def test_any_chunk_size_gives_the_same_run_bit_for_bit(
     sizes: list[int], program: Program, start: Callable[[], TrainState], chunk: Chunk
 ) -> None:
-    schedule = curriculum.schedule(program.config)
+    schedule = programs.schedule(program.config)
     one_by_one = _run(chunk, schedule, start(), [1] * 20)
     at_once = _run(chunk, schedule, start(), sizes)
     assert digest(to_leaves(one_by_one)) == digest(to_leaves(at_once))
@@ -68,7 +71,7 @@ def test_any_chunk_size_gives_the_same_run_bit_for_bit(
 def test_a_run_trains_and_reports_one_row_an_update(
     program: Program, start: Callable[[], TrainState], chunk: Chunk
 ) -> None:
-    state, metrics = chunk(curriculum.schedule(program.config), start(), np.int32(5))
+    state, metrics = chunk(programs.schedule(program.config), start(), np.int32(5))
     assert int(state.update) == 5
     np.testing.assert_array_equal(metrics["update"][:5], np.arange(5))
     before, after = to_leaves(start()), to_leaves(state)
@@ -83,7 +86,7 @@ def test_stage_numbers_are_no_part_of_the_program(
     program: Program, start: Callable[[], TrainState], chunk: Chunk
 ) -> None:
     """A later trace would fail in `chunk`, which allows one; the numbers must matter as well."""
-    schedule = curriculum.schedule(program.config)
+    schedule = programs.schedule(program.config)
     wider = schedule._replace(stages=schedule.stages._replace(side=schedule.stages.side * 1.5))
     state, _ = chunk(schedule, start(), np.int32(20))
     other, _ = chunk(wider, start(), np.int32(20))
@@ -112,7 +115,7 @@ def _six(base: TrainConfig, options: CurriculumConfig) -> TrainConfig:
 def test_the_curriculum_visits_every_stage_within_one_trace(tiny_config: TrainConfig) -> None:
     """Promoted by deadline, since nothing is learned so fast."""
     options = CurriculumConfig(mode="sequential", threshold=1.0, budget_share=0.8)
-    program, schedule = loop.load(_six(tiny_config, options))
+    program, schedule = programs.load(_six(tiny_config, options))
     chunk = _traced_once(program)
     state = jax.jit(partial(loop.init, program))(schedule)
     state, metrics = chunk(schedule, state, np.int32(10))
@@ -128,7 +131,7 @@ def test_the_curriculum_visits_every_stage_within_one_trace(tiny_config: TrainCo
 @pytest.mark.slow
 def test_mixed_keeps_arenas_on_earlier_stages_within_one_trace(tiny_config: TrainConfig) -> None:
     options = CurriculumConfig(mode="mixed", threshold=1.0, earlier_share=0.5)
-    program, schedule = loop.load(_six(tiny_config, options))
+    program, schedule = programs.load(_six(tiny_config, options))
     chunk, init = _traced_once(program), jax.jit(partial(loop.init, program))
     schedule = schedule._replace(deadline=np.array([3, 8, *[NEVER] * 4], np.int32))
     _, metrics = chunk(schedule, init(schedule), np.int32(20))
@@ -155,7 +158,7 @@ def test_mixed_keeps_arenas_on_earlier_stages_within_one_trace(tiny_config: Trai
 @pytest.mark.slow
 def test_adaptive_trains_on_all_stages_within_one_trace(tiny_config: TrainConfig) -> None:
     options = CurriculumConfig(mode="adaptive")
-    program, schedule = loop.load(_six(tiny_config, options))
+    program, schedule = programs.load(_six(tiny_config, options))
     chunk, init = _traced_once(program), jax.jit(partial(loop.init, program))
     _, metrics = chunk(schedule, init(schedule), np.int32(25))
     assert set(np.asarray(metrics["stage"])) == {5}
@@ -175,7 +178,7 @@ def test_adaptive_trains_on_all_stages_within_one_trace(tiny_config: TrainConfig
 def test_metrics_by_stage_are_the_record(
     program: Program, start: Callable[[], TrainState], chunk: Chunk
 ) -> None:
-    state, metrics = chunk(curriculum.schedule(program.config), start(), np.int32(20))
+    state, metrics = chunk(programs.schedule(program.config), start(), np.int32(20))
     record = state.curriculum.record
     names = {
         "episodes_by_stage": record.episodes,
@@ -200,7 +203,7 @@ def test_metrics_by_stage_are_the_record(
 
 @pytest.mark.slow
 def test_a_seed_may_be_given(program: Program, start: Callable[[], TrainState]) -> None:
-    schedule = curriculum.schedule(program.config)
+    schedule = programs.schedule(program.config)
     init = jax.jit(partial(loop.init, program))
     same, other = init(schedule, np.int32(0)), init(schedule, np.int32(1))
     assert digest(to_leaves(same)) == digest(to_leaves(start()))  # the config's is 0
@@ -218,13 +221,11 @@ def independent(tiny_config: TrainConfig, tiny_world: World) -> Independent:
     """Robots with a learner each; the third joins at the deadline of the first stage."""
     config = replace(
         tiny_config,
-        algo=replace(
-            tiny_config.algo, policy="independent", contact_limit=0.5, contact_price_arrivals=0.0
-        ),
+        algo=replace(tiny_config.algo, policy="independent"),
         curriculum=CurriculumConfig(threshold=1.0),
     )
-    program = Program(config, replace(tiny_world, config=config))
-    schedule = curriculum.schedule(config)
+    program = Program(config, tiny_world)
+    schedule = programs.schedule(config)
     init = jax.jit(partial(loop.init, program))
     return lambda: init(schedule), jax.jit(partial(loop.train_chunk, program, schedule))
 
@@ -238,16 +239,6 @@ def test_independent_robots_learn_apart(independent: Independent) -> None:
     assert (moved[:2] > 1e-4).all()
     assert moved[2] == 0.0
     assert not np.array_equal(to_leaves(after)[name][0], to_leaves(after)[name][1])
-
-
-def test_the_price_of_contacts_follows_the_episodes_of_each_robot(independent: Independent) -> None:
-    start, train = independent
-    after, metrics = train(start(), np.int32(3))
-    price = after.learners.price
-    assert price is not None
-    assert (np.asarray(price.episodes)[:2] > 0.0).all()
-    assert float(price.episodes[2]) == 0.0  # absent
-    np.testing.assert_array_equal(metrics["contact_price"][2], np.mean(price.height[:2]))
 
 
 def test_newcomers_start_from_what_the_others_learned(independent: Independent) -> None:

@@ -9,10 +9,12 @@ import numpy as np
 import optax
 import pytest
 
-from swarmjax.config import AlgoConfig, CurriculumConfig, TrainConfig
+from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import normalizer
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch, LearnerState
+from swarmjax.run.settings import TrainConfig
 from swarmjax.training import promotion
 
 LEARNERS, OBSERVED = 5, 3

@@ -10,20 +10,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax.config import AlgoConfig
 from swarmjax.ppo import gae
 from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import LearnerState
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import gaps, physics
 from swarmjax.task import env, observation
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, TimeStep, World
+from swarmjax.task.episode import Ended
 from swarmjax.task.level import Level
 from swarmjax.training import rollout
-from swarmjax.training.rollout import Ended, Trajectory
+from swarmjax.training.program import ACTION_SIZE, Program
+from swarmjax.training.rollout import Arena, Trajectory
 
-ArenaStep = Callable[[EnvState, jax.Array], tuple[EnvState, TimeStep]]
-Draw = Callable[[int, int], EnvState]
+ArenaStep = Callable[[Arena, jax.Array], tuple[Arena, TimeStep]]
+Draw = Callable[[int, int], Arena]
 
 T, ARENAS, ROBOTS, LIMIT = 8, 8, 3, 16  # of the tiny configuration
 HULL, RANGE = 0.037, 0.04  # m
@@ -36,9 +39,9 @@ class Run(NamedTuple):
     """A rollout: what it began with and what came of it."""
 
     learners: LearnerState
-    before: EnvState
-    starts: EnvState
-    after: EnvState
+    before: Arena
+    starts: Arena
+    after: Arena
     trajectory: Trajectory
     ended: Ended
 
@@ -50,29 +53,34 @@ class Replay(NamedTuple):
     seen: np.ndarray  # what was observed before each step
     pose: np.ndarray  # after each step, before any reset
     fresh: np.ndarray  # whether the next step is the first of an episode
-    last: EnvState
+    last: Arena
 
 
 @pytest.fixture(scope="module")
-def learners(tiny_world: World) -> LearnerState:
-    config = tiny_world.config
+def program(tiny_config: TrainConfig, tiny_world: World) -> Program:
+    return Program(tiny_config, tiny_world)
+
+
+@pytest.fixture(scope="module")
+def learners(tiny_config: TrainConfig) -> LearnerState:
+    algo, updates = tiny_config.algo, tiny_config.updates
 
     def init(key: jax.Array) -> LearnerState:
-        return ppo.init(key, config.algo, observation.SIZE, rollout.ACTION_SIZE, config.updates)
+        return ppo.init(key, algo, observation.SIZE, ACTION_SIZE, updates)
 
     return jax.vmap(init)(jax.random.split(jax.random.key(1), 1))
 
 
 @pytest.fixture(scope="module")
-def draw(tiny_world: World) -> Draw:
+def draw(tiny_config: TrainConfig, tiny_world: World) -> Draw:
     """Draws starts of either stage in turn, from a seed, for a cohort."""
-    stages, index = task_stage.stack(tiny_world.config.stage), jnp.arange(ARENAS) % 2
+    stages, index = task_stage.stack(tiny_config.stage), jnp.arange(ARENAS) % 2
     draw = jax.jit(functools.partial(rollout.draw_starts, tiny_world, stages, index))
     return lambda seed, cohort: draw(jnp.int32(cohort), jax.random.key(seed))
 
 
 @pytest.fixture(scope="module")
-def before(tiny_world: World, draw: Draw) -> EnvState:
+def before(tiny_world: World, draw: Draw) -> Arena:
     """Arenas in the middle of their episodes; in one all arrive, one drives into a wall."""
     drawn = draw(0, NOW)
     pose, target = drawn.level.start[ARRIVES], drawn.level.target
@@ -82,15 +90,15 @@ def before(tiny_world: World, draw: Draw) -> EnvState:
     start = drawn.level.start.at[BUMPS, 0].set(at_wall)
     level = drawn.level._replace(start=start, target=target)
     reset = jax.jit(jax.vmap(functools.partial(env.reset, tiny_world)))
-    state = reset(level, drawn.stage, drawn.cohort)
+    state = Arena(**vars(reset(level)), stage=drawn.stage, cohort=drawn.cohort)
     sim = state.sim._replace(qvel=state.sim.qvel.at[BROKEN, 1].set(jnp.inf))
     return dataclasses.replace(state, sim=sim, clock=jnp.array(CLOCK, jnp.int32))
 
 
 @pytest.fixture(scope="module")
-def run(tiny_world: World, draw: Draw, learners: LearnerState, before: EnvState) -> Run:
+def run(program: Program, draw: Draw, learners: LearnerState, before: Arena) -> Run:
     starts = draw(1, NEXT)
-    collect = jax.jit(functools.partial(rollout.collect, tiny_world))
+    collect = jax.jit(functools.partial(rollout.collect, program))
     found = collect(learners, before, starts, jax.random.key(2))
     again = collect(learners, before, starts, jax.random.key(2))
     other = collect(learners, before, starts, jax.random.key(3))
@@ -99,7 +107,7 @@ def run(tiny_world: World, draw: Draw, learners: LearnerState, before: EnvState)
     return Run(learners, before, starts, *jax.tree.map(np.asarray, found))
 
 
-def _unpack(world: World, state: EnvState) -> EnvState:
+def _unpack[S: EnvState](world: World, state: S) -> S:
     sim = jax.vmap(functools.partial(physics.unpack, world.physics))(state.sim)
     return dataclasses.replace(state, sim=sim)
 
@@ -123,10 +131,10 @@ def replay(tiny_world: World, run: Run, tiny_step: ArenaStep) -> Replay:
     return Replay(came, observed, pose, fresh, state)
 
 
-def _values(world: World, learners: LearnerState, seen: np.ndarray) -> np.ndarray:
+def _values(config: TrainConfig, learners: LearnerState, seen: np.ndarray) -> np.ndarray:
     """Values [..., A, R] by the one learner."""
     one = jax.tree.map(lambda leaf: leaf[0], learners)
-    return np.asarray(ppo.values(one, world.config.algo, jnp.asarray(seen)))
+    return np.asarray(ppo.values(one, config.algo, jnp.asarray(seen)))
 
 
 def _at[Tree](tree: Tree, where: Any) -> Tree:
@@ -301,12 +309,12 @@ def test_some_episodes_end_and_others_go_on(run: Run, replay: Replay) -> None:
 
 
 def test_value_after_an_episode_is_of_what_it_came_to_not_of_the_next_start(
-    tiny_world: World, run: Run, replay: Replay
+    tiny_config: TrainConfig, run: Run, replay: Replay
 ) -> None:
     found = run.trajectory
-    value = _values(tiny_world, run.learners, replay.seen)
-    next_value = _values(tiny_world, run.learners, replay.came.observation)
-    start = _values(tiny_world, run.learners, np.asarray(run.starts.observation))
+    value = _values(tiny_config, run.learners, replay.seen)
+    next_value = _values(tiny_config, run.learners, replay.came.observation)
+    start = _values(tiny_config, run.learners, np.asarray(run.starts.observation))
     present = replay.seen[..., 8] > 0.0  # as above
     # 1e-5: the drift of a bearing (2e-4) through a network whose slope is about 0.01 at first.
     np.testing.assert_allclose(found.value[:, 0][present], value[present], atol=1e-5)
@@ -321,10 +329,10 @@ def test_value_after_an_episode_is_of_what_it_came_to_not_of_the_next_start(
     np.testing.assert_array_equal(found.next_value[:-1, 0][going], found.value[1:, 0][going])
 
 
-def test_actions_are_drawn_from_the_policy(tiny_world: World, run: Run) -> None:
+def test_actions_are_drawn_from_the_policy(tiny_config: TrainConfig, run: Run) -> None:
     one = jax.tree.map(lambda leaf: leaf[0], run.learners)
     action, seen = run.trajectory.action[:, 0], jnp.asarray(run.trajectory.observation[:, 0])
-    noise = (action - ppo.mode(one, tiny_world.config.algo, seen)) / 0.6  # the initial deviation
+    noise = (action - ppo.mode(one, tiny_config.algo, seen)) / 0.6  # the initial deviation
     # 384 standard normal numbers: mean within 5 / sqrt(384), variance within 5 sqrt(2 / 384).
     assert abs(noise.mean()) < 0.26
     assert abs(noise.var() - 1.0) < 0.36
@@ -342,11 +350,11 @@ def test_a_broken_arena_starts_afresh_and_nothing_of_it_is_learnt(run: Run) -> N
     assert run.after.clock[BROKEN] == 7
 
 
-def test_a_level_counts_once_a_rollout(tiny_world: World, run: Run) -> None:
+def test_a_level_counts_once_a_rollout(program: Program, run: Run) -> None:
     # Episodes end at 16 control steps: those that run at once, those that wait after three more.
     before = dataclasses.replace(run.before, clock=jnp.full(ARENAS, 15, jnp.int32))
     starts = dataclasses.replace(run.starts, clock=jnp.full(ARENAS, 13, jnp.int32))
-    collect = jax.jit(functools.partial(rollout.collect, tiny_world))
+    collect = jax.jit(functools.partial(rollout.collect, program))
     after, _, ended = collect(run.learners, before, starts, jax.random.key(2))
     uncounted = rollout.UNCOUNTED
     none = [-1, -1]
@@ -358,21 +366,27 @@ def test_a_level_counts_once_a_rollout(tiny_world: World, run: Run) -> None:
             assert after.cohort[arena] == uncounted
 
 
-def test_a_long_rollout_draws_an_episode_for_every_32_control_steps() -> None:
-    assert [rollout.waiting(steps) for steps in (1, 32, 63, 64, 6000)] == [1, 1, 1, 2, 187]
+def test_a_long_rollout_draws_an_episode_for_every_32_control_steps(
+    tiny_config: TrainConfig,
+) -> None:
+    def waiting(steps: int) -> int:
+        algo = dataclasses.replace(tiny_config.algo, rollout=steps)
+        return dataclasses.replace(tiny_config, algo=algo, budget=8 * steps).waiting
+
+    assert [waiting(steps) for steps in (1, 32, 63, 64, 6000)] == [1, 1, 1, 2, 187]
 
 
 def test_episodes_that_wait_are_begun_in_turn_and_all_count(
-    tiny_world: World, run: Run, draw: Draw
+    program: Program, run: Run, draw: Draw
 ) -> None:
     before = dataclasses.replace(run.before, clock=jnp.full(ARENAS, 15, jnp.int32))
     drawn = [draw(seed, NEXT) for seed in (11, 12, 13)]
     starts = jax.tree.map(lambda *x: jnp.concatenate(x), *drawn)
     starts = dataclasses.replace(starts, clock=jnp.full(3 * ARENAS, 13, jnp.int32))
-    collect = jax.jit(functools.partial(rollout.collect, tiny_world))
+    collect = jax.jit(functools.partial(rollout.collect, program))
     after, trajectory, ended = collect(run.learners, before, starts, jax.random.key(2))
     values = ppo.values(
-        jax.tree.map(lambda x: x[0], run.learners), tiny_world.config.algo, starts.observation
+        jax.tree.map(lambda x: x[0], run.learners), program.config.algo, starts.observation
     )
     for arena in range(ARENAS):
         if arena in (BROKEN, ARRIVES):

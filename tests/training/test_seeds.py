@@ -11,14 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax.config import TrainConfig
 from swarmjax.curriculum import engine as curriculum
 from swarmjax.run.checkpoint import Leaves, to_leaves
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import physics
-from swarmjax.task import env
 from swarmjax.task.env import World
 from swarmjax.training import loop, seeds
-from swarmjax.training.loop import Program, TrainState
+from swarmjax.training import program as programs
+from swarmjax.training.loop import TrainState
+from swarmjax.training.program import Program
 
 SEEDS, UPDATES = 3, np.int32(2)
 Run = Callable[[TrainState, np.int32], tuple[TrainState, dict]]
@@ -27,18 +28,15 @@ Run = Callable[[TrainState, np.int32], tuple[TrainState, dict]]
 def _program(
     config: TrainConfig, world: World, count: int, by: Literal["vmap", "map"], first: int = 0
 ) -> Program:
-    config = replace(config, seed=first, seeds=count, seeds_by=by)
-    return Program(config, replace(world, config=config))
+    return Program(replace(config, seed=first, seeds=count, seeds_by=by), world)
 
 
 def _start(program: Program) -> TrainState:
-    return jax.jit(partial(seeds.init, program))(curriculum.schedule(program.config))
+    return jax.jit(partial(seeds.init, program))(programs.schedule(program.config))
 
 
 def _run(program: Program) -> Run:
-    return partial(
-        jax.jit(partial(seeds.train_chunk, program)), curriculum.schedule(program.config)
-    )
+    return partial(jax.jit(partial(seeds.train_chunk, program)), programs.schedule(program.config))
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +60,7 @@ def run(side_by_side: Program) -> Run:
 
     chex.clear_trace_counter()  # it knows functions by their address, and some are gone
     traced_once = jax.jit(chex.assert_max_traces(chunk, n=1))
-    return partial(traced_once, curriculum.schedule(side_by_side.config))
+    return partial(traced_once, programs.schedule(side_by_side.config))
 
 
 def _lane(found: tuple[TrainState, dict], lane: int) -> Leaves:
@@ -131,7 +129,7 @@ def test_one_seed_is_what_the_loop_makes(
     tiny_config: TrainConfig, tiny_world: World, start: TrainState, run: Run
 ) -> None:
     program = _program(tiny_config, tiny_world, 1, "vmap", first=1)
-    schedule = curriculum.schedule(program.config)
+    schedule = programs.schedule(program.config)
     first = _start(program)
     plain = jax.jit(partial(loop.init, program))(schedule)
     _assert_same(_lane((first, {}), 0), to_leaves(plain))
@@ -185,12 +183,40 @@ def test_what_is_stepped_together_lies_on_one_axis(
 def test_warp_has_room_for_the_arenas_that_are_stepped_together(
     by: Literal["vmap", "map"], arenas: int, tiny_config: TrainConfig
 ) -> None:
-    sim = replace(tiny_config.sim, impl="warp", solver="newton")
+    sim = replace(tiny_config.sim, impl="warp", solver="mjx")
     warp = replace(tiny_config, sim=sim)
-    several = env.load(replace(warp, seeds=SEEDS, seeds_by=by)).physics.template
-    expected = env.load(replace(warp, arenas=arenas)).physics.template
+    several = programs.load_world(replace(warp, seeds=SEEDS, seeds_by=by)).physics.engine.template
+    expected = programs.load_world(replace(warp, arenas=arenas)).physics.engine.template
     assert several._impl.naconmax == expected._impl.naconmax
     assert several._impl.naconmax >= arenas
+
+
+def test_warp_has_room_for_seeds_of_one_group_on_one_core(
+    tiny_config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(programs, "cores", lambda: 1)
+    sim = replace(tiny_config.sim, impl="warp", solver="mjx")
+    warp = replace(tiny_config, sim=sim)
+    grouped = replace(warp, seeds=SEEDS, seeds_by="cores")
+    several = programs.load_world(grouped).physics.engine.template
+    all_at_once = replace(warp, arenas=SEEDS * warp.arenas)
+    expected = programs.load_world(all_at_once).physics.engine.template
+    assert several._impl.naconmax == expected._impl.naconmax
+    assert several._impl.naconmax >= SEEDS * warp.arenas
+
+
+@pytest.mark.parametrize(
+    ("by", "cores", "backend", "expected"),
+    [("map", 2, "cpu", 1), ("vmap", 2, "cpu", 6), ("cores", 1, "cpu", 6), ("cores", 2, "cpu", 3),
+     ("cores", 4, "cpu", 2), ("cores", 16, "cpu", 1), ("cores", 2, "gpu", 6)],
+)  # fmt: skip
+def test_a_call_steps_the_seeds_of_a_group_side_by_side(
+    by: Literal["vmap", "map", "cores"], cores: int, backend: str, expected: int,
+    tiny_config: TrainConfig, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(programs, "cores", lambda: cores)
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    assert programs.side_by_side(replace(tiny_config, seeds=6, seeds_by=by)) == expected
 
 
 def test_numbers_count_up_from_the_seed(tiny_config: TrainConfig) -> None:
@@ -203,7 +229,7 @@ def test_warp_steps_the_arenas_of_all_seeds_each_with_its_own_model(
     """A robot drives against a box, whose size is a number of the model, in each arena another."""
     lanes, arenas, steps = 3, 2, 40
     sim = replace(tiny_config.sim, impl="warp")
-    engine = env.load(replace(tiny_config, sim=sim, seeds=lanes, arenas=arenas)).physics
+    engine = programs.load_world(replace(tiny_config, sim=sim, seeds=lanes, arenas=arenas)).physics
     half = np.linspace(0.02, 0.05, lanes * arenas, dtype=np.float32)
     obstacle = np.zeros((lanes * arenas, 2, 5), np.float32)
     obstacle[:, 0] = [0.0, 0.1, 0.0, 0.05, 0.0]
@@ -235,7 +261,7 @@ def test_cores_have_as_many_seeds_each(
     count: int, cores: int, by: Literal["vmap", "map", "cores"], expected: int,
     tiny_config: TrainConfig,
 ) -> None:  # fmt: skip
-    assert seeds.groups(replace(tiny_config, seeds=count, seeds_by=by), cores) == expected
+    assert programs.groups(replace(tiny_config, seeds=count, seeds_by=by), cores) == expected
 
 
 def test_groups_of_seeds_are_cut_and_joined_in_order() -> None:

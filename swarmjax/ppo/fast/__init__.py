@@ -1,1 +1,5 @@
-"""Faster ways to the same gradient: nothing outside needs them, only `ppo.dispatch` calls them."""
+"""Faster ways to the same update, which nothing needs: only `ppo/dispatch.py` calls them.
+
+`tiles.py` learns by the kernels of `fused.py` on an NVIDIA GPU, `blocks.py` takes a whole batch on
+a CPU in blocks that stay in a core's cache.
+"""

@@ -6,17 +6,19 @@ not there or has long arrived, are left out. One that is vectorised would wait f
 learner in every step: learners and seeds take their turns instead.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from swarmjax.config import AlgoConfig
-from swarmjax.ppo import losses
+from swarmjax.ppo import losses, optimizer
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.fast.valid_first import valid_first
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
+from swarmjax.ppo.optimizer import Progress
 
 # Samples of a block: of 100 to 6,000, with layers of 64, 250 to 400 took least CPU time.
 BLOCK = 256
@@ -32,6 +34,36 @@ class Blocks(NamedTuple):
 
     samples: Minibatch
     used: jax.Array
+
+
+def learn(
+    config: AlgoConfig, updates: int, begun: Progress, samples: Minibatch, _: jax.Array
+) -> tuple[Progress, Metrics]:
+    """Learns from a batch: each epoch is one step on all samples, so their order does not matter.
+
+    Args:
+        config: With one minibatch.
+        updates: Number of updates of the whole run.
+        begun: Parameters and the optimiser's state.
+        samples: [G, N, ...], zero where not valid.
+
+    Returns:
+        Parameters and the optimiser's state after, and the metrics of each step, [epochs].
+    """
+    return in_turn(functools.partial(_learn, config, updates))(begun, samples)
+
+
+def _learn(
+    config: AlgoConfig, updates: int, begun: Progress, samples: Minibatch
+) -> tuple[Progress, Metrics]:
+    """All epochs, each one step on all samples; the metrics of each are [epochs]."""
+    blocks, count = arrange(samples), jnp.sum(samples.valid)
+
+    def epoch(progress: Progress, _: None) -> tuple[Progress, Metrics]:
+        found = gradient(progress[0], blocks, config, count)
+        return optimizer.take(config, updates, progress, found, count > 0)
+
+    return jax.lax.scan(epoch, begun, length=config.epochs)
 
 
 def arrange(samples: Minibatch) -> Blocks:

@@ -16,17 +16,15 @@ it lies: a minibatch is a choice of tiles, and the rest of the batch costs nothi
 import functools
 import itertools
 import math
-import re
 from dataclasses import replace
-from typing import Literal
 
 import chex
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from swarmjax.config import AlgoConfig, ConfigError, show
 from swarmjax.ppo import networks
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.fast import kernel
 from swarmjax.ppo.fast.kernel import Launch, Layout, Place, Samples, Tiles
 from swarmjax.ppo.losses import Metrics, Minibatch
@@ -44,53 +42,8 @@ _LEAST_TILES = 8
 # Guide, "Technical Specifications per Compute Capability".
 _MEMORY = {"8.0": 163 * 1024, "9.0": 227 * 1024, "10.0": 227 * 1024}
 
-# XLA takes Triton's kernels from this generation on (Ampere, compute capability 8).
-_LEAST_GENERATION = 8
-
-# Names that JAX has for products without tensor cores (`jax.default_matmul_precision`).
-_FULL = ("highest", "float32", "F32_F32_F32")
-
-# What `flat_gradient` tells: the metrics of `losses.ppo_loss`.
-METRICS = ("approx_kl", "bound_loss", "clip_fraction", "entropy", "policy_loss", "value_loss")
-
 _Run = functools.partial[tuple[jax.Array, Metrics]]
 Flat = dict[str, jax.Array]  # a vector for each network, in the order of its tree's leaves
-
-
-def resolve(
-    config: AlgoConfig, observation_size: int, action_size: int
-) -> Literal["autodiff", "fused"]:
-    """Turns `auto` into `fused` on an NVIDIA GPU where the layers fit it, `autodiff` elsewhere.
-
-    So it does where JAX's matrix products are to be in full precision: without tensor cores the
-    kernels are slower than what XLA makes.
-
-    Args:
-        config: Of the learner.
-        observation_size: O.
-        action_size: U.
-
-    Returns:
-        How the gradient is computed.
-
-    Raises:
-        ConfigError: `fused` is asked for where there is no such GPU, or of layers that do not fit.
-    """
-    possible = _has_tensor_cores()
-    fitting = fits(config, observation_size, action_size)
-    if config.gradient == "fused" and not possible:
-        raise ConfigError(
-            "algo.gradient is fused, but there is no NVIDIA GPU of compute capability "
-            f"{_LEAST_GENERATION} or more: give auto or autodiff."
-        )
-    if config.gradient == "fused" and not fitting:
-        raise ConfigError(
-            f"algo.gradient is fused, but algo.hidden is {show(config.hidden)}, which does not fit "
-            "the chip: give two layers of 16, 32 or 64, or algo.gradient=auto."
-        )
-    if config.gradient == "auto" and jax.config.jax_default_matmul_precision in _FULL:
-        return "autodiff"
-    return "fused" if config.gradient != "autodiff" and possible and fitting else "autodiff"
 
 
 def fits(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
@@ -131,12 +84,6 @@ def choose_launch(
 def _capability() -> str:
     """The compute capability of the GPU that JAX computes on, such as 9.0; no text of others."""
     return str(getattr(jax.devices()[0], "compute_capability", ""))
-
-
-def _has_tensor_cores() -> bool:
-    """Whether JAX computes on an NVIDIA GPU whose tensor cores Triton knows."""
-    generation = re.fullmatch(r"(\d+)\.\d+", _capability())
-    return generation is not None and int(generation[1]) >= _LEAST_GENERATION
 
 
 def gradient(

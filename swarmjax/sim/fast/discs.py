@@ -18,6 +18,7 @@ does: there is one minimum. `planar_jax` does so by JAX, `planar_warp` by Warp. 
 goes through the fixtures one by one, for all robots, and then through the pairs of robots.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -29,10 +30,9 @@ from flax import struct
 from jax import Array
 
 from swarmjax.sim import model as sim_model
+from swarmjax.sim.engine import Engine
 from swarmjax.sim.geometry import CONTACT_HEIGHT
 
-# Contacts that a solver has room for: neighbours of its size that a disc can touch at once.
-ROWS_PER_ROBOT = 6
 # Share of the largest force by which any may still change; float32 rounds at 1e-7.
 TOLERANCE = 1e-6
 # A centre that is deeper within a box than it is below its top or above its bottom, m, is pushed
@@ -152,6 +152,23 @@ def put(model: mujoco.MjModel) -> tuple[Model, Data]:
     fields = model.body_mass, model.body_inertia, model.body_invweight0
     still = jnp.zeros(model.nv)
     return Model(*map(jnp.asarray, fields)), Data(jnp.zeros(model.nq), still, still, still)
+
+
+def load_engine(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve: Solve) -> Engine:
+    """Loads the discs as what takes a program's physics steps.
+
+    Args:
+      model: compiled, one arena.
+      ids: where things lie in it.
+      radius: of the hulls, m.
+      solve: `push_apart` of `planar_warp` or `planar_jax`.
+
+    Returns:
+      The engine.
+    """
+    discs = load(model, ids, radius, solve)
+    label = "discs, swarmjax's own step of the MJX model in the plane"
+    return Engine(label, *put(model), functools.partial(step, discs), is_mjx=False)
 
 
 def _rounds(robots: int) -> np.ndarray:

@@ -18,8 +18,9 @@ from jax import Array
 from jax.custom_batching import custom_vmap
 
 from swarmjax.sim import model as sim_model
+from swarmjax.sim.engine import ROWS_PER_ROBOT
 from swarmjax.sim.fast import discs as sim_discs
-from swarmjax.sim.fast.discs import ROWS_PER_ROBOT, Discs, Robots
+from swarmjax.sim.fast.discs import Discs, Robots
 
 BLOCK = 64  # threads of a block: with few arenas, the blocks of 256 would leave most of a card idle
 _TOLERANCE = wp.constant(sim_discs.TOLERANCE)

@@ -4,7 +4,6 @@ On a GPU the minimum over four obstacles is a kernel of its own, which reads wha
 memory. Taken one thing after the other all is elementwise, and XLA keeps it in registers.
 """
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -27,20 +26,3 @@ def pieces(count: int, xp: Any) -> list[slice]:
     if xp is np or not 0 < count <= MOST:
         return [slice(None)]
     return [slice(i, i + 1) for i in range(count)]
-
-
-def least(values: Iterable[Array], limit: float, xp: Any) -> Array:
-    """Least of what there is of all things.
-
-    Args:
-      values: [..., N] of things, one array a piece.
-      limit: where there is nothing less.
-      xp: `numpy` or `jax.numpy`.
-
-    Returns:
-      [...] at most `limit`.
-    """
-    found = limit
-    for value in values:
-        found = xp.minimum(found, xp.min(value, axis=-1, initial=limit))
-    return found

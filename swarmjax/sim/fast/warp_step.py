@@ -4,14 +4,38 @@ MJX calls Warp's `step` by its name, and there it is replaced; a model says by i
 which step is meant, and one that names none of ours is stepped as ever. Needs Warp.
 """
 
+import copy
+from dataclasses import replace
 from typing import Any
 
+import mujoco
 import mujoco.mjx.third_party.mujoco_warp as mjw
 from mujoco.mjx.warp import forward
 
+from swarmjax.sim import engine
+from swarmjax.sim.engine import Engine
 from swarmjax.sim.fast import wheeled_warp
 
 _newton = mjw.step
+
+
+def load_engine(model: mujoco.MjModel, robots: int, arenas: int) -> Engine:
+    """Loads MJX-Warp with the contact solver that is made for wheeled robots.
+
+    Args:
+      model: compiled, one arena.
+      robots: R.
+      arenas: how many arenas will be stepped together.
+
+    Returns:
+      The engine.
+    """
+    model = copy.copy(model)
+    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE  # as `wheeled_warp` reads it
+    plain = engine.load_mjx(model, robots, "warp", arenas)
+    install()
+    chosen = plain.model.tree_replace({"opt.solver": wheeled_warp.NUMBER})
+    return replace(plain, label="MJX with swarmjax's contact solver", model=chosen)
 
 
 def install() -> None:

@@ -1,14 +1,15 @@
 """Gradients by blocks are those of the whole batch."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax.config import AlgoConfig
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import losses, networks
-from swarmjax.ppo.fast import blocks as full_batch
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.fast import blocks
 from swarmjax.ppo.losses import Minibatch
 
 CONFIG = AlgoConfig(hidden=(8,), minibatches=1, epochs=3, entropy_cost=0.01)
@@ -40,10 +41,10 @@ def _params() -> networks.Params:
 @pytest.mark.parametrize(("share", "used"), [(1.0, 3), (0.5, 2), (0.1, 1), (0.0, 0)])
 def test_the_gradient_is_that_of_all_samples_at_once(share: float, used: int) -> None:
     samples, params = _batch(share), _params()
-    blocks = full_batch.arrange(samples)
-    assert int(blocks.used) == used  # of 750, about 375, 75 and 0 samples in blocks of 256
+    arranged = blocks.arrange(samples)
+    assert int(arranged.used) == used  # of 750, about 375, 75 and 0 samples in blocks of 256
     count = jnp.sum(samples.valid)
-    found = full_batch.gradient(params, blocks, CONFIG, count)
+    found = blocks.gradient(params, arranged, CONFIG, count)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
     whole = jax.grad(losses.ppo_loss, has_aux=True)
     # Sums of float32 in another order.
@@ -55,13 +56,26 @@ def test_the_gradient_is_that_of_all_samples_at_once(share: float, used: int) ->
 
 def test_valid_samples_come_first_in_their_order() -> None:
     samples = _batch(0.5)
-    blocks = full_batch.arrange(samples)
+    arranged = blocks.arrange(samples)
     valid = samples.valid.reshape(-1)
     kept = samples.advantage.reshape(-1)[valid]
-    np.testing.assert_array_equal(blocks.samples.advantage.reshape(-1)[: len(kept)], kept)
+    np.testing.assert_array_equal(arranged.samples.advantage.reshape(-1)[: len(kept)], kept)
     np.testing.assert_array_equal(
-        blocks.samples.valid.reshape(-1), np.arange(3 * full_batch.BLOCK) < len(kept)
+        arranged.samples.valid.reshape(-1), np.arange(3 * blocks.BLOCK) < len(kept)
     )
+
+
+def test_a_learner_learns_as_by_autodiff() -> None:
+    begun = ppo.init(jax.random.key(0), CONFIG, OBSERVATION, ACTION, 5)
+    batch = _to_batch(_batch(0.5))
+    update = jax.jit(ppo.update, static_argnums=(1, 4, 5))
+    found, told = update(begun, CONFIG, batch, jax.random.key(1), 5, "blocks")
+    expected, metrics = update(begun, CONFIG, batch, jax.random.key(1), 5, "autodiff")
+    chex.assert_trees_all_equal_structs((found, told), (expected, metrics))
+    # Steps of Adam along gradients that differ by rounding.
+    chex.assert_trees_all_close((found, told), (expected, metrics), rtol=1e-4, atol=1e-5)
+    moved = jax.tree.map(lambda a, b: np.abs(a - b).max(), found.params, begun.params)
+    assert max(jax.tree.leaves(moved)) > 1e-3
 
 
 def test_lanes_take_their_turns_and_come_to_what_each_does_alone() -> None:
@@ -71,7 +85,7 @@ def test_lanes_take_their_turns_and_come_to_what_each_does_alone() -> None:
     learners = jax.vmap(lambda k: ppo.init(k, CONFIG, OBSERVATION, ACTION, 5))(keys)
 
     def update(learner: ppo.LearnerState, batch: ppo.Batch, key: jax.Array) -> ppo.LearnerState:
-        return ppo.update(learner, CONFIG, batch, key, 5)[0]
+        return ppo.update(learner, CONFIG, batch, key, 5, "blocks")[0]
 
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *batches)
     together = jax.jit(jax.vmap(update))(learners, stacked, keys).params

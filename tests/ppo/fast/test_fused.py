@@ -14,11 +14,11 @@ import pytest
 from hypothesis import strategies as st
 from jax.sharding import AbstractDevice, AbstractMesh
 
-from swarmjax.config import AlgoConfig, ConfigError
 from swarmjax.ppo import learner as ppo
-from swarmjax.ppo import losses, networks
-from swarmjax.ppo.fast import fused
-from swarmjax.ppo.fast import kernel as fused_kernel
+from swarmjax.ppo import losses, networks, optimizer
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.dispatch import Backend
+from swarmjax.ppo.fast import fused, kernel
 from swarmjax.ppo.fast.kernel import Launch
 from swarmjax.ppo.losses import Minibatch
 from swarmjax.ppo.networks import Params
@@ -214,21 +214,23 @@ def _batch(drawn: Minibatch, groups: int) -> ppo.Batch:
     return ppo.Batch(**cut)
 
 
-def _learn(config: AlgoConfig, begun: ppo.LearnerState, batch: ppo.Batch) -> Any:
+def _learn(
+    config: AlgoConfig, begun: ppo.LearnerState, batch: ppo.Batch, backend: Backend = "fused"
+) -> Any:
     """Parameters, the optimiser's state and metrics of an update."""
-    made, metrics = jax.jit(lambda b: ppo.update(begun, config, b, jax.random.key(1), 5))(batch)
+    update = jax.jit(lambda b: ppo.update(begun, config, b, jax.random.key(1), 5, backend))
+    made, metrics = update(batch)
     return made.params, made.optimizer_state, metrics
 
 
 def _interpret(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Makes learners use the kernels, interpreted; lists each time that they are traced."""
+    """Has the kernels interpreted; lists each time that they are traced."""
     calls, real = [], fused.flat_gradient
 
     def interpreted(*arguments: Any, launch: Launch) -> Any:
         calls.append(arguments)
         return real(*arguments, launch=launch, interpret=True)
 
-    monkeypatch.setattr(fused, "resolve", lambda *_: "fused")
     monkeypatch.setattr(fused, "flat_gradient", interpreted)
     return calls
 
@@ -247,7 +249,7 @@ def test_a_learner_that_takes_all_at_once_learns_as_by_autodiff(
     config = replace(SMALL, minibatches=1, epochs=3)
     begun = ppo.init(jax.random.key(0), config, OBSERVATION, ACTION, 5)
     batch = _batch(_minibatch(begun.params, config, 8 * 20), 8)
-    expected = _learn(config, begun, batch)
+    expected = _learn(config, begun, batch, "autodiff")
     calls = _interpret(monkeypatch)
     _assert_learned_alike(_learn(config, begun, batch), expected)
     assert len(calls) == 1  # traced once, in a loop over steps
@@ -277,7 +279,7 @@ def test_a_learner_steps_through_the_tiles_that_it_has_shuffled(
         part = jax.tree.map(lambda x, rows=rows: x[rows], valid)
         gradient = jax.grad(losses.ppo_loss, has_aux=True)
         slope = gradient(progress[0], part, config, count / 4)
-        progress, metrics = ppo._take(config, 5, progress, slope, jnp.bool_(True))
+        progress, metrics = optimizer.take(config, 5, progress, slope, jnp.bool_(True))
         told.append(metrics)
     means = jax.tree.map(lambda *x: np.mean(x), *told)
     means["std"] = np.mean(np.exp(progress[0]["actor"]["log_std"]))
@@ -309,7 +311,7 @@ def test_learners_side_by_side_learn_as_each_does_alone(monkeypatch: pytest.Monk
         batches.append(_batch(replace(drawn, valid=np.arange(8 * 20) < share * 8 * 20), 8))
 
     def update(learner: ppo.LearnerState, batch: ppo.Batch) -> ppo.LearnerState:
-        return ppo.update(learner, config, batch, jax.random.key(3), 5)[0]
+        return ppo.update(learner, config, batch, jax.random.key(3), 5, "fused")[0]
 
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *zip(begun, batches, strict=True))
     together = jax.jit(jax.vmap(update))(*stacked)
@@ -341,7 +343,7 @@ def test_tiles_with_valid_samples_are_dealt_out_once_a_pass(
 def test_what_the_kernels_tell_are_the_metrics_of_the_loss() -> None:
     params = _params(SMALL)
     _, expected = _expected(params, _minibatch(params, SMALL, 8), SMALL, 8.0)
-    assert sorted(expected) == list(fused.METRICS)
+    assert sorted(expected) == list(optimizer.METRICS[:-1])
 
 
 @pytest.mark.parametrize("name", ["actor", "critic"])
@@ -389,30 +391,11 @@ def test_layers_fit_by_their_widths_and_by_the_memory_on_the_chip(
 def test_a_wide_observation_does_not_fit() -> None:
     assert fused.fits(SMALL, 128, ACTION)
     assert not fused.fits(SMALL, 129, ACTION)
-    assert fused_kernel.padded_width(129) == 256
+    assert kernel.padded_width(129) == 256
 
 
 def _on(monkeypatch: pytest.MonkeyPatch, **device: str) -> None:
     monkeypatch.setattr(fused.jax, "devices", lambda: [SimpleNamespace(**device)])
-
-
-@pytest.mark.parametrize(
-    ("device", "choice"),
-    [
-        ({}, "autodiff"),
-        ({"compute_capability": "gfx942"}, "autodiff"),
-        ({"compute_capability": "7.5"}, "autodiff"),
-        ({"compute_capability": "8.0"}, "fused"),
-        ({"compute_capability": "12.0"}, "fused"),
-    ],
-)
-def test_auto_is_fused_on_an_nvidia_gpu_where_the_layers_fit(
-    device: dict[str, str], choice: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _on(monkeypatch, **device)
-    assert fused.resolve(AlgoConfig(), OBSERVATION, ACTION) == choice
-    assert fused.resolve(AlgoConfig(gradient="autodiff"), OBSERVATION, ACTION) == "autodiff"
-    assert fused.resolve(AlgoConfig(hidden=(8,)), OBSERVATION, ACTION) == "autodiff"
 
 
 @pytest.mark.parametrize(
@@ -440,29 +423,3 @@ def test_a_small_batch_has_small_tiles(
     _on(monkeypatch, compute_capability="9.0")
     config = AlgoConfig(minibatches=8)  # 8 tiles of 128 a minibatch are 8,192 samples
     assert fused.choose_launch(config, OBSERVATION, ACTION, samples) == expected
-
-
-def test_full_precision_is_left_to_autodiff(monkeypatch: pytest.MonkeyPatch) -> None:
-    _on(monkeypatch, compute_capability="9.0")
-    with jax.default_matmul_precision("highest"):
-        assert fused.resolve(AlgoConfig(), OBSERVATION, ACTION) == "autodiff"
-        assert fused.resolve(AlgoConfig(gradient="fused"), OBSERVATION, ACTION) == "fused"
-    with jax.default_matmul_precision("tensorfloat32"):
-        assert fused.resolve(AlgoConfig(), OBSERVATION, ACTION) == "fused"
-
-
-def test_fused_is_refused_where_it_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ConfigError) as no_gpu:
-        fused.resolve(AlgoConfig(gradient="fused"), OBSERVATION, ACTION)
-    assert str(no_gpu.value) == (
-        "algo.gradient is fused, but there is no NVIDIA GPU of compute capability 8 or more: give "
-        "auto or autodiff."
-    )
-    _on(monkeypatch, compute_capability="9.0")
-    assert fused.resolve(AlgoConfig(gradient="fused"), OBSERVATION, ACTION) == "fused"
-    with pytest.raises(ConfigError) as unfit:
-        fused.resolve(AlgoConfig(gradient="fused", hidden=(48, 64)), OBSERVATION, ACTION)
-    assert str(unfit.value) == (
-        "algo.gradient is fused, but algo.hidden is [48,64], which does not fit the chip: give two "
-        "layers of 16, 32 or 64, or algo.gradient=auto."
-    )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from swarmjax.sim import gaps, infrared
-from swarmjax.sim.fast.unroll import MOST, least, pieces
+from swarmjax.sim.fast.unroll import MOST, pieces
 
 RADIUS = 0.037  # m
 RANGE = 0.04  # m
@@ -24,20 +24,6 @@ def test_jax_takes_few_things_one_by_one() -> None:
 @pytest.mark.parametrize(("count", "xp"), [(0, jnp), (MOST + 1, jnp), (0, np), (3, np)])
 def test_many_things_none_and_numpy_are_one_piece(count: int, xp: ModuleType) -> None:
     assert pieces(count, xp) == [slice(None)]
-
-
-@MODULES
-@pytest.mark.parametrize("count", [3, MOST + 1])
-def test_least_of_all_pieces(xp: ModuleType, count: int) -> None:
-    reach = np.stack([np.arange(count), 7.0 - np.arange(count), np.full(count, 9.0)])
-    found = least([xp.asarray(reach)[:, i] for i in pieces(count, xp)], 6.5, xp)
-    assert found.tolist() == [0.0, 7.0 - (count - 1), 6.5]
-
-
-@MODULES
-def test_of_no_things_none_is_near(xp: ModuleType) -> None:
-    found = least([xp.zeros((2, 0))[:, i] for i in pieces(0, xp)], 6.5, xp)
-    assert found.tolist() == [6.5, 6.5]
 
 
 @MODULES

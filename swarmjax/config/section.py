@@ -12,7 +12,9 @@ import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
+
+MAX_COUNT = 2**31 - 1  # counts and seeds are int32 on the device
 
 
 class ConfigError(ValueError):
@@ -53,6 +55,7 @@ def about(
     above: float = -math.inf,
     below: float = math.inf,
     derived: bool = False,
+    renamed: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
     """Return the metadata of a field.
 
@@ -63,13 +66,23 @@ def about(
         above: a number that it must exceed.
         below: a number that it must not reach.
         derived: whether it follows from the files chosen, and is no key of the command line.
+        renamed: values that have a new name, by the old one.
     """
-    return {"meaning": meaning, "bounds": Bounds(low, high, above, below), "derived": derived}
+    bounds = Bounds(low, high, above, below)
+    return {"meaning": meaning, "bounds": bounds, "derived": derived, "renamed": renamed or {}}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A group of settings, whose numbers are held to their bounds when it is made."""
+    """A group of settings, whose numbers are held to their bounds when it is made.
+
+    Attributes:
+        command: name of the command's file in configs/, of a section that is all of a command's.
+        removed: why a key is gone, by its old name.
+    """
+
+    command: ClassVar[str] = ""
+    removed: ClassVar[Mapping[str, str]] = {}
 
     def __post_init__(self) -> None:
         for item in dataclasses.fields(self):
@@ -139,6 +152,8 @@ def build[C: Section](cls: type[C], mapping: Mapping[str, Any], where: str = "")
     for item in known.values():
         if item.name not in mapping and _is_required(item):
             raise ConfigError(f"{where}{item.name} is missing and has no default: give it.")
+    for key, value in mapping.items():
+        _refuse_renamed(known[key], value, f"{where}{key}")
     values = {
         key: convert(known[key].type, value, f"{where}{key}") for key, value in mapping.items()
     }
@@ -146,6 +161,14 @@ def build[C: Section](cls: type[C], mapping: Mapping[str, Any], where: str = "")
         return cls(**values)
     except ConfigError as error:
         raise ConfigError(f"{where}{error}") from None
+
+
+def _refuse_renamed(item: dataclasses.Field[Any], value: object, key: str) -> None:
+    """Refuse a value's old name with its new one."""
+    renamed = item.metadata.get("renamed", {})
+    if isinstance(value, str) and value in renamed:
+        new = renamed[value]
+        raise ConfigError(f"{key} is {value}, which is called {new} now: give {new}.")
 
 
 def to_dict(config: Section) -> dict[str, Any]:
@@ -212,6 +235,8 @@ def unknown_key(key: str, cls: type[Section], where: str = "") -> ConfigError:
         cls: the section that has no such key.
         where: what stands before it, such as `sim.`.
     """
+    if key in cls.removed:
+        return ConfigError(f"{where}{key} is no longer a key: {cls.removed[key]}")
     known = names(cls)
     dotted = {full.rpartition(".")[2]: full for full in reversed(keys(cls))}
     near = [dotted[key]] if key in dotted else difflib.get_close_matches(key, known, n=1)

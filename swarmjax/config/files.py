@@ -2,23 +2,26 @@
 
 Hydra composes the YAML files with the `key=value` words and nothing else: it sets up no logging
 and changes no directory, and is imported when it is used. What comes out is for
-`settings.build`.
+`section.build`.
 """
 
 import difflib
 import re
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from swarmjax import settings
-from swarmjax.settings import ConfigError, Section, show
+from swarmjax.config import section
+from swarmjax.config.section import ConfigError, Section, show
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-_PACKAGE = Path(__file__).resolve().parent
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+# Given what was composed and the choice of each group: the keys and values to check.
+Complete = Callable[[dict[str, Any], dict[str, str]], dict[str, Any]]
 
 
 def compose(
@@ -40,84 +43,33 @@ def compose(
     words = split_words(cls, overrides)
     groups = {key: word.partition("=")[2] for key, word in words.items() if choices(key)}
     for key, choice in groups.items():
-        _check_choice(key, choice, key)
+        check_choice(key, choice, key)
     for key in words.keys() - groups.keys():
         _parse(words[key])
     for group, choice in (defaults(command) | groups).items():
-        _read_yaml(f"{group}/{choice}")  # names a broken file, where Hydra would not
+        read_file(f"{group}/{choice}")  # names a broken file, where Hydra would not
     forced = [word if key in groups else f"++{word}" for key, word in words.items()]
     composed, chosen = _hydra(command, forced)
     return _resolve(composed), chosen
 
 
-def stages(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
-    """Return the stages that a file of configs/stage/ stands for: itself, or its sequence.
+def load[C: Section](cls: type[C], overrides: Sequence[str], complete: Complete | None = None) -> C:
+    """Makes a command's settings from its files and its `key=value` words: every command's loader.
 
     Args:
-        stage: what `compose` made of the group `stage`.
-        choice: the name of its file.
+        cls: the command's dataclass; its `command` names the file in configs/.
+        overrides: the words.
+        complete: given what was composed and the choice of each group, returns the keys and values
+            to check; None checks what was composed.
+
+    Returns:
+        The settings.
 
     Raises:
-        ConfigError: the file or its sequence is unsound, or keys are given for a sequence.
+        ConfigError: a word, a choice, a file or a value is unsound.
     """
-    if not is_sequence(choice):
-        return [_named(stage, choice)]
-    names = settings.convert(tuple[str, ...], stage["sequence"], "stage.sequence")
-    names = typing.cast(tuple[str, ...], names)
-    if not names:
-        raise ConfigError("stage.sequence is []: give at least one stage.")
-    _refuse_others(
-        stage, choice, "sequence", f"a curriculum: choose one stage, as in stage={names[-1]}"
-    )
-    return [_member(name) for name in names]
-
-
-def grid(stage: dict[str, Any], choice: str) -> dict[str, Any]:
-    """Return the axes of a file of configs/stage/ that is a grid.
-
-    Args:
-        stage: what `compose` made of the group `stage`.
-        choice: the name of its file.
-
-    Raises:
-        ConfigError: other keys are given beside it.
-    """
-    _refuse_others(stage, choice, "grid", "a grid: give its axes, as in stage.grid.side=[0.7,1.0]")
-    return stage["grid"]
-
-
-def is_sequence(choice: str) -> bool:
-    """Tell whether a file of configs/stage/ names a sequence of others."""
-    return "sequence" in _read_yaml(f"stage/{choice}")
-
-
-def is_grid(choice: str) -> bool:
-    """Tell whether a file of configs/stage/ is a grid of stages."""
-    return "grid" in _read_yaml(f"stage/{choice}")
-
-
-def _refuse_others(stage: dict[str, Any], choice: str, only: str, advice: str) -> None:
-    """Refuse keys of a single stage where a file stands for several."""
-    for key in stage.keys() - {only}:
-        raise ConfigError(f"stage.{key} cannot be given for {choice}, {advice}.")
-
-
-def _member(name: str) -> dict[str, Any]:
-    """Read one stage of a curriculum."""
-    _check_choice("stage", name, "stage.sequence")
-    if is_sequence(name):
-        raise ConfigError(f"stage.sequence names {name}, a curriculum itself: give single stages.")
-    if is_grid(name):
-        raise ConfigError(f"stage.sequence names {name}, a grid: give single stages.")
-    return _named(_read_yaml(f"stage/{name}"), name)
-
-
-def _named(stage: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return the stage if it bears the name of its file."""
-    found = stage.get("name", name)
-    if found != name:
-        raise ConfigError(f"stage.name is {show(found)} in {name}.yaml: give the file's name.")
-    return stage
+    mapping, chosen = compose(cls, cls.command, overrides)
+    return section.build(cls, complete(mapping, chosen) if complete else mapping)
 
 
 # Files
@@ -130,7 +82,7 @@ def choices(group: str) -> list[str]:
 
 def defaults(command: str) -> dict[str, str]:
     """Return the groups of a command and the choices that its file makes."""
-    entries = _read_yaml(command).get("defaults", [])
+    entries = read_file(command).get("defaults", [])
     return {
         str(group): str(choice)
         for entry in entries
@@ -160,8 +112,15 @@ def _config_dir() -> Path:
     raise ConfigError(f"configs is missing: neither {source} nor {installed} is a folder.")
 
 
-def _read_yaml(name: str) -> dict[str, Any]:
-    """Read one file of configs/ as it stands."""
+def read_file(name: str) -> dict[str, Any]:
+    """Read one file of configs/ as it stands.
+
+    Args:
+        name: its path there without the ending, such as `stage/s6`.
+
+    Raises:
+        ConfigError: it cannot be read.
+    """
     return read_yaml(_config_dir() / f"{name}.yaml")
 
 
@@ -184,26 +143,14 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return {str(key): value for key, value in mapping.items()}
 
 
-def read_stage(choice: str) -> dict[str, Any]:
-    """Read a file of configs/stage/ that is a single stage.
-
-    Raises:
-        ConfigError: there is none of this name, or it stands for several.
-    """
-    _check_choice("stage", choice, "stage")
-    if is_sequence(choice) or is_grid(choice):
-        raise ConfigError(f"stage is {choice}, which stands for several: give single stages.")
-    return _read_yaml(f"stage/{choice}")
-
-
 def read_preset(group: str, choice: str) -> dict[str, Any]:
     """Read a file of a group that stands for itself, such as `realism` and `real`.
 
     Raises:
         ConfigError: there is none of this name.
     """
-    _check_choice(group, choice, group)
-    return _read_yaml(f"{group}/{choice}")
+    check_choice(group, choice, group)
+    return read_file(f"{group}/{choice}")
 
 
 def suite_path(choice: str) -> Path:
@@ -215,7 +162,7 @@ def suite_path(choice: str) -> Path:
     path = Path(choice)
     if path.suffix == ".yaml":
         return path
-    _check_choice("suites", choice, "suite")
+    check_choice("suites", choice, "suite")
     return _config_dir() / "suites" / f"{choice}.yaml"
 
 
@@ -223,7 +170,17 @@ def _example(group: str) -> str:
     return f"{group}={choices(group)[-1]}"
 
 
-def _check_choice(group: str, choice: str, key: str) -> None:
+def check_choice(group: str, choice: str, key: str) -> None:
+    """Refuse a choice that is no file of a group.
+
+    Args:
+        group: a folder of configs/.
+        choice: the name of a file in it.
+        key: what a sentence calls it.
+
+    Raises:
+        ConfigError: there is none of this name.
+    """
     names = choices(group)
     if choice not in names:
         # Names as short as s7 and s6 share half their letters, below difflib's own cutoff of 0.6.
@@ -249,7 +206,7 @@ def split_words(cls: type[Section], overrides: Sequence[str]) -> dict[str, str]:
         ConfigError: a word is no `key=value`, begins with a key that `cls` does not have, or sets
             what the choice of a file sets.
     """
-    roots, derived = settings.names(cls), settings.keys(cls, derived=True)
+    roots, derived = section.names(cls), section.keys(cls, derived=True)
     words = {}
     for word in overrides:
         key, equals, _ = word.partition("=")
@@ -257,11 +214,11 @@ def split_words(cls: type[Section], overrides: Sequence[str]) -> dict[str, str]:
             raise ConfigError(f"{show(word)} is not a setting: give key=value.")
         root = key.partition(".")[0]
         if root not in roots:
-            raise settings.unknown_key(root, cls)
+            raise section.unknown_key(root, cls)
         if key in derived:
             raise ConfigError(f"{key} cannot be given: choose a file, as in {_example(root)}.")
         words[key] = word
-    texts = {key for key, item in settings.keys(cls).items() if str in settings.options(item.type)}
+    texts = {key for key, item in section.keys(cls).items() if str in section.options(item.type)}
     return {key: _quote(word) if key in texts else word for key, word in words.items()}
 
 

@@ -1,0 +1,127 @@
+"""The settings of the curriculum."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from swarmjax.config import ConfigError, Section, about, show
+
+# The options of a curriculum that not all modes take: those that do, and what null stands for.
+_STEPWISE = ("sequential", "mixed")
+
+
+_MODE_OPTIONS: dict[str, tuple[tuple[str, ...], float | str | None]] = {
+    "threshold": (_STEPWISE, 0.8),
+    "demotion": (_STEPWISE, None),
+    "budget_share": (_STEPWISE, 0.5),
+    "earlier_share": (("mixed",), 0.2),
+    "score": (("adaptive",), "learnability"),
+    "floor": (("adaptive",), 0.1),
+    "optimizer": (_STEPWISE, "keep"),
+    "normalizer": (_STEPWISE, "keep"),
+    "exploration": (_STEPWISE, "keep"),
+    "newcomers": (_STEPWISE, "copy"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurriculumConfig(Section):
+    """Who trains on which stage, when that changes, and what a promotion does to the learners.
+
+    An option of some modes only, as its meaning says, is null in the others and may be null in
+    its own, where it then takes its default.
+    """
+
+    mode: Literal["sequential", "mixed", "adaptive"] = field(
+        default="mixed",
+        metadata=about(
+            "sequential: all on the newest stage; mixed: some on earlier ones; adaptive: on all "
+            "stages, most where most is learned"
+        ),
+    )
+    success: Literal["targets", "all"] = field(
+        default="targets",
+        metadata=about("what decides: share of targets, or of episodes in which all arrived"),
+    )
+    threshold: float | None = field(
+        default=None,
+        metadata=about("success that promotes; null: 0.8 [sequential, mixed]", 0.0, 1.0),
+    )
+    demotion: float | None = field(
+        default=None,
+        metadata=about(
+            "success below which the stage before returns; null: never [sequential, mixed]",
+            0.0,
+            1.0,
+        ),
+    )
+    budget_share: float | None = field(
+        default=None,
+        metadata=about(
+            "share of the budget for all stages before the last, in equal parts; null: 0.5 "
+            "[sequential, mixed]",
+            above=0.0,
+            below=1.0,
+        ),
+    )
+    earlier_share: float | None = field(
+        default=None,
+        metadata=about(
+            "share of the arenas on earlier stages; null: 0.2 [mixed]", above=0.0, below=1.0
+        ),
+    )
+    score: Literal["learnability", "progress"] | None = field(
+        default=None,
+        metadata=about(
+            "learnability: p (1 - p) of success p; progress: how fast it changes; null: "
+            "learnability [adaptive]"
+        ),
+    )
+    floor: float | None = field(
+        default=None,
+        metadata=about(
+            "share of the arenas spread evenly over all stages; null: 0.1 [adaptive]",
+            above=0.0,
+            high=1.0,
+        ),
+    )
+    optimizer: Literal["keep", "reset"] = field(
+        default="keep",
+        metadata=about("moments of Adam at a promotion; reset: to 0 [sequential, mixed]"),
+    )
+    normalizer: Literal["keep", "relearn"] = field(
+        default="keep",
+        metadata=about(
+            "at a promotion; relearn: from the next batch, without the past [sequential, mixed]"
+        ),
+    )
+    exploration: Literal["keep", "reset"] = field(
+        default="keep",
+        metadata=about("at a promotion; reset: to algo.initial_std [sequential, mixed]"),
+    )
+    newcomers: Literal["copy", "fresh"] = field(
+        default="copy",
+        metadata=about(
+            "independent policies of robots that a promotion adds; copy: of those that trained, "
+            "in turn [sequential, mixed]"
+        ),
+    )
+
+    def _check(self) -> None:
+        for key, (modes, default) in _MODE_OPTIONS.items():
+            value = getattr(self, key)
+            plain = getattr(CurriculumConfig, key)
+            if self.mode not in modes and value != plain:
+                raise ConfigError(
+                    f"{key} is {show(value, quote='')}, but mode is {self.mode}: {key} is an "
+                    f"option of {' and '.join(modes)}, so give {show(plain, quote='')} or "
+                    f"mode={modes[0]}."
+                )
+            if self.mode in modes and value is None:
+                object.__setattr__(self, key, default)
+        if self.demotion is None or self.threshold is None:
+            return
+        if self.demotion >= self.threshold:
+            raise ConfigError(
+                f"demotion is {show(self.demotion)}, but threshold is {show(self.threshold)}: "
+                f"give less than {show(self.threshold)}."
+            )

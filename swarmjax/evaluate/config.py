@@ -1,0 +1,76 @@
+"""The settings of an evaluation."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.config.section import MAX_COUNT
+from swarmjax.sim.config import RobotConfig
+from swarmjax.sim.realism_config import RealismConfig
+from swarmjax.task.config import TaskConfig, check_realism
+from swarmjax.task.shapes import Shape
+from swarmjax.task.stage_config import StageConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig(Section):
+    """Everything that fixes an evaluation of policies."""
+
+    command: ClassVar[str] = "evaluate"
+
+    policy: str | None = field(
+        default=None,
+        metadata=about("policy.npz, or several of one recipe: a.npz,b.npz or a pattern"),
+    )
+    compare: str | None = field(
+        default=None,
+        metadata=about("two instead, level by level: a.npz,b.npz; each may be a pattern"),
+    )
+    stage: StageConfig
+    robot: RobotConfig = field(default_factory=lambda: RobotConfig(body="wheeled"))
+    task: TaskConfig = field(default_factory=TaskConfig)
+    suite: str | None = field(
+        default=None,
+        metadata=about("instead of a stage: a name of configs/suites/, or a file .yaml or .npz"),
+    )
+    shape: Shape = field(default="box", metadata=about("of the obstacles of a random level"))
+    realism: RealismConfig = field(default_factory=RealismConfig)
+    action: Literal["sampled", "mean"] = field(
+        default="sampled",
+        metadata=about(
+            "of the robots; sampled: drawn from the policy, the same for the same level; mean: "
+            "the most likely one"
+        ),
+    )
+    engine: Literal["c", "mjx"] = field(
+        default="c", metadata=about("c: MuJoCo's C engine; mjx: the one that trains")
+    )
+    steps: int = field(
+        default=1500, metadata=about("control steps of an episode; Table 1", 1, MAX_COUNT)
+    )
+    episodes: int = field(default=1000, metadata=about("episodes", 1, MAX_COUNT))
+    seed: int = field(default=1, metadata=about("random seed of the levels", 0, MAX_COUNT))
+    workers: int | None = field(
+        default=None, metadata=about("processes; null: one a core", 1, 1024)
+    )
+    substeps: int | None = field(
+        default=None,
+        metadata=about("physics steps per control step; null: those of the body", 1, 1000),
+    )
+    out: str | None = field(
+        default=None,
+        metadata=about("folder for result.json, levels.csv and plots, or a file .json alone"),
+    )
+
+    def _check(self) -> None:
+        if (self.policy is None) == (self.compare is None):
+            raise ConfigError(
+                f"policy is {show(self.policy)} and compare is {show(self.compare)}: give one of "
+                "them, policy=FILE or compare=FILE,FILE."
+            )
+        if self.shape != "box" and self.stage.level == "fixed":
+            raise ConfigError(
+                f"shape is {self.shape}, but stage.level is fixed, with obstacles of its own: "
+                "give shape=box."
+            )
+        check_realism(self.realism, self.robot, self.task, self.steps)

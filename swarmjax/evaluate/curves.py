@@ -1,0 +1,108 @@
+"""Figures of learning curves: the area under them, and the steps to a threshold."""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from swarmjax.evaluate.statistics import Interval, Statistic, bootstrap, checked, checked_table, iqm
+
+
+def area_under(steps: ArrayLike, values: ArrayLike) -> np.ndarray:
+    """Mean height of learning curves: the area under them by trapezoids, by the span of the steps.
+
+    Args:
+      steps: [points] at which the curves are known, rising.
+      values: [..., points] of any unit, finite.
+
+    Returns:
+      [...] in the unit of values.
+
+    Raises:
+      ValueError: If there are fewer than two points, steps do not rise, or a number is not finite.
+    """
+    at, curves = _curves(steps, values)
+    return np.asarray(np.trapezoid(curves, at, axis=-1) / (at[-1] - at[0]))
+
+
+def steps_to(steps: ArrayLike, values: ArrayLike, threshold: float) -> np.ndarray:
+    """Steps until learning curves first reach a threshold, whether they stay there or not.
+
+    Curves are straight between their points. One that scatters touches a threshold early: let
+    its values be means over episodes enough.
+
+    Args:
+      steps: [points] at which the curves are known, rising.
+      values: [..., points] of any unit, finite.
+      threshold: to reach from below, in the same unit.
+
+    Returns:
+      [...] in the unit of steps: the first one if a curve begins there, inf if it never does.
+      `iqm`, `np.median` and `probability_of_improvement` take these as they are.
+
+    Raises:
+      ValueError: If there are fewer than two points, steps do not rise, or a number is not finite.
+    """
+    if not math.isfinite(threshold):
+        raise ValueError(f"threshold is {threshold}: give a finite number.")
+    at, curves = _curves(steps, values)
+    reached = curves >= threshold
+    after = reached.argmax(axis=-1)
+    before = np.maximum(after - 1, 0)
+    low, high = (np.take_along_axis(curves, i[..., None], -1)[..., 0] for i in (before, after))
+    share = (threshold - low) / np.where(high > low, high - low, 1.0)
+    return np.where(reached.any(axis=-1), at[before] + share * (at[after] - at[before]), np.inf)
+
+
+def _curves(steps: ArrayLike, values: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Takes the points of curves; refuses what does not fit together or is not finite."""
+    at, curves = checked("steps", steps), checked("values", values)
+    if at.ndim != 1 or len(at) < 2 or not (np.diff(at) > 0).all():
+        raise ValueError(f"steps of shape {at.shape} must be two or more numbers that rise.")
+    if curves.shape[-1:] != at.shape:
+        raise ValueError(f"values has shape {curves.shape}: give [..., {len(at)}], as steps has.")
+    for name, numbers in (("steps", at), ("values", curves)):
+        if np.isinf(numbers).any():
+            raise ValueError(f"{name} holds inf: the points of a curve are finite.")
+    return at, curves
+
+
+def curve(
+    values: ArrayLike,
+    statistic: Statistic = iqm,
+    *,
+    confidence: float = 0.95,
+    resamples: int = 2000,
+    seed: int = 0,
+) -> Interval[np.ndarray]:
+    """Interval of a statistic over runs at each point of their curves.
+
+    All points share their draws, so that runs are drawn with their whole curves. The band holds
+    at each point by itself, not at all of them at once.
+
+    Args:
+      values: [runs, points] of any unit, at least three runs.
+      statistic: as of `bootstrap`, called on [..., runs, 1].
+      confidence: as of `bootstrap`.
+      resamples: as of `bootstrap`.
+      seed: of the draws.
+
+    Returns:
+      Estimates and intervals [points].
+
+    Raises:
+      ValueError: As of `bootstrap`.
+    """
+    columns = checked_table("values", values, "runs").T[..., None]
+    found = [
+        bootstrap(
+            column,
+            statistic,
+            draw="runs",
+            confidence=confidence,
+            resamples=resamples,
+            seed=seed,
+        )
+        for column in columns
+    ]
+    return Interval(*np.array(found).T)

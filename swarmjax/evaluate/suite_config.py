@@ -1,0 +1,99 @@
+"""Files of suites: cells of levels to judge policies on."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from swarmjax.config import ConfigError, Section, about, build, files, show
+from swarmjax.config.section import MAX_COUNT
+from swarmjax.task import stage_files
+from swarmjax.task.shapes import Shape
+from swarmjax.task.stage_config import StageConfig
+
+# Seeds of a suite's levels begin here, so that none is drawn by hand, or by a benchmark, which
+# take small ones. Training draws from another generator altogether, JAX's.
+SUITE_SEED = 1_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellConfig(Section):
+    """Levels of one kind that a suite judges policies on."""
+
+    name: str = field(metadata=about("of the cell"))
+    stage: StageConfig
+    levels: int = field(default=1000, metadata=about("how many", 1, 1_000_000))
+    seed: int = field(metadata=about("of the levels", SUITE_SEED, MAX_COUNT))
+    episodes: tuple[int, ...] = field(
+        default=(),
+        metadata=about("numbers of the levels; none: from 0 on, as many as levels", 0, MAX_COUNT),
+    )
+    realism: Literal["ideal", "webots", "real"] | None = field(
+        default=None, metadata=about("preset; null: that of the command")
+    )
+    shape: Shape = field(default="box", metadata=about("of the obstacles"))
+    digest: str | None = field(
+        default=None, metadata=about("SHA-256 of the levels; null: not drawn yet")
+    )
+
+    def _check(self) -> None:
+        if not re.fullmatch(r"[\w-]+", self.name):
+            raise ConfigError(f"name is {show(self.name)}: give letters, digits, _ and - only.")
+        if self.episodes and len(self.episodes) != self.levels:
+            raise ConfigError(
+                f"levels is {self.levels}, but episodes are {len(self.episodes)}: give as many."
+            )
+        if len(set(self.episodes)) != len(self.episodes):
+            raise ConfigError("episodes holds a number twice: give each once.")
+        if self.digest is not None and not re.fullmatch(r"[0-9a-f]{64}", self.digest):
+            raise ConfigError(f"digest is {show(self.digest)}: give 64 hexadecimal digits.")
+        if self.shape != "box" and self.stage.level == "fixed":
+            raise ConfigError(
+                f"shape is {self.shape}, but the stage's level is fixed: give shape=box."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuiteFileConfig(Section):
+    """A suite: levels to judge policies on, never trained on."""
+
+    name: str = field(metadata=about("of the suite, that of its file"))
+    cells: tuple[CellConfig, ...]
+
+    def _check(self) -> None:
+        names = [cell.name for cell in self.cells]
+        if not names:
+            raise ConfigError("cells is []: give at least one cell.")
+        for name in names:
+            if names.count(name) > 1:
+                raise ConfigError(f"cells names {name} more than once: give each name once.")
+
+
+def read_suite(choice: str) -> SuiteFileConfig:
+    """Read the file of a suite.
+
+    Args:
+        choice: a name of configs/suites/, or the path of a .yaml file.
+
+    Raises:
+        ConfigError: there is no such file, or it is unsound.
+    """
+    path = files.suite_path(choice)
+    mapping = files.read_yaml(path)
+    cells = mapping.get("cells")
+    if isinstance(cells, list):
+        mapping = mapping | {"cells": [_cell(cell) for cell in cells]}
+    try:
+        return build(SuiteFileConfig, {"name": path.stem} | mapping)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def _cell(cell: Any) -> Any:
+    """Give a cell of a suite's file the numbers of the stage that it names."""
+    stage = cell.get("stage") if isinstance(cell, Mapping) else None
+    if isinstance(stage, str):
+        return {**cell, "stage": stage_files.pick_one(stage_files.read_stage(stage), stage)}
+    if isinstance(stage, Mapping):
+        return {**cell, "stage": {"name": cell.get("name"), **stage}}
+    return cell

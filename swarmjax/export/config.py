@@ -1,0 +1,53 @@
+"""The settings of an export."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.config.section import MAX_COUNT
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportConfig(Section):
+    """Which policy leaves in which form, and where to."""
+
+    command: ClassVar[str] = "export"
+
+    run: str | None = field(default=None, metadata=about("run directory; this or policy"))
+    policy: str | None = field(default=None, metadata=about("path of a policy.npz; this or run"))
+    format: Literal["npz", "onnx", "c", "webots"] = field(
+        default="npz", metadata=about("of what is written: a file of npz or onnx, or a folder")
+    )
+    step: int | None = field(
+        default=None,
+        metadata=about("update of the run's checkpoint; null: the newest sound", 0, MAX_COUNT),
+    )
+    seed: int | None = field(
+        default=None, metadata=about("of the run's policies; null: all of them", 0, MAX_COUNT)
+    )
+    out: str | None = field(
+        default=None,
+        metadata=about("file or folder; null: in run or beside policy, by format and step"),
+    )
+    sensors: Literal["webots", "real"] = field(
+        default="webots",
+        metadata=about("what answers the webots controller: simulated e-pucks, or real ones"),
+    )
+
+    def _check(self) -> None:
+        if (self.run is None) == (self.policy is None):
+            raise ConfigError(
+                f"run is {show(self.run)} and policy is {show(self.policy)}: give one of them, "
+                "as in run=runs/a or policy=policy.npz."
+            )
+        for key in ("step", "seed"):
+            if self.run is None and getattr(self, key) is not None:
+                raise ConfigError(
+                    f"{key} is {getattr(self, key)}, but policy is one file: give {key} with run."
+                )
+        if self.sensors != "webots" and self.format != "webots":
+            raise ConfigError(
+                f"sensors is {self.sensors}, but format is {self.format}: give format=webots."
+            )
+        if self.out is None and self.run is None and self.format == "npz":
+            raise ConfigError("out is null, but policy is given already: give out=FILE.")

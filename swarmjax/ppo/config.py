@@ -1,0 +1,188 @@
+"""The settings of PPO."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.config.section import MAX_COUNT
+
+# The options of the algorithm that belong to one choice: whose, which, and what null stands for.
+_ALGO_OPTIONS: dict[str, tuple[str, str, float | int]] = {
+    "gae_lambda": ("returns", "gae", 0.95),
+    "std_decrement": ("exploration", "scheduled", 0.05),
+    "std_interval": ("exploration", "scheduled", 250_000),
+    "std_floor": ("exploration", "scheduled", 0.1),
+}
+
+
+# What the step limit may be to a return, the default first.
+_TIME_OUTS = {"gae": ("bootstrap", "terminal"), "monte_carlo": ("terminal", "leak")}
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlgoConfig(Section):
+    """PPO; what stands in Table 1 of the paper has its name from there in quotes.
+
+    An option of one choice only, as its meaning says, is null with the others and may be null with
+    its own, where it then takes its default.
+    """
+
+    removed: ClassVar[Mapping[str, str]] = dict.fromkeys(
+        ("contact_limit", "contact_price_rate", "contact_price_arrivals"),
+        "give fixed prices instead, task.reward.contact or task.reward.robot_contact.",
+    )
+
+    name: Literal["ppo", "paper"] = field(
+        default="ppo", metadata=about("preset that the numbers started from", derived=True)
+    )
+    policy: Literal["shared", "independent"] = field(
+        default="shared", metadata=about("one policy for all agents, or one for each")
+    )
+    hidden: tuple[int, ...] = field(
+        default=(64, 64), metadata=about("widths of the hidden layers", 1, 4096)
+    )
+    activation: Literal["tanh", "relu", "swish"] = field(
+        default="tanh", metadata=about("activation of the hidden layers")
+    )
+    output: Literal["linear", "tanh"] = field(
+        default="linear", metadata=about("of the mean action; tanh: within the range of commands")
+    )
+    initialization: Literal["orthogonal", "uniform"] = field(
+        default="orthogonal",
+        metadata=about("of the layers; uniform: within 1 / sqrt(inputs), biases too, as PyTorch's"),
+    )
+    normalize_observations: bool = field(
+        default=True,
+        metadata=about("by running mean and deviation; false: as they are, within +-10"),
+    )
+    rollout: int = field(default=32, metadata=about("control steps per update", 1, MAX_COUNT))
+    epochs: int = field(
+        default=4, metadata=about("passes over each rollout: 'PPO K epochs'", 1, MAX_COUNT)
+    )
+    minibatches: int = field(
+        default=8, metadata=about("gradient steps per pass; divides arenas", 1, MAX_COUNT)
+    )
+    discount: float = field(
+        default=0.99, metadata=about("per control step: 'discount factor (gamma)'", 0.0, 1.0)
+    )
+    returns: Literal["gae", "monte_carlo"] = field(
+        default="gae",
+        metadata=about(
+            "gae: bootstrapped, advantages normalised; monte_carlo: summed to the end of episode "
+            "or rollout and normalised, for the critic and for advantages"
+        ),
+    )
+    gae_lambda: float | None = field(
+        default=None, metadata=about("of the advantages; null: 0.95 [returns=gae]", 0.0, 1.0)
+    )
+    time_out: Literal["bootstrap", "terminal", "leak"] | None = field(
+        default=None,
+        metadata=about(
+            "a return at the step limit; bootstrap: goes on with the value [gae], terminal: ends, "
+            "leak: goes on into the next episode [monte_carlo]; null: the first that is possible"
+        ),
+    )
+    clip: float = field(
+        default=0.2, metadata=about("of the probability ratio: 'PPO epsilon clip'", above=0.0)
+    )
+    actor_learning_rate: float = field(
+        default=3e-4,
+        metadata=about("of the policy: 'optimizer learning rate actor'", above=0.0, high=1.0),
+    )
+    critic_learning_rate: float = field(
+        default=1e-3,
+        metadata=about("of the value: 'optimizer learning rate critic'", above=0.0, high=1.0),
+    )
+    learning_rate_schedule: Literal["constant", "linear"] = field(
+        default="linear", metadata=about("linear falls to 0 at the end of the budget")
+    )
+    adam_epsilon: float = field(
+        default=1e-5, metadata=about("added to the root of Adam's second moment", above=0.0)
+    )
+    max_grad_norm: float | None = field(
+        default=0.5,
+        metadata=about("norm at which gradients are clipped; null: they are not", above=0.0),
+    )
+    value_cost: float = field(
+        default=0.5, metadata=about("weight of the value loss, half the mean squared error", 0.0)
+    )
+    entropy_cost: float = field(default=0.0, metadata=about("weight of the entropy", 0.0))
+    bound_cost: float = field(
+        default=1.0,
+        metadata=about("weight of the squared distance of the mean action from -1..1", 0.0),
+    )
+    gradient: Literal["auto", "autodiff", "fused"] = field(
+        default="auto",
+        metadata=about(
+            "how gradients are computed; fused: also, minibatches of tiles of valid samples; "
+            "auto: fused on an NVIDIA GPU where the layers fit it"
+        ),
+    )
+    exploration: Literal["learned", "scheduled"] = field(
+        default="learned",
+        metadata=about("deviation of the action: learned, or falling in steps whatever is learned"),
+    )
+    initial_std: float = field(
+        default=0.6,
+        metadata=about("at first: 'starting std of action distribution'", above=0.0),
+    )
+    std_decrement: float | None = field(
+        default=None,
+        metadata=about(
+            "what a step takes off: 'the decay rate of std of action distribution'; null: 0.05 "
+            "[exploration=scheduled]",
+            above=0.0,
+        ),
+    )
+    std_interval: int | None = field(
+        default=None,
+        metadata=about(
+            "control steps of all arenas together between two: 'decay frequency of std of action "
+            "distribution'; null: 250000 [exploration=scheduled]",
+            1,
+            MAX_COUNT,
+        ),
+    )
+    std_floor: float | None = field(
+        default=None,
+        metadata=about(
+            "where it stops: 'minimum std of action distribution'; null: 0.1 "
+            "[exploration=scheduled]",
+            above=0.0,
+        ),
+    )
+
+    def _check(self) -> None:
+        if not self.hidden:
+            raise ConfigError("hidden is []: give at least one layer, as in [64,64].")
+        for key, (selector, choice, default) in _ALGO_OPTIONS.items():
+            value, chosen = getattr(self, key), getattr(self, selector)
+            if chosen != choice and value is not None:
+                raise ConfigError(
+                    f"{key} is {show(value)}, but {selector} is {chosen}: {key} is an option of "
+                    f"{choice}, so give null or {selector}={choice}."
+                )
+            if chosen == choice and value is None:
+                object.__setattr__(self, key, default)
+        self._check_time_out()
+        if self.std_floor is not None and self.std_floor > self.initial_std:
+            raise ConfigError(
+                f"std_floor is {show(self.std_floor)}, but initial_std is "
+                f"{show(self.initial_std)}: give at most {show(self.initial_std)}."
+            )
+        if self.output == "tanh" and self.activation != "tanh":
+            raise ConfigError(
+                f"output is tanh, but activation is {self.activation}, and a policy's file has one "
+                "for all layers: give activation=tanh or output=linear."
+            )
+
+    def _check_time_out(self) -> None:
+        allowed = _TIME_OUTS[self.returns]
+        if self.time_out is None:
+            object.__setattr__(self, "time_out", allowed[0])
+        elif self.time_out not in allowed:
+            raise ConfigError(
+                f"time_out is {self.time_out}, but returns is {self.returns}: "
+                f"give {' or '.join(allowed)}."
+            )

@@ -1,0 +1,109 @@
+"""Chooses how an update is computed: plain autodiff, or a faster way of `ppo/fast/`."""
+
+import re
+from collections.abc import Callable
+from typing import Literal
+
+import jax
+
+from swarmjax.config import ConfigError, show
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.losses import Metrics, Minibatch
+from swarmjax.ppo.optimizer import Progress
+
+# XLA takes Triton's kernels from this generation on (Ampere, compute capability 8).
+_LEAST_GENERATION = 8
+# Names that JAX has for products without tensor cores (`jax.default_matmul_precision`).
+_FULL = ("highest", "float32", "F32_F32_F32")
+
+# autodiff: `learner` alone; blocks: autodiff of a whole batch, block by block; fused: kernels.
+Backend = Literal["autodiff", "blocks", "fused"]
+Learn = Callable[[AlgoConfig, int, Progress, Minibatch, jax.Array], tuple[Progress, Metrics]]
+
+
+def resolve(config: AlgoConfig, observation_size: int, action_size: int) -> Backend:
+    """Chooses how updates are computed on the device that JAX computes on.
+
+    `auto` is `fused` on an NVIDIA GPU where the layers fit it, unless JAX's matrix products are to
+    be in full precision: without tensor cores the kernels are slower than what XLA makes. A whole
+    batch on a CPU is taken in `blocks`; an accelerator has it all at once.
+
+    Args:
+        config: Of the learner.
+        observation_size: O.
+        action_size: U.
+
+    Returns:
+        The backend, as `learner.update` takes it.
+
+    Raises:
+        ConfigError: `fused` is asked for where there is no such GPU, or of layers that do not fit.
+    """
+    if _fuses(config, observation_size, action_size):
+        return "fused"
+    whole = config.minibatches == 1 and jax.default_backend() == "cpu"
+    return "blocks" if whole and _has_fast() else "autodiff"
+
+
+def find(backend: Backend) -> Learn | None:
+    """Returns what learns by a backend; None for autodiff, which `learner` does itself."""
+    if backend == "fused":
+        from swarmjax.ppo.fast import tiles
+
+        return tiles.learn
+    if backend == "blocks":
+        from swarmjax.ppo.fast import blocks
+
+        return blocks.learn
+    return None
+
+
+def _has_fast() -> bool:
+    """Whether the faster ways can be imported."""
+    try:
+        import swarmjax.ppo.fast  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def _fuses(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
+    """Whether the kernels compute the gradient; refuses them where they cannot be had."""
+    if config.gradient == "autodiff":
+        return False
+    if not _has_fast():
+        if config.gradient == "auto":
+            return False
+        raise ConfigError(
+            "algo.gradient is fused, but swarmjax.ppo.fast cannot be imported: give auto or "
+            "autodiff."
+        )
+    possible = _has_tensor_cores()
+    fitting = possible and _fits(config, observation_size, action_size)
+    if config.gradient == "fused" and not possible:
+        raise ConfigError(
+            "algo.gradient is fused, but there is no NVIDIA GPU of compute capability "
+            f"{_LEAST_GENERATION} or more: give auto or autodiff."
+        )
+    if config.gradient == "fused" and not fitting:
+        raise ConfigError(
+            f"algo.gradient is fused, but algo.hidden is {show(config.hidden)}, which does not fit "
+            "the chip: give two layers of 16, 32 or 64, or algo.gradient=auto."
+        )
+    if config.gradient == "auto" and jax.config.jax_default_matmul_precision in _FULL:
+        return False
+    return fitting
+
+
+def _fits(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
+    """Whether the kernels take networks of this size."""
+    from swarmjax.ppo.fast import fused
+
+    return fused.fits(config, observation_size, action_size)
+
+
+def _has_tensor_cores() -> bool:
+    """Whether JAX computes on an NVIDIA GPU whose tensor cores Triton knows."""
+    capability = str(getattr(jax.devices()[0], "compute_capability", ""))
+    generation = re.fullmatch(r"(\d+)\.\d+", capability)
+    return generation is not None and int(generation[1]) >= _LEAST_GENERATION

@@ -1,0 +1,76 @@
+"""Updates by the kernels of `fused`, from where the batch lies: minibatches of tiles.
+
+Valid samples are moved to the front once; tiles of them are shuffled instead of groups, and a
+minibatch is a span of that order. There may be fewer tiles of valid samples than minibatches.
+"""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax.flatten_util import ravel_pytree
+
+from swarmjax.ppo import optimizer
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.fast import fused
+from swarmjax.ppo.fast.valid_first import valid_first
+from swarmjax.ppo.losses import Metrics, Minibatch
+from swarmjax.ppo.networks import Params
+from swarmjax.ppo.optimizer import METRICS, Progress
+
+
+def learn(
+    config: AlgoConfig, updates: int, begun: Progress, samples: Minibatch, key: jax.Array
+) -> tuple[Progress, Metrics]:
+    """Learns from a batch, in minibatches of tiles of valid samples.
+
+    Networks and what the optimiser has of them are one vector each on the way: of a minibatch's
+    kernels most would otherwise add up, compare and move one of two dozen small arrays.
+
+    Args:
+        config: Of networks that `fused.fits` accepts.
+        updates: Number of updates of the whole run.
+        begun: Parameters and the optimiser's state.
+        samples: [G, N, ...], zero where not valid.
+        key: Random key, consumed.
+
+    Returns:
+        Parameters and the optimiser's state after, and the metrics of each step, [steps].
+    """
+    params, state = begun
+    flat_state = _flat_state(config, updates, *begun)
+    layouts, arranged = fused.layouts(params), valid_first(samples)
+    valid = jnp.sum(arranged.valid, dtype=jnp.int32)
+    arranged = replace(arranged, valid=arranged.valid.astype(jnp.float32))
+    count, size = arranged.observation.shape
+    launch = fused.choose_launch(config, size, arranged.action.shape[-1], count)
+    keys = jax.random.split(key, config.epochs)
+    dealt = fused.shuffle(keys, count, valid, config.minibatches, launch)
+
+    def step(progress: Progress, span: jax.Array) -> tuple[Progress, jax.Array]:
+        tiles = dealt._replace(span=span)
+        gradient, metrics, taken = fused.flat_gradient(
+            progress[0], layouts, arranged, tiles, config, valid / config.minibatches, launch=launch
+        )
+        progress, metrics = optimizer.take(
+            config, updates, progress, (gradient, metrics), taken > 0
+        )
+        return progress, jnp.stack([metrics[name] for name in METRICS])
+
+    (flat, flat_state), rows = jax.lax.scan(step, (fused.flatten(params), flat_state), dealt.span)
+    learned = fused.unflatten(flat, params), _tree_state(flat_state, state)
+    return learned, dict(zip(METRICS, rows.T, strict=True))
+
+
+def _flat_state(
+    config: AlgoConfig, updates: int, params: Params, state: optax.OptState
+) -> optax.OptState:
+    """The optimiser's state with one vector where there is a tree of each network's parameters."""
+    like = jax.eval_shape(optimizer.make(config, updates).init, fused.flatten(params))
+    return jax.tree.map(lambda x, tree: ravel_pytree(tree)[0] if x.ndim else tree, like, state)
+
+
+def _tree_state(flat: optax.OptState, like: optax.OptState) -> optax.OptState:
+    """Undoes `_flat_state`."""
+    return jax.tree.map(lambda x, tree: ravel_pytree(tree)[1](x) if x.ndim else x, flat, like)

@@ -1,0 +1,115 @@
+"""The robot and the compiled simulation: their settings."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from swarmjax import epuck
+from swarmjax.config import ConfigError, Section, about, show
+
+# m; a level leaves a passage of 0.10 m (task/stage_config.py), through which a robot of this radius
+# fits with a tenth of it to spare.
+LARGEST_HULL = 0.045
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotConfig(Section):
+    """The robot; the numbers are those of the e-puck, with their sources in epuck.py."""
+
+    body: Literal["planar", "wheeled"] = field(
+        default="planar",
+        metadata=about("planar: 3 degrees of freedom and servos; wheeled: a free body on wheels"),
+    )
+    hull_radius: float = field(
+        default=epuck.HULL_RADIUS,
+        metadata=about("radius of the hull, m", above=0.0, high=LARGEST_HULL),
+    )
+    mass: float = field(
+        default=epuck.MASS,
+        metadata=about("mass with its wheels, kg", above=2 * epuck.WHEEL_MASS, high=100.0),
+    )
+    yaw_inertia: float = field(
+        default=epuck.YAW_INERTIA,
+        metadata=about("moment of inertia about the vertical axis, kg m^2", 1e-8, 10.0),
+    )
+    wheel_radius: float = field(
+        default=epuck.WHEEL_RADIUS, metadata=about("radius of the wheels, m", above=0.0)
+    )
+    track: float = field(
+        default=epuck.TRACK,
+        metadata=about("distance between the wheels that commands are computed with, m", above=0),
+    )
+    effective_track: float = field(
+        default=epuck.TRACK,
+        metadata=about("distance between the points where the wheels grip, m", above=0.0),
+    )
+    motor_lag: float = field(
+        default=0.0,
+        metadata=about("time constant of the wheel servos, s; 0: one physics step", 0.0, 1.0),
+    )
+    max_wheel_speed: float = field(
+        default=epuck.MAX_WHEEL_SPEED, metadata=about("limit of each wheel, rad/s", above=0.0)
+    )
+    friction: float = field(
+        default=epuck.FRICTION, metadata=about("friction of wheel on floor", above=0.0)
+    )
+    max_speed: float = field(
+        default=epuck.MAX_SPEED,
+        metadata=about("upper end of the speed command, m/s; the lower is 0", above=0.0),
+    )
+    max_turn_rate: float = field(
+        default=epuck.MAX_TURN_RATE,
+        metadata=about("both ends of the turn command, rad/s", above=0.0),
+    )
+
+    def _check(self) -> None:
+        hull = self.hull_radius
+        for key, most in (("track", 2), ("effective_track", 2), ("wheel_radius", 1)):
+            value = getattr(self, key)
+            if value >= most * hull:
+                raise ConfigError(
+                    f"{key} is {show(value)}, but hull_radius is {show(hull)} and the wheels lie "
+                    f"inside the hull: give less than {show(most * hull)}."
+                )
+        # Each wheel about its own upright axis, and as a point on the axle.
+        wheels = 2 * (epuck.WHEEL_INERTIA[2] + epuck.WHEEL_MASS * epuck.AXLE_Y**2)
+        if self.body == "wheeled" and self.yaw_inertia <= wheels:
+            raise ConfigError(
+                f"yaw_inertia is {show(self.yaw_inertia)}, but body is wheeled and its wheels "
+                f"alone have {show(wheels)}: give more than {show(wheels)}."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimConfig(Section):
+    """The compiled simulation."""
+
+    impl: Literal["auto", "jax", "warp"] = field(
+        default="auto", metadata=about("who steps the physics; auto: warp on an NVIDIA GPU")
+    )
+    solver: Literal["auto", "mjx", "swarm"] = field(
+        default="auto",
+        metadata=about(
+            "of contacts; mjx: MJX's own step, unpatched; swarm: made for the body, of wheels by "
+            "warp; auto: swarm where there is one",
+            renamed={"newton": "mjx"},
+        ),
+    )
+    max_robots: int = field(default=5, metadata=about("robots compiled in", 1, 100))
+    max_obstacles: int = field(default=4, metadata=about("obstacles compiled in", 0, 32))
+    substeps: int | None = field(
+        default=None,
+        metadata=about("physics steps per control step; null: those of the body", 1, 1000),
+    )
+    iterations: int | None = field(
+        default=None,
+        metadata=about("of the solver, at most; on wheels by swarm 20; null: as measured", 1, 1000),
+    )
+    ls_iterations: int | None = field(
+        default=None,
+        metadata=about("line-search iterations of mjx; null: as measured", 1, 1000),
+    )
+
+
+def physics_substeps(robot: RobotConfig, given: int | None) -> int:
+    """Return the physics steps per control step: those given, else those that the body needs."""
+    return {"planar": 1, "wheeled": 2}[robot.body] if given is None else given

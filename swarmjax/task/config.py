@@ -1,0 +1,97 @@
+"""What a robot is asked to do: the settings of task and reward."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from swarmjax import epuck
+from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.config.section import MAX_COUNT
+from swarmjax.sim.config import RobotConfig
+from swarmjax.sim.realism_config import RealismConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardConfig(Section):
+    """Weights of the named terms of the reward: equation 3 of the paper, and prices."""
+
+    progress: float = field(default=1.0, metadata=about("per metre nearer to the target"))
+    proximity: float = field(
+        default=0.0, metadata=about("per control step with something in infrared range")
+    )
+    arrival: float = field(default=0.0, metadata=about("once, on arrival"))
+    contact: float = field(default=-0.2, metadata=about("per contact event, of whatever kind"))
+    robot_contact: float = field(
+        default=0.0, metadata=about("besides, per contact event with another robot")
+    )
+    time: float = field(default=-0.002, metadata=about("per control step until arrival"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskConfig(Section):
+    """What a robot is asked to do, and what it senses."""
+
+    control_step: float = field(
+        default=0.032, metadata=about("control step, s; Webots basicTimeStep", 0.001, 0.2)
+    )
+    step_limit: int = field(
+        default=500, metadata=about("control steps of a training episode", 1, MAX_COUNT)
+    )
+    target_radius: float = field(
+        default=0.05,
+        metadata=about("distance of the centres that counts as arrival, m", above=0.0, high=0.1),
+    )
+    sensor_range: float = field(
+        default=epuck.SENSOR_RANGE, metadata=about("infrared range, m", above=0.0, high=1.0)
+    )
+    encoding: Literal["auto", "metric", "webots"] = field(
+        default="auto",
+        metadata=about("what is observed: m and rad, or as in Webots; auto: as realism.infrared"),
+    )
+    reward: RewardConfig = field(default_factory=RewardConfig)
+
+
+def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, steps: int) -> None:
+    """Refuse realism that the robot or the length of an episode rules out.
+
+    Args:
+        realism: held to its own bounds already.
+        robot: the robot it is for.
+        task: read for the control step.
+        steps: control steps of an episode.
+
+    Raises:
+        ConfigError: keys are named from the top.
+    """
+    hull, seconds = robot.hull_radius, steps * task.control_step
+    for key, value, most in (
+        ("track", realism.track, 2 * hull),
+        ("wheel_radius", realism.wheel_radius, hull),
+    ):
+        if value is not None and value[1] >= most:
+            raise ConfigError(
+                f"realism.{key} is {show(value)}, but robot.hull_radius is {show(hull)} and the "
+                f"wheels lie inside the hull: give less than {show(most)}."
+            )
+    stall_time = None if realism.stall is None else realism.stall_time
+    for key, value, length, unit in (
+        ("action_latency", realism.action_latency, steps, "control steps"),
+        ("observation_latency", realism.observation_latency, steps, "control steps"),
+        ("infrared_period", realism.infrared_period, seconds, "s"),
+        ("stall_time", stall_time, seconds, "s"),
+    ):
+        if value is not None and value[1] >= length:
+            raise ConfigError(
+                f"realism.{key} is {show(value)}, but an episode takes {show(length)} {unit}: "
+                f"give less than {show(length)}."
+            )
+
+
+def resolve_encoding(task: TaskConfig, realism: RealismConfig) -> Literal["metric", "webots"]:
+    """Return what the policy observes.
+
+    `metric` are metres and radians as they are. `webots` are counts / 1023, distance / 1.5 m and
+    (bearing + pi) / (2 pi), as in deepworlds' find_and_avoid.
+    """
+    if task.encoding != "auto":
+        return task.encoding
+    return "webots" if realism.infrared == "webots" else "metric"

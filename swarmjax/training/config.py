@@ -1,0 +1,68 @@
+"""The settings that fix the compiled program of a run."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from swarmjax.config import Section, about
+from swarmjax.config.section import MAX_COUNT
+from swarmjax.curriculum.config import CurriculumConfig
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.sim.config import RobotConfig, SimConfig
+from swarmjax.sim.realism_config import RealismConfig
+from swarmjax.task.config import TaskConfig
+from swarmjax.task.stage_config import StageConfig
+
+# Control steps of a rollout for which one episode of each arena is drawn; the shortest that the
+# six stages have take 23.
+_STEPS_PER_EPISODE = 32
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProgramConfig(Section):
+    """What fixes the compiled program, whoever calls it and wherever it is written down."""
+
+    stage: tuple[StageConfig, ...]
+    robot: RobotConfig = field(default_factory=RobotConfig)
+    task: TaskConfig = field(default_factory=TaskConfig)
+    algo: AlgoConfig = field(default_factory=AlgoConfig)
+    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
+    sim: SimConfig = field(default_factory=SimConfig)
+    seed: int = field(default=0, metadata=about("random seed", 0, MAX_COUNT))
+    seeds: int = field(
+        default=1, metadata=about("runs trained at once, of seed, seed + 1, ...", 1, 4096)
+    )
+    seeds_by: Literal["vmap", "map", "cores"] = field(
+        default="vmap",
+        metadata=about(
+            "vmap: side by side; map: in turn, each as it would be alone, bit for bit; cores: "
+            "vmap, in a group for each core of a CPU"
+        ),
+    )
+    arenas: int = field(
+        default=128,
+        metadata=about("arenas simulated at once; auto: by run.memory_share", 1, 2**20),
+    )
+    budget: int = field(
+        default=3_000_000, metadata=about("control steps of all arenas together", 1, 10**15)
+    )
+    realism: RealismConfig = field(default_factory=RealismConfig)
+
+    @property
+    def updates(self) -> int:
+        """Updates that the budget pays for; what is left over is not spent."""
+        return self.budget // (self.arenas * self.algo.rollout)
+
+    @property
+    def learners(self) -> int:
+        """Actor-critics that are trained: one, or one for each robot."""
+        return self.sim.max_robots if self.algo.policy == "independent" else 1
+
+    @property
+    def numbers(self) -> range:
+        """The seeds of a run, in the order of their axis."""
+        return range(self.seed, self.seed + self.seeds)
+
+    @property
+    def waiting(self) -> int:
+        """Episodes that are drawn for each arena ahead of a rollout."""
+        return max(1, self.algo.rollout // _STEPS_PER_EPISODE)

@@ -1,0 +1,106 @@
+"""The compiled side of a run: what is fixed before anything moves."""
+
+from dataclasses import dataclass
+
+import jax
+
+from swarmjax.curriculum import engine as curricula
+from swarmjax.curriculum.engine import Mode, Schedule
+from swarmjax.curriculum.modes import MODES
+from swarmjax.ppo import dispatch
+from swarmjax.ppo.dispatch import Backend
+from swarmjax.provenance import cores
+from swarmjax.task import env, observation
+from swarmjax.task.env import World
+from swarmjax.training import episodes
+from swarmjax.training.config import ProgramConfig
+
+ACTION_SIZE = 2
+MAX_ROWS = 4096  # updates that a call can report, over all seeds; a longer chunk is several calls
+
+
+@dataclass(frozen=True, eq=False)
+class Program[C: ProgramConfig]:
+    """What fixes the compiled program.
+
+    Attributes:
+      config: its settings.
+      world: the compiled environment.
+      backend: how learners compute their updates.
+      by_robot: whether each episode is handed on robot by robot.
+    """
+
+    config: C
+    world: World
+    backend: Backend = "autodiff"
+    by_robot: bool = False
+
+    @property
+    def rows(self) -> int:
+        """Most updates of one call."""
+        most = max(1, MAX_ROWS // self.config.seeds)
+        if self.by_robot:
+            most = min(most, episodes.rows_of_call(self.config))
+        return min(self.config.updates, most)
+
+    @property
+    def mode(self) -> Mode:
+        """How the curriculum decides."""
+        return MODES[self.config.curriculum.mode]
+
+
+def load[C: ProgramConfig](config: C, *, by_robot: bool = False) -> tuple[Program[C], Schedule]:
+    """Builds the program and the curriculum's numbers; everything left to `auto` is resolved here.
+
+    Args:
+      config: the settings.
+      by_robot: whether each episode is handed on robot by robot.
+
+    Returns:
+      The program, and the numbers that are an argument of it.
+
+    Raises:
+      ConfigError: if Warp is asked for and not installed, or a gradient that cannot be had.
+    """
+    backend = dispatch.resolve(config.algo, observation.SIZE, ACTION_SIZE)
+    return Program(config, load_world(config), backend, by_robot), schedule(config)
+
+
+def load_world(config: ProgramConfig) -> World:
+    """Builds the environment, with room for all arenas that are stepped together."""
+    return env.load(
+        config.stage,
+        config.robot,
+        config.task,
+        config.realism,
+        config.sim,
+        arenas=config.arenas * side_by_side(config),
+    )
+
+
+def schedule(config: ProgramConfig) -> Schedule:
+    """Works the curriculum's numbers out."""
+    return curricula.schedule(
+        config.stage,
+        config.curriculum,
+        updates=config.updates,
+        step_limit=config.task.step_limit,
+        rollout=config.algo.rollout,
+    )
+
+
+def groups(config: ProgramConfig, cores: int) -> int:
+    """Returns into how many groups of as many seeds a run is cut, to be called at once.
+
+    Args:
+      config: of the run.
+      cores: that the process may use.
+    """
+    if config.seeds_by != "cores" or jax.default_backend() != "cpu":
+        return 1
+    return next(n for n in range(min(cores, config.seeds), 0, -1) if config.seeds % n == 0)
+
+
+def side_by_side(config: ProgramConfig) -> int:
+    """Returns how many seeds one call of the program steps at once."""
+    return 1 if config.seeds_by == "map" else config.seeds // groups(config, cores())

@@ -1,0 +1,84 @@
+"""Which way of computing an update is taken, and that all can be had without the faster ones."""
+
+import sys
+from types import SimpleNamespace
+
+import jax
+import pytest
+
+from swarmjax.config import ConfigError
+from swarmjax.ppo import dispatch
+from swarmjax.ppo.config import AlgoConfig
+
+OBSERVATION, ACTION = 10, 2
+
+
+def _on(monkeypatch: pytest.MonkeyPatch, **device: str) -> None:
+    monkeypatch.setattr(jax, "devices", lambda: [SimpleNamespace(**device)])
+
+
+@pytest.mark.parametrize(
+    ("device", "choice"),
+    [
+        ({}, "autodiff"),
+        ({"compute_capability": "gfx942"}, "autodiff"),
+        ({"compute_capability": "7.5"}, "autodiff"),
+        ({"compute_capability": "8.0"}, "fused"),
+        ({"compute_capability": "12.0"}, "fused"),
+    ],
+)
+def test_auto_is_fused_on_an_nvidia_gpu_where_the_layers_fit(
+    device: dict[str, str], choice: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _on(monkeypatch, **device)
+    assert dispatch.resolve(AlgoConfig(), OBSERVATION, ACTION) == choice
+    assert dispatch.resolve(AlgoConfig(gradient="autodiff"), OBSERVATION, ACTION) == "autodiff"
+    assert dispatch.resolve(AlgoConfig(hidden=(8,)), OBSERVATION, ACTION) == "autodiff"
+
+
+def test_a_whole_batch_is_taken_in_blocks_on_a_cpu_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = AlgoConfig(minibatches=1)
+    assert dispatch.resolve(whole, OBSERVATION, ACTION) == "blocks"
+    assert dispatch.resolve(AlgoConfig(minibatches=2), OBSERVATION, ACTION) == "autodiff"
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert dispatch.resolve(whole, OBSERVATION, ACTION) == "autodiff"
+    _on(monkeypatch, compute_capability="9.0")
+    assert dispatch.resolve(whole, OBSERVATION, ACTION) == "fused"
+
+
+def test_full_precision_is_left_to_autodiff(monkeypatch: pytest.MonkeyPatch) -> None:
+    _on(monkeypatch, compute_capability="9.0")
+    with jax.default_matmul_precision("highest"):
+        assert dispatch.resolve(AlgoConfig(), OBSERVATION, ACTION) == "autodiff"
+        assert dispatch.resolve(AlgoConfig(gradient="fused"), OBSERVATION, ACTION) == "fused"
+    with jax.default_matmul_precision("tensorfloat32"):
+        assert dispatch.resolve(AlgoConfig(), OBSERVATION, ACTION) == "fused"
+
+
+def test_fused_is_refused_where_it_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError) as no_gpu:
+        dispatch.resolve(AlgoConfig(gradient="fused"), OBSERVATION, ACTION)
+    assert str(no_gpu.value) == (
+        "algo.gradient is fused, but there is no NVIDIA GPU of compute capability 8 or more: give "
+        "auto or autodiff."
+    )
+    _on(monkeypatch, compute_capability="9.0")
+    assert dispatch.resolve(AlgoConfig(gradient="fused"), OBSERVATION, ACTION) == "fused"
+    with pytest.raises(ConfigError) as unfit:
+        dispatch.resolve(AlgoConfig(gradient="fused", hidden=(48, 64)), OBSERVATION, ACTION)
+    assert str(unfit.value) == (
+        "algo.gradient is fused, but algo.hidden is [48,64], which does not fit the chip: give two "
+        "layers of 16, 32 or 64, or algo.gradient=auto."
+    )
+
+
+def test_without_the_faster_ways_there_is_autodiff(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert dispatch.find("blocks") is not None
+    assert dispatch.find("fused") is not None
+    assert dispatch.find("autodiff") is None
+    monkeypatch.setitem(sys.modules, "swarmjax.ppo.fast", None)  # cannot be imported
+    assert dispatch.resolve(AlgoConfig(minibatches=1), OBSERVATION, ACTION) == "autodiff"
+    _on(monkeypatch, compute_capability="9.0")
+    assert dispatch.resolve(AlgoConfig(), OBSERVATION, ACTION) == "autodiff"
+    with pytest.raises(ConfigError, match="swarmjax.ppo.fast cannot be imported"):
+        dispatch.resolve(AlgoConfig(gradient="fused"), OBSERVATION, ACTION)

@@ -1,0 +1,69 @@
+"""Which way is taken, and that things go through in pieces to the same end."""
+
+import sys
+from types import ModuleType
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmjax.config import ConfigError
+from swarmjax.sim import dispatch
+from swarmjax.sim.dispatch import least, pieces
+from swarmjax.sim.fast.unroll import MOST
+
+MODULES = pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
+
+
+def test_warp_is_asked_for_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dispatch.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"sim\.impl is warp"):
+        dispatch.resolve_impl("warp")
+    assert dispatch.resolve_impl("auto") == "jax"
+
+
+def test_auto_is_jax_without_an_nvidia_gpu() -> None:
+    assert dispatch.resolve_impl("auto") == "jax"
+    assert dispatch.resolve_impl("jax") == "jax"
+    assert dispatch.resolve_impl("warp") == "warp"
+
+
+def test_the_solver_is_chosen() -> None:
+    resolve = dispatch.resolve_solver
+    assert resolve("auto", "warp", "planar", 50) == "swarm"
+    assert resolve("auto", "warp", "wheeled", 5) == "swarm"
+    assert resolve("auto", "warp", "wheeled", 6) == "mjx"
+    assert resolve("auto", "jax", "planar", 50) == "swarm"
+    assert resolve("auto", "jax", "wheeled", 5) == "mjx"
+    assert resolve("mjx", "warp", "planar", 5) == "mjx"
+    with pytest.raises(ConfigError, match=r"robot\.body is wheeled and sim\.impl is jax: give mjx"):
+        resolve("swarm", "jax", "wheeled", 5)
+    with pytest.raises(ConfigError, match=r"sim\.max_robots is 6: give mjx or auto, or 5 robots"):
+        resolve("swarm", "warp", "wheeled", 6)
+
+
+def test_without_the_faster_ways_mjx_steps_and_all_is_one_piece(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "swarmjax.sim.fast", None)  # cannot be imported
+    for impl, body in (("jax", "planar"), ("warp", "planar"), ("warp", "wheeled")):
+        assert dispatch.resolve_solver("auto", impl, body, 5) == "mjx"
+        with pytest.raises(
+            ConfigError, match=r"swarmjax\.sim\.fast cannot be imported: give mjx or auto\.$"
+        ):
+            dispatch.resolve_solver("swarm", impl, body, 5)
+    assert pieces(3, jnp) == [slice(None)]
+
+
+@MODULES
+@pytest.mark.parametrize("count", [3, MOST + 1])
+def test_least_of_all_pieces(xp: ModuleType, count: int) -> None:
+    reach = np.stack([np.arange(count), 7.0 - np.arange(count), np.full(count, 9.0)])
+    found = least([xp.asarray(reach)[:, i] for i in pieces(count, xp)], 6.5, xp)
+    assert found.tolist() == [0.0, 7.0 - (count - 1), 6.5]
+
+
+@MODULES
+def test_of_no_things_none_is_near(xp: ModuleType) -> None:
+    found = least([xp.zeros((2, 0))[:, i] for i in pieces(0, xp)], 6.5, xp)
+    assert found.tolist() == [6.5, 6.5]
