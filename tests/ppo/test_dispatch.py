@@ -80,5 +80,5 @@ def test_without_the_faster_ways_there_is_autodiff(monkeypatch: pytest.MonkeyPat
     assert dispatch.resolve(AlgoConfig(minibatches=1), OBSERVATION, ACTION) == "autodiff"
     _on(monkeypatch, compute_capability="9.0")
     assert dispatch.resolve(AlgoConfig(), OBSERVATION, ACTION) == "autodiff"
-    with pytest.raises(ConfigError, match="swarmjax.ppo.fast cannot be imported"):
+    with pytest.raises(ConfigError, match=r"swarmjax\.ppo\.fast cannot be imported"):
         dispatch.resolve(AlgoConfig(gradient="fused"), OBSERVATION, ACTION)
