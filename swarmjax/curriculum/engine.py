@@ -1,6 +1,6 @@
 """The curriculum's engine: where each arena begins, how each stage goes, when something is decided.
 
-All of it on device, for any mode of `curriculum_modes`. Episodes are counted in cohorts: all those
+All of it on device, for any mode of `modes.py`. Episodes are counted in cohorts: all those
 that began within one step limit. A cohort's verdict falls another step limit later, when the last
 of its episodes has ended; the short episodes that end first are the lucky ones, and would promote
 too early. An episode counts for the stage and the cohort in which it began.
@@ -258,7 +258,7 @@ def init(schedule: Schedule, options: CurriculumConfig, mode: Mode) -> Curriculu
     Args:
       schedule: the curriculum's numbers.
       options: what the config says of the curriculum.
-      mode: one of `curriculum_modes.MODES`.
+      mode: one of `modes.MODES`.
 
     Returns:
       The curriculum before the first update.
@@ -340,7 +340,7 @@ def advance(
       curriculum: after `count`.
       schedule: the curriculum's numbers.
       options: what the config says of the curriculum.
-      mode: one of `curriculum_modes.MODES`.
+      mode: one of `modes.MODES`.
       update: [] the update that has just been done, from 0.
 
     Returns:

@@ -9,7 +9,7 @@ from rich.progress import Progress
 
 from swarmjax.config import ConfigError, show
 from swarmjax.evaluate import cells, judge, summary
-from swarmjax.evaluate import trials as evaluate_run
+from swarmjax.evaluate import trials as evaluate_trials
 from swarmjax.evaluate.cells import Suite
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.trials import Entrant, Trial
@@ -43,7 +43,7 @@ def evaluate(settings: EvaluateConfig, progress: Progress | None = None) -> Eval
         PolicyError: If a policy is unsound, or does not fit the levels.
         ConfigError: If a file is missing, a suite unsound, or the physics breaks down.
     """
-    sides = [evaluate_run.read_policies(each) for each in _sides(settings)]
+    sides = [evaluate_trials.read_policies(each) for each in _sides(settings)]
     entrants = [each for side in sides for each in side]
     for stage in cells.stages(settings):  # before levels are drawn, which takes a while
         for path, trained in entrants:
@@ -53,7 +53,7 @@ def evaluate(settings: EvaluateConfig, progress: Progress | None = None) -> Eval
     progress = progress or Progress(disable=True)
     bar = progress.add_task("episodes", total=total)
     report = partial(progress.advance, bar)
-    trials = evaluate_run.run(settings, suite.cells, entrants, report)
+    trials = evaluate_trials.run(settings, suite.cells, entrants, report)
     return Evaluation(_sum_up(settings, suite, sides, trials), entrants, trials)
 
 

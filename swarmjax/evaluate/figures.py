@@ -21,7 +21,7 @@ def draw(result: Mapping[str, Any], trials: Sequence[Trial], limit: float) -> di
     """Draws the plots of an evaluation.
 
     Args:
-        result: As `evaluate_summary.result` makes it.
+        result: As `summary.result` makes it.
         trials: What policies came to, a cell each.
         limit: Length of an episode, s.
 

@@ -21,7 +21,7 @@ from swarmjax import command
 from swarmjax.config import ConfigError, show
 from swarmjax.evaluate import cells
 from swarmjax.evaluate import judge as evaluate_judge
-from swarmjax.evaluate import trials as evaluate_run
+from swarmjax.evaluate import trials as evaluate_trials
 from swarmjax.evaluate.cells import Cell
 from swarmjax.evaluate.trials import Entrant, Trial
 from swarmjax.export import folder as export_folder
@@ -66,7 +66,7 @@ def replay(
     if settings.worst is not None:
         bar = progress.add_task("episodes", total=sum(len(cell.episodes) for cell in chosen))
         report = partial(progress.advance, bar)
-        trials = evaluate_run.run(settings.evaluation, chosen, entrants[:1], report)
+        trials = evaluate_trials.run(settings.evaluation, chosen, entrants[:1], report)
         picks = worst(trials, settings.worst)
     used = len({pick.cell for pick in picks})
     bar = progress.add_task("steps", total=settings.steps * len(entrants) * used)
@@ -147,7 +147,7 @@ def _record(
         levels = cells.split(cell.levels)
         runs = []
         for each in entrants:
-            judged = evaluate_run.specialise(settings.evaluation, cell, each.path)
+            judged = evaluate_trials.specialise(settings.evaluation, cell, each.path)
             judge = evaluate_judge.load(judged, each.policy, cell.half)
             runs.append(record.record(judge, [levels[pick.row] for pick in mine], report))
         for pick, by_policy in zip(mine, zip(*runs, strict=True), strict=True):
@@ -160,7 +160,7 @@ def _record(
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings = load_levels(ReplayConfig, arguments)
-    entrants = evaluate_run.read_policies(settings.policies)
+    entrants = evaluate_trials.read_policies(settings.policies)
     out, video = Path(settings.out), settings.video and Path(settings.video)
     _check_out(out, [*settings.policies, settings.suite, settings.video])
     if video:

@@ -58,7 +58,7 @@ def fill(title: str, packed: bytes) -> str:
 
     Args:
         title: Of the page.
-        packed: What `replay_pack.pack` returned.
+        packed: What `pack.pack` returned.
 
     Returns:
         HTML.

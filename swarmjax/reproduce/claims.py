@@ -44,7 +44,7 @@ type Test = Callable[..., tuple[bool | None, str]]
 
 
 class Values(Protocol):
-    """What an arm came to by seed: a function of `reproduce_measures` with its options set."""
+    """What an arm came to by seed: a function of `measures` with its options set."""
 
     def __call__(self, data: Reproduction, arm: str, /) -> np.ndarray:
         """Returns [N]."""

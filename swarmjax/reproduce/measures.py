@@ -1,7 +1,7 @@
 """What is read out of the episodes of a reproduction: success, its steady state, rolling means.
 
 Where the paper can be read in two ways (docs/paper.md), each reading is a function here. Axes as
-in `reproduce_rows`. No JAX.
+in `rows`. No JAX.
 """
 
 import math

@@ -22,8 +22,8 @@ state = env.reset(world, level.sample(uniform.astype(np.float32), one, world.spa
 state = state.replace(sim=physics.unpack(world.physics, state.sim))
 after, came = jax.jit(lambda s: env.step(world, s, jnp.ones((2, 2))))(state)
 assert after.clock == 1 and bool(came.sound)
-rooms = ("ppo", "curriculum", "training", "run", "evaluate")
-print(sorted(name for name in sys.modules if name.startswith(tuple(f"swarmjax.{r}" for r in rooms))))
+rooms = tuple(f"swarmjax.{room}" for room in ("ppo", "curriculum", "training", "run", "evaluate"))
+print(sorted(name for name in sys.modules if name.startswith(rooms)))
 """
 
 
