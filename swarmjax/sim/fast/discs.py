@@ -167,7 +167,11 @@ def load_engine(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve:
       The engine.
     """
     discs = load(model, ids, radius, solve)
-    label = "discs, swarmjax's own step of the MJX model in the plane"
+    # Speeds of the environment: README.md, "What steps the robots".
+    label = (
+        "discs, swarmjax's own step of the MJX model in the plane (2.4 times as fast as "
+        "sim.solver=mjx on two cores, 3.9 times on an H200)"
+    )
     return Engine(label, *put(model), functools.partial(step, discs), is_mjx=False)
 
 

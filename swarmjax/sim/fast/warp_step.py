@@ -35,7 +35,9 @@ def load_engine(model: mujoco.MjModel, robots: int, arenas: int) -> Engine:
     plain = engine.load_mjx(model, robots, "warp", arenas)
     install()
     chosen = plain.model.tree_replace({"opt.solver": wheeled_warp.NUMBER})
-    return replace(plain, label="MJX with swarmjax's contact solver", model=chosen)
+    # Speeds of the environment: README.md, "What steps the robots".
+    label = "MJX with swarmjax's contact solver (3.2 times as fast as sim.solver=mjx on an H200)"
+    return replace(plain, label=label, model=chosen)
 
 
 def install() -> None:
