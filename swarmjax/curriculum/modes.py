@@ -1,6 +1,6 @@
 """The modes of the curriculum: each says from the record which stages are trained, and how much.
 
-A mode is one pure function of the signature `curriculum.Mode`. It sees the curriculum with the
+A mode is one pure function of the signature `engine.Mode`. It sees the curriculum with the
 verdicts of the update just done, and returns the newest stage, the share of the arenas on each,
 and why; asked before the first update, when nothing is known, it says where a run begins.
 """

@@ -30,7 +30,7 @@ class AlgoConfig(Section):
 
     removed: ClassVar[Mapping[str, str]] = dict.fromkeys(
         ("contact_limit", "contact_price_rate", "contact_price_arrivals"),
-        "give fixed prices instead, task.reward.contact or task.reward.robot_contact.",
+        "give a fixed price in the reward instead.",
     )
 
     name: Literal["ppo", "paper"] = field(

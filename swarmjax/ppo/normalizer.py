@@ -1,8 +1,8 @@
 """Running mean and variance of observations.
 
-Not Brax's `running_statistics`: importing that loads MuJoCo, MJX and Warp into code that knows
-nothing of robots, and a first batch without a valid sample (a learner whose robot is absent from
-the first stage) makes it divide 0 by 0.
+Not Brax's `running_statistics`: importing that loads MuJoCo, MJX and Warp, which nothing here
+needs, and a first batch without a valid sample (a learner that has nothing to learn from yet) makes
+it divide 0 by 0.
 """
 
 import chex

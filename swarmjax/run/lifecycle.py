@@ -50,11 +50,11 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
     source = warm_start.read(settings)
     program, schedule, init, template = _load(settings)
     state, skipped = _first_state(program, lambda: init(schedule), template, source)
+    display.say(f"{_opening(program)}; into {run}; compiling")
     for sentence in skipped:
         display.say(f"{sentence}: it was passed over.")
     if source is not None:
         display.say(f"starting with what {source.run} had learned after {source.update} updates")
-    display.say(f"{_opening(program)}; into {run}; compiling")
     for sentence in _short_budget(settings, schedule):
         display.say(sentence)
     compiled, state = prepare(program, schedule, state, memory.limit())

@@ -454,8 +454,7 @@ def test_resume_changes_budget_and_run_only():
 @pytest.mark.parametrize("key", GONE)
 def test_keys_of_a_price_that_adapts_are_refused_with_what_to_give_instead(key):
     assert refusal(load_train, [f"algo.{key}=0.5"]) == (
-        f"algo.{key} is no longer a key: give fixed prices instead, task.reward.contact or "
-        "task.reward.robot_contact."
+        f"algo.{key} is no longer a key: give a fixed price in the reward instead."
     )
 
 

@@ -82,7 +82,7 @@ def _turn(things: np.ndarray, angle: float) -> np.ndarray:
 @pytest.fixture(
     scope="module",
     params=[
-        # It compiles for 20 s a test; test_physics.py and test_evaluate_c.py, where robots meet an
+        # It compiles for 20 s a test; test_physics.py and test_engine_c.py, where robots meet an
         # obstacle, hold it to MuJoCo C as well.
         pytest.param(each, marks=pytest.mark.slow if each[0] == "jax" else ())
         for each in ENGINES

@@ -1,9 +1,9 @@
 """Gradients over a whole batch on a CPU, block by block.
 
 The loss is a sum over samples, so that its gradient is the sum of those of blocks. The activations
-of a block stay in a core's cache, and blocks without a valid sample, as those of a robot that is
-not there or has long arrived, are left out. One that is vectorised would wait for the fullest
-learner in every step: learners and seeds take their turns instead.
+of a block stay in a core's cache, and blocks without a valid sample are left out. One that is
+vectorised would wait for the fullest learner in every step: learners and seeds take their turns
+instead.
 """
 
 import functools

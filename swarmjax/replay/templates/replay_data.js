@@ -1,4 +1,4 @@
-// Reads what swarmjax/replay_pack.py wrote.
+// Reads what swarmjax/replay/pack.py wrote.
 
 /** Inflates the data of the page: the header, and all bytes, in which the series lie. */
 async function unpack(base64) {
