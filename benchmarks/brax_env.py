@@ -30,7 +30,7 @@ from swarmjax.training.program import Program
 
 
 @struct.dataclass
-class Arenas:
+class BraxArenas:
     """What Brax carries as `pipeline_state`.
 
     Attributes:
@@ -89,7 +89,7 @@ class SwarmEnv(Env):
         now = jax.tree.map(lambda x: x[:arenas], drawn)
         starts = jax.tree.map(lambda x: x[arenas:], drawn)
         unpack = partial(physics.unpack, self.world.physics)
-        inner = Arenas(
+        inner = BraxArenas(
             now=replace(now, sim=jax.vmap(unpack)(now.sim)),
             starts=starts,
             begun=jnp.zeros(arenas, jnp.int32),
@@ -109,7 +109,7 @@ class SwarmEnv(Env):
         Returns:
           The state after; where an arena began anew, it is observed there.
         """
-        inner: Arenas = state.pipeline_state  # pyright: ignore[reportAssignmentType]  # ours
+        inner: BraxArenas = state.pipeline_state  # pyright: ignore[reportAssignmentType]  # ours
         arenas, robots = inner.now.arrived.shape
         moved, came = jax.vmap(partial(env.step, self.world))(
             inner.now, action.reshape(arenas, robots, -1)
@@ -130,15 +130,15 @@ class SwarmEnv(Env):
         index = jnp.zeros(each * self.program.config.arenas, jnp.int32)
         return rollout.draw_starts(self.world, self.stages, index, jnp.int32(0), key)
 
-    def _refill(self, inner: Arenas) -> Arenas:
+    def _refill(self, inner: BraxArenas) -> BraxArenas:
         """Draws the episodes that wait anew, once a rollout."""
         begun, (next_key, key) = inner.begun, jax.random.split(inner.key)
 
-        def draw(inner: Arenas) -> Arenas:
+        def draw(inner: BraxArenas) -> BraxArenas:
             starts = self._draw(key, self._waiting)
             return replace(inner, starts=starts, begun=jnp.zeros_like(begun), key=next_key)
 
-        due = inner.clock % self.program.config.algo.rollout == 0
+        due = inner.clock % self.program.config.algo.rollout_length == 0
         return jax.lax.cond(due, draw, lambda inner: inner, inner)
 
 
@@ -149,7 +149,7 @@ def _ends(came: TimeStep) -> tuple[Array, Array]:
     return ended.ravel().astype(jnp.float32), cut.ravel().astype(jnp.float32)
 
 
-def _state(inner: Arenas, reward: Array, done: Array, truncation: Array) -> State:
+def _state(inner: BraxArenas, reward: Array, done: Array, truncation: Array) -> State:
     """What Brax sees of a step."""
     info: dict[str, Any] = {
         "truncation": truncation,

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import mujoco_arena, peers, timing
-from benchmarks.mujoco_arena import Arena, Moved
+from benchmarks.mujoco_arena import Moved, MujocoArena
 from swarmjax import provenance
 from swarmjax.config import Section, about, to_dict
 from swarmjax.ppo.config import AlgoConfig
@@ -44,8 +44,10 @@ class Robot:
     def __init__(self, torch: Any, algo: AlgoConfig) -> None:
         """Makes both networks as PyTorch begins them."""
         self._torch, self._algo = torch, algo
-        self._actor = _network(torch, algo.hidden, mujoco_arena.ACTION_SIZE, last=torch.nn.Tanh())
-        self._critic = _network(torch, algo.hidden, 1)
+        self._actor = _network(
+            torch, algo.hidden_sizes, mujoco_arena.ACTION_SIZE, last=torch.nn.Tanh()
+        )
+        self._critic = _network(torch, algo.hidden_sizes, 1)
         rates = ((self._actor, algo.actor_learning_rate), (self._critic, algo.critic_learning_rate))
         self._optimizer = torch.optim.Adam(
             [{"params": net.parameters(), "lr": rate} for net, rate in rates]
@@ -88,7 +90,7 @@ class Robot:
         for _ in range(epochs):
             chosen = self._distribution(seen)
             ratio = torch.exp(chosen.log_prob(done) - before)
-            clipped = torch.clamp(ratio, 1.0 - algo.clip, 1.0 + algo.clip)
+            clipped = torch.clamp(ratio, 1.0 - algo.clip_epsilon, 1.0 + algo.clip_epsilon)
             gain = torch.minimum(ratio * advantage, clipped * advantage)
             error = 0.5 * (self._critic(seen)[:, 0] - returns).square().mean()
             loss = error - (gain + algo.entropy_cost * chosen.entropy()).mean()
@@ -124,7 +126,7 @@ def discounted(reward: Sequence[float], ended: Sequence[bool], discount: float) 
     return found
 
 
-def cycle(arena: Arena, robots: Sequence[Robot], steps: int, epochs: int) -> None:
+def cycle(arena: MujocoArena, robots: Sequence[Robot], steps: int, epochs: int) -> None:
     """Drives for so many control steps from a fresh level on, then lets every robot learn.
 
     Args:
@@ -145,7 +147,7 @@ def cycle(arena: Arena, robots: Sequence[Robot], steps: int, epochs: int) -> Non
 
 
 def _control_step(
-    arena: Arena, robots: Sequence[Robot], drives: Sequence[Robot], seen: np.ndarray
+    arena: MujocoArena, robots: Sequence[Robot], drives: Sequence[Robot], seen: np.ndarray
 ) -> tuple[Moved, list[Robot]]:
     """One control step; returns what it came to, and the robots that are still on their way."""
     none = np.zeros(mujoco_arena.ACTION_SIZE, np.float32)
@@ -164,7 +166,7 @@ def results(given: PaperWayConfig, words: list[str]) -> Iterator[dict[str, Any]]
     torch = peers.find("torch", peers.TORCH)
     judged = mujoco_arena.load_settings(["stage=s6", "robot=planar", "steps=500", *words])
     algo = load_train(["algo=paper"]).algo
-    arena = Arena(judged)
+    arena = MujocoArena(judged)
     robots = [Robot(torch, algo) for _ in range(judged.stage.robots)]
     calls_s, transitions = [], 0
     for steps in itertools.chain([min(_WARM, given.rollout)], itertools.repeat(given.rollout)):

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import mujoco_arena, peers, timing
-from benchmarks.mujoco_arena import Arena
+from benchmarks.mujoco_arena import MujocoArena
 from swarmjax import provenance
 from swarmjax.config import ConfigError, Section, about, to_dict
 from swarmjax.evaluate.config import EvaluateConfig
@@ -55,7 +55,7 @@ def serve(pipe: Connection, judged: EvaluateConfig, numbers: Sequence[int]) -> N
       judged: settings of the arenas.
       numbers: [A] of the arenas.
     """
-    arenas = [Arena(judged, number * _LEVELS) for number in numbers]
+    arenas = [MujocoArena(judged, number * _LEVELS) for number in numbers]
     seen = [arena.reset() for arena in arenas]
     waits = [np.zeros(len(each), bool) for each in seen]
     pipe.send(np.concatenate(seen))
@@ -66,7 +66,7 @@ def serve(pipe: Connection, judged: EvaluateConfig, numbers: Sequence[int]) -> N
         pipe.send([np.concatenate([each[i] for each in found]) for i in range(5)])
 
 
-def _step(arena: Arena, action: np.ndarray, waits: np.ndarray) -> tuple[np.ndarray, ...]:
+def _step(arena: MujocoArena, action: np.ndarray, waits: np.ndarray) -> tuple[np.ndarray, ...]:
     """Steps an arena, and resets it where it is over.
 
     Returns:
@@ -148,17 +148,20 @@ def ppo_settings(robots: int) -> dict[str, Any]:
     """Numbers of `algo=ppo` under the names of Stable-Baselines3, for so many robots in all."""
     algo = load_train(["stage=s6"]).algo
     return {
-        "n_steps": algo.rollout,
-        "batch_size": robots * algo.rollout // algo.minibatches,
+        "n_steps": algo.rollout_length,
+        "batch_size": robots * algo.rollout_length // algo.num_minibatches,
         "n_epochs": algo.epochs,
         "gamma": algo.discount,
         "gae_lambda": algo.gae_lambda,
-        "clip_range": algo.clip,
+        "clip_range": algo.clip_epsilon,
         "learning_rate": algo.actor_learning_rate,
         "vf_coef": algo.value_cost,
         "ent_coef": algo.entropy_cost,
         "max_grad_norm": algo.max_grad_norm,
-        "policy_kwargs": {"net_arch": list(algo.hidden), "log_std_init": np.log(algo.initial_std)},
+        "policy_kwargs": {
+            "net_arch": list(algo.hidden_sizes),
+            "log_std_init": np.log(algo.initial_std),
+        },
         "seed": 0,
     }
 

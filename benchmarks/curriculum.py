@@ -219,7 +219,7 @@ def _line(study: StudyConfig, arm: str, trained: TrainConfig, at: np.ndarray) ->
         "robot": trained.robot.body,
         "realism": trained.realism.name,
         "impl": dispatch.resolve_impl(trained.sim.impl),
-        "arena_steps": (at * trained.arenas * trained.algo.rollout).tolist(),
+        "arena_steps": (at * trained.arenas * trained.algo.rollout_length).tolist(),
         "settings_digest": digest[:12],
         "device": provenance.device(),
         "versions": provenance.versions(),

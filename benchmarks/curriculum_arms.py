@@ -114,7 +114,7 @@ def points(study: StudyConfig, trained: TrainConfig) -> np.ndarray:
     Raises:
       ConfigError: if the budget ends before the first point.
     """
-    update = trained.arenas * trained.algo.rollout
+    update = trained.arenas * trained.algo.rollout_length
     first = max(1, round(study.first / update))
     if first >= trained.updates:
         raise ConfigError(

@@ -55,7 +55,7 @@ def results(settings: TrainConfig) -> Iterator[dict[str, Any]]:
             "updates": updates,
             "arena_steps_per_s": updates
             * settings.arenas
-            * settings.algo.rollout
+            * settings.algo.rollout_length
             / median([mine for _, mine in times])[0],
             "robot": settings.robot.body,
             "impl": dispatch.resolve_impl(settings.sim.impl),

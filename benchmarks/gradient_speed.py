@@ -106,7 +106,7 @@ def _of_samples(gradient: Callable[..., Any], algo: AlgoConfig) -> Gradient:
 
 def _compile(
     gradient: Gradient, steps: int, params: Params, samples: Minibatch
-) -> timing.Program | str:
+) -> timing.TimedProgram | str:
     """Compiles as many steps along the gradient; what is said where that cannot be done."""
 
     def descend(params: Params, samples: Minibatch) -> tuple[Params, None]:
@@ -122,7 +122,9 @@ def _compile(
         return str(error).splitlines()[0]
 
 
-def _time(programs: Sequence[timing.Program], repeats: int, params: Params, samples: Any) -> Any:
+def _time(
+    programs: Sequence[timing.TimedProgram], repeats: int, params: Params, samples: Any
+) -> Any:
     """Seconds of the calls of each program, which take their turns; the first is not counted."""
     taken: list[list[float]] = [[] for _ in programs]
     for _ in range(1 + repeats):
@@ -178,7 +180,7 @@ def _about(
         "batch": size,
         "gradient": "autodiff" if launch is None else "fused",
         **(dict.fromkeys(Launch._fields) if launch is None else launch._asdict()),
-        "hidden": algo.hidden,
+        "hidden": algo.hidden_sizes,
         "activation": algo.activation,
         "steps": given.steps,
         "kernels": given.kernels,

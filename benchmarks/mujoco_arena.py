@@ -39,7 +39,7 @@ class Moved(NamedTuple):
     over: bool
 
 
-class Arena:
+class MujocoArena:
     """One arena; `reset` begins the next level, `step` moves it on.
 
     Attributes:
@@ -137,7 +137,7 @@ def rewards(judge: Judge, before: Arenas, after: Arenas) -> np.ndarray:
     sensed = after.outcome.sensed - before.outcome.sensed
     begun = (after.outcome.contacts - before.outcome.contacts).sum(axis=-1)
     total = weights.progress * (way[0] - way[1]) + weights.proximity * sensed
-    return np.where(active, total + weights.contact * begun + weights.time, 0.0)
+    return np.where(active, total + weights.contact * begun + weights.step_penalty, 0.0)
 
 
 def load_settings(words: list[str]) -> EvaluateConfig:

@@ -127,7 +127,7 @@ def _most(seconds: dict[str, float]) -> list[tuple[str, float]]:
 def results(settings: TrainConfig, top: int) -> Iterator[dict]:
     """Profiles physics, environment and training, and yields their lines."""
     prepared = steps_per_second.prepare(settings)
-    schedule, keys, rollout = prepared.schedule, prepared.keys, settings.algo.rollout
+    schedule, keys, rollout = prepared.schedule, prepared.keys, settings.algo.rollout_length
     about = {"arenas": settings.arenas, "robot": settings.robot.body}
     steps = steps_per_second.CONTROL_STEPS[settings.robot.body]
     for name, program, argument, count in (

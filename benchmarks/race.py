@@ -134,7 +134,7 @@ def run_ours(race: RaceConfig, trained: TrainConfig) -> Course:
         train_s=np.array(curves.train_s),
         share=np.array(curves.judged["goal"]["targets_reached"][0]),
         transitions=np.array(curves.transitions[0]),
-        arena_steps=updates * trained.arenas * trained.algo.rollout,
+        arena_steps=updates * trained.arenas * trained.algo.rollout_length,
         compile_s=curves.compile_s,
     )
 
@@ -170,19 +170,19 @@ def brax_settings(race: RaceConfig, trained: TrainConfig) -> dict[str, Any]:
 
 def _brax_updates(trained: TrainConfig, given: dict[str, Any]) -> int:
     """Rollouts of Brax's that our budget has room for."""
-    return trained.updates * trained.algo.rollout // given["unroll_length"]
+    return trained.updates * trained.algo.rollout_length // given["unroll_length"]
 
 
 def _our_settings(trained: TrainConfig) -> dict[str, Any]:
     """Our numbers under the names that Brax has for them."""
     algo = trained.algo
     return {
-        "unroll_length": algo.rollout,
-        "num_minibatches": algo.minibatches,
+        "unroll_length": algo.rollout_length,
+        "num_minibatches": algo.num_minibatches,
         "num_updates_per_batch": algo.epochs,
         "discounting": algo.discount,
         "gae_lambda": algo.gae_lambda,
-        "clipping_epsilon": algo.clip,
+        "clipping_epsilon": algo.clip_epsilon,
         "entropy_cost": algo.entropy_cost,
         "vf_loss_coefficient": algo.value_cost,
         "learning_rate": algo.actor_learning_rate,
@@ -196,8 +196,8 @@ def network_factory(trained: TrainConfig) -> Callable[..., Any]:
     algo, orthogonal = trained.algo, jax.nn.initializers.orthogonal
     return partial(
         networks.make_ppo_networks,
-        policy_hidden_layer_sizes=algo.hidden,
-        value_hidden_layer_sizes=algo.hidden,
+        policy_hidden_layer_sizes=algo.hidden_sizes,
+        value_hidden_layer_sizes=algo.hidden_sizes,
         activation=_ACTIVATIONS[algo.activation],
         distribution_type="normal",
         noise_std_type="log",

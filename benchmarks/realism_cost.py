@@ -51,7 +51,7 @@ def compare(ideal: Arm, arm: Arm, updates: int) -> dict[str, Any]:
     pairs = time_in_turn(ideal, arm, updates, PAIRS)
     ratio, low, high = median([mine / theirs for theirs, mine in pairs])
     settings = ideal.settings
-    steps = updates * settings.seeds * settings.arenas * settings.algo.rollout
+    steps = updates * settings.seeds * settings.arenas * settings.algo.rollout_length
     return {
         "time_ratio": ratio,
         "time_ratio_low": low,

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from benchmarks import peers, run_page
-from benchmarks.suites import SUITES, Entry
+from benchmarks.suites import SUITES, SuiteEntry
 from swarmjax import command
 from swarmjax.config import ConfigError, Section, about
 
@@ -34,7 +34,7 @@ _GRACE = 10.0  # s that a process is given to end by itself
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunConfig(Section):
+class SuiteRunConfig(Section):
     """What is run, and where its results go."""
 
     suite: str | None = field(
@@ -70,14 +70,14 @@ class RunConfig(Section):
 # What is left to do
 
 
-def entries(config: RunConfig) -> list[Entry]:
+def entries(config: SuiteRunConfig) -> list[SuiteEntry]:
     """The entries that are chosen, in the order of their suite."""
     if config.suite is None:
         return []
     return [entry for entry in SUITES[config.suite] if entry.name in config.only or not config.only]
 
 
-def left(entry: Entry, lines: Sequence[Line]) -> list[str | None]:
+def left(entry: SuiteEntry, lines: Sequence[Line]) -> list[str | None]:
     """Values of an entry that have no result yet.
 
     Args:
@@ -92,19 +92,19 @@ def left(entry: Entry, lines: Sequence[Line]) -> list[str | None]:
     return [value for value in values if not _is_done(entry, value, lines)]
 
 
-def _is_done(entry: Entry, value: str | None, lines: Sequence[Line]) -> bool:
+def _is_done(entry: SuiteEntry, value: str | None, lines: Sequence[Line]) -> bool:
     """Tells whether the newest line of an entry and value is a result."""
     mine = [line for line in lines if _is_of(entry, value, line)]
     return bool(mine) and not {"failed", "skipped"} & mine[-1].keys()
 
 
-def _is_of(entry: Entry, value: str | None, line: Line) -> bool:
+def _is_of(entry: SuiteEntry, value: str | None, line: Line) -> bool:
     if line.get("entry") != entry.name:
         return False
     return entry.over is None or str(line.get(entry.over)) == value
 
 
-def command_line(entry: Entry, values: Sequence[str | None]) -> list[str]:
+def command_line(entry: SuiteEntry, values: Sequence[str | None]) -> list[str]:
     """The command of a process that measures some values of an entry."""
     words = [*entry.words]
     if entry.over is not None:
@@ -165,7 +165,7 @@ def read(path: Path) -> list[Line]:
     return found
 
 
-def run_entry(entry: Entry, output: Output, deadline: float) -> None:
+def run_entry(entry: SuiteEntry, output: Output, deadline: float) -> None:
     """Runs what is left of an entry, in as many processes as it takes.
 
     A value that a process did not come to is left to the next process, but for the one that it
@@ -192,7 +192,7 @@ def run_entry(entry: Entry, output: Output, deadline: float) -> None:
         waiting = [*untried[1:], *rest]
 
 
-def _failed(entry: Entry, value: str | None, reason: str) -> Line:
+def _failed(entry: SuiteEntry, value: str | None, reason: str) -> Line:
     """The line of a value that has no result."""
     line = {"benchmark": entry.module, "entry": entry.name, "failed": reason}
     return line if entry.over is None else {**line, entry.over: value}
@@ -206,7 +206,7 @@ class Process:
       late: whether it was ended because the time of the whole run was over.
     """
 
-    def __init__(self, entry: Entry, values: Sequence[str | None]) -> None:
+    def __init__(self, entry: SuiteEntry, values: Sequence[str | None]) -> None:
         """Starts it."""
         self.reason, self.late, self._closed = "", False, False
         self._limit = entry.seconds
@@ -278,7 +278,7 @@ class Process:
         return f"exit code {self._process.returncode}: {words[-1][:300] if words else 'silent'}"
 
 
-def run_suite(config: RunConfig, say: TextIO) -> None:
+def run_suite(config: SuiteRunConfig, say: TextIO) -> None:
     """Runs all entries, and says of each what is done.
 
     Args:
@@ -306,7 +306,7 @@ def run_suite(config: RunConfig, say: TextIO) -> None:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    config = peers.load(RunConfig, arguments)
+    config = peers.load(SuiteRunConfig, arguments)
     if config.suite is not None:
         run_suite(config, sys.stderr)
     if config.docs is not None:
@@ -316,4 +316,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(command.run("run", main, RunConfig))
+    sys.exit(command.run("run", main, SuiteRunConfig))

@@ -65,9 +65,9 @@ class Prepared:
     schedule: Schedule
     start: Any
     keys: Array
-    physics: timing.Program
-    environment: timing.Program
-    training: timing.Program
+    physics: timing.TimedProgram
+    environment: timing.TimedProgram
+    training: timing.TimedProgram
 
 
 def prepare(settings: TrainConfig) -> Prepared:
@@ -124,7 +124,7 @@ def environment(
         level_key, key = jax.random.split(key)
         index = jnp.zeros(program.config.arenas, jnp.int32)
         starts = rollout.draw_starts(world, schedule.stages, index, jnp.int32(0), level_key)
-        keys = jax.random.split(key, program.config.algo.rollout)
+        keys = jax.random.split(key, program.config.algo.rollout_length)
         arenas, reward = jax.lax.scan(partial(body, starts=starts), arenas, keys)
         return arenas, jnp.sum(reward)
 
@@ -136,7 +136,7 @@ def environment(
 
 def _rollouts(settings: TrainConfig) -> int:
     """How many rollouts a call of the environment is."""
-    return max(1, CONTROL_STEPS[settings.robot.body] // settings.algo.rollout)
+    return max(1, CONTROL_STEPS[settings.robot.body] // settings.algo.rollout_length)
 
 
 def _actions(program: Program, key: Array) -> Array:
@@ -218,7 +218,7 @@ def time_environment(prepared: Prepared) -> dict[str, Any]:
     settings = prepared.program.config
     arenas, argument = prepared.start(prepared.schedule).arenas, (prepared.schedule, prepared.keys)
     calls_s, _ = timing.time_program(prepared.environment, arenas, argument)
-    steps = _rollouts(settings) * settings.algo.rollout
+    steps = _rollouts(settings) * settings.algo.rollout_length
     return _line(prepared, "environment", steps, calls_s)
 
 
@@ -233,13 +233,13 @@ def time_training(prepared: Prepared, arena_steps_per_s: float) -> dict[str, Any
       The line.
     """
     settings = prepared.program.config
-    per_update = settings.seeds * settings.arenas * settings.algo.rollout
+    per_update = settings.seeds * settings.arenas * settings.algo.rollout_length
     updates = TRAIN_SECONDS * arena_steps_per_s / per_update / 2
     n = int(np.clip(updates, 1, prepared.program.rows))
     state = prepared.start(prepared.schedule)
     calls_s, metrics = timing.time_program(prepared.training, state, np.int32(n))
     transitions = float(np.sum(np.asarray(metrics["transitions"], np.float64)[:, :n]))
-    return _line(prepared, "training", n * settings.algo.rollout, calls_s, transitions)
+    return _line(prepared, "training", n * settings.algo.rollout_length, calls_s, transitions)
 
 
 def results(prepared: Prepared) -> list[dict[str, Any]]:

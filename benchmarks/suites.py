@@ -15,7 +15,7 @@ SEEDS = ("0", "1", "2", "3", "4")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Entry:
+class SuiteEntry:
     """One benchmark with its settings.
 
     Attributes:
@@ -39,9 +39,9 @@ class Entry:
     environment: dict[str, str] = field(default_factory=dict)
 
 
-def _speed(name: str, *words: str, values: tuple[str, ...] = ARENAS) -> Entry:
+def _speed(name: str, *words: str, values: tuple[str, ...] = ARENAS) -> SuiteEntry:
     """Physics, environment and training at several numbers of arenas."""
-    return Entry(
+    return SuiteEntry(
         name=name,
         module="steps_per_second",
         words=("budget=1e10", *words),
@@ -51,17 +51,17 @@ def _speed(name: str, *words: str, values: tuple[str, ...] = ARENAS) -> Entry:
     )
 
 
-def _robots(name: str, *words: str) -> Entry:
+def _robots(name: str, *words: str) -> SuiteEntry:
     """The same with swarms of several sizes."""
     values = ("5", "1", "50", "10", "20", "2", "3")
-    return Entry(
+    return SuiteEntry(
         name=name, module="robots_speed", words=words, over="robots", values=values, seconds=480.0
     )
 
 
-def _memory(name: str, *words: str) -> Entry:
+def _memory(name: str, *words: str) -> SuiteEntry:
     """Memory at two sizes, a process each: a peak is one of a whole process."""
-    return Entry(
+    return SuiteEntry(
         name=name,
         module="memory",
         words=words,
@@ -72,9 +72,9 @@ def _memory(name: str, *words: str) -> Entry:
     )
 
 
-def _peer(name: str, values: tuple[str, ...], *words: str) -> Entry:
+def _peer(name: str, values: tuple[str, ...], *words: str) -> SuiteEntry:
     """The environment of a peer."""
-    return Entry(
+    return SuiteEntry(
         name=name, module=name, words=words, over="arenas", values=values, environment=HIGHEST
     )
 
@@ -95,42 +95,42 @@ PEERS = (
     replace(_peer("peer_jaxnav", ("16384",), "step=default"), name="peer_jaxnav-default"),
 )
 TRAINERS = (
-    Entry(
+    SuiteEntry(
         name="race-swarmjax",
         module="race",
         words=("trainer=swarmjax", "points=200", *_TRAINED),
     ),
-    Entry(
+    SuiteEntry(
         name="race-brax",
         module="race",
         words=("trainer=brax", "points=200", *_TRAINED),
         seconds=400.0,
     ),
-    Entry(
+    SuiteEntry(
         name="race-brax-playground",
         module="race",
         words=("trainer=brax", "settings=playground", "points=100", *_TRAINED),
         seconds=400.0,
     ),
-    Entry(
+    SuiteEntry(
         name="peer_jaxmarl_ippo",
         module="peer_jaxmarl_ippo",
         over="arenas",
         values=("16384", "4096"),
         environment=HIGHEST,
     ),
-    Entry(name="peer_benchmarl", module="peer_benchmarl", over="arenas", values=("4096",)),
+    SuiteEntry(name="peer_benchmarl", module="peer_benchmarl", over="arenas", values=("4096",)),
 )
 START = (
-    Entry(name="start_up", module="start_up", words=("stage=s6", _WARP, "arenas=16384")),
-    Entry(
+    SuiteEntry(name="start_up", module="start_up", words=("stage=s6", _WARP, "arenas=16384")),
+    SuiteEntry(
         name="start_up-wheeled",
         module="start_up",
         words=("stage=s6", _WARP, "robot=wheeled", "arenas=16384"),
     ),
 )
 SUCCESS = (
-    Entry(
+    SuiteEntry(
         name="success-wheeled",
         module="command_to_success",
         words=("stage=s6", _WARP, "robot=wheeled", "arenas=16384", "budget=80e6"),
@@ -138,7 +138,7 @@ SUCCESS = (
         values=SEEDS,
         seconds=240.0,
     ),
-    Entry(
+    SuiteEntry(
         name="success-planar",
         module="command_to_success",
         words=("stage=s6", _WARP, "arenas=16384", "budget=150e6"),
@@ -165,33 +165,33 @@ ON_CPU = tuple(
     for entry in (
         _speed("cpu-planar", "sim.impl=jax", values=("128", "64", "256")),
         _speed("cpu-wheeled", "sim.impl=jax", "robot=wheeled", values=("64",)),
-        Entry(name="cpu_paper_way", module="cpu_paper_way", words=("seconds=30",)),
-        Entry(name="cpu_sb3", module="cpu_sb3", words=("seconds=30",)),
-        Entry(
+        SuiteEntry(name="cpu_paper_way", module="cpu_paper_way", words=("seconds=30",)),
+        SuiteEntry(name="cpu_sb3", module="cpu_sb3", words=("seconds=30",)),
+        SuiteEntry(
             name="cpu-benchmarl",
             module="peer_benchmarl",
             words=("device=cpu",),
             over="arenas",
             values=("64",),
         ),
-        Entry(
+        SuiteEntry(
             name="cpu-success",
             module="command_to_success",
             over="seed",
             values=SEEDS,
             seconds=900.0,
         ),
-        Entry(name="cpu-start_up", module="start_up"),
+        SuiteEntry(name="cpu-start_up", module="start_up"),
     )
 )
 QUICK = tuple(
     replace(entry, environment=CPU | entry.environment)
     for entry in (
         _speed("quick-planar", "sim.impl=jax", values=("64",)),
-        Entry(
+        SuiteEntry(
             name="quick-cpu_paper_way", module="cpu_paper_way", words=("seconds=5", "rollout=1000")
         ),
-        Entry(name="quick-cpu_sb3", module="cpu_sb3", words=("seconds=5",)),
+        SuiteEntry(name="quick-cpu_sb3", module="cpu_sb3", words=("seconds=5",)),
         *(
             replace(_peer(name, ("64",), "steps=16", *words), name=f"quick-{name}", module=name)
             for name, words in {
@@ -203,7 +203,7 @@ QUICK = tuple(
     )
 )
 
-SUITES: dict[str, tuple[Entry, ...]] = {
+SUITES: dict[str, tuple[SuiteEntry, ...]] = {
     "quick": QUICK,
     "headline": HEADLINE,
     "peers": (*HEADLINE, *PEERS),

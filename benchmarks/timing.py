@@ -12,7 +12,7 @@ from swarmjax.training import loop
 REPEATS = 5
 
 
-class Program(NamedTuple):
+class TimedProgram(NamedTuple):
     """A compiled `(state, argument) -> (state, rest)`, the state donated.
 
     Attributes:
@@ -27,7 +27,7 @@ class Program(NamedTuple):
     size: int
 
 
-def compile_program(call: Callable[[Any, Any], Any], state: Any, argument: Any) -> Program:
+def compile_program(call: Callable[[Any, Any], Any], state: Any, argument: Any) -> TimedProgram:
     """Compiles ahead of time.
 
     Args:
@@ -46,11 +46,11 @@ def compile_program(call: Callable[[Any, Any], Any], state: Any, argument: Any) 
     assert memory is not None  # both CPU and GPU tell
     size = memory.argument_size_in_bytes + memory.temp_size_in_bytes
     size += memory.output_size_in_bytes - memory.alias_size_in_bytes
-    return Program(compiled, seconds, size)
+    return TimedProgram(compiled, seconds, size)
 
 
 def time_program(
-    program: Program, state: Any, argument: Any, repeats: int = REPEATS
+    program: TimedProgram, state: Any, argument: Any, repeats: int = REPEATS
 ) -> tuple[list[float], Any]:
     """Times calls, each on the state that the one before left, after one that is not counted.
 

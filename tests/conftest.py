@@ -56,9 +56,9 @@ def tiny_config() -> TrainConfig:
         ),
         # Equation 3 alone, whose sums are easily worked out.
         task=TaskConfig(
-            step_limit=16, reward=RewardConfig(proximity=-0.001, contact=0.0, time=0.0)
+            step_limit=16, reward=RewardConfig(proximity=-0.001, contact=0.0, step_penalty=0.0)
         ),
-        algo=AlgoConfig(hidden=(8,), rollout=8, minibatches=2, epochs=2),
+        algo=AlgoConfig(hidden_sizes=(8,), rollout_length=8, num_minibatches=2, epochs=2),
         sim=SimConfig(impl="jax", max_robots=3, max_obstacles=2),
         arenas=8,
         budget=8 * 8 * 20,

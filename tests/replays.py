@@ -9,7 +9,7 @@ from swarmjax.evaluate import judge as evaluate_judge
 from swarmjax.evaluate.judge import Judge
 from swarmjax.replay import record as replay_record
 from swarmjax.replay.config import ReplayConfig
-from swarmjax.replay.record import Episode, Recording, Scene
+from swarmjax.replay.record import Recording, ReplayEpisode, ReplayScene
 from swarmjax.task.stage_files import load_levels
 
 SMALL = ("stage.robots=3", "stage.side=0.9", "stage.obstacles=2")
@@ -48,7 +48,7 @@ def wandering(robots: int, frames: int, seed: int = 0) -> Recording:
         "time": np.full((frames, robots), -1e-3),
     }
     return Recording(
-        scene=Scene(
+        scene=ReplayScene(
             side=1.2,
             target=draw.uniform(-0.5, 0.5, (robots, 2)),
             box=np.array([[0.1, -0.2, 0.3, 0.05, 0.05]]),
@@ -64,6 +64,6 @@ def wandering(robots: int, frames: int, seed: int = 0) -> Recording:
     )
 
 
-def episode(*runs: Recording, level: int = 0) -> Episode:
+def episode(*runs: Recording, level: int = 0) -> ReplayEpisode:
     """An episode of these runs."""
-    return Episode(f"level {level}", level, list(runs))
+    return ReplayEpisode(f"level {level}", level, list(runs))

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax.reproduce.rows import ARMS, EXPANDED, JUDGED, LAST, Log, Reproduction
+from swarmjax.reproduce.rows import ARMS, EXPANDED, JUDGED, LAST, Reproduction, RunLog
 
 SEEDS = (0, 1, 2)
 FACTS = {
@@ -91,7 +91,7 @@ def whole(out: Path, episodes: int = 30, arms: Sequence[str] = tuple(ARMS)) -> P
     return write(out, logs)
 
 
-def log(successes: Sequence[bool], *, every: int = 100, **given: Any) -> Log:
+def log(successes: Sequence[bool], *, every: int = 100, **given: Any) -> RunLog:
     """A seed's episodes of two robots, which arrive together or not at all."""
     count = len(successes)
     both = np.repeat(np.asarray(successes, bool)[:, None], 2, axis=1)
@@ -108,11 +108,11 @@ def log(successes: Sequence[bool], *, every: int = 100, **given: Any) -> Log:
         "sensed": 10 * ones,
         "contacts": ones,
     }
-    return Log(**(values | given))
+    return RunLog(**(values | given))
 
 
 def reproduction(
-    logs: Mapping[str, Sequence[Log]] | None = None,
+    logs: Mapping[str, Sequence[RunLog]] | None = None,
     judged: Mapping[tuple[str, str], Mapping[str, float]] | None = None,
 ) -> Reproduction:
     """What arms came to: every measure that is not given is 0 for all seeds."""

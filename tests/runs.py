@@ -16,7 +16,7 @@ CONFIG = TrainConfig(
         StageConfig(name="trio", robots=3, side=0.8, obstacles=2),
     ),
     task=TaskConfig(step_limit=16),  # a cohort is two updates of 8 control steps
-    algo=AlgoConfig(hidden=(8,), rollout=8, minibatches=2),
+    algo=AlgoConfig(hidden_sizes=(8,), rollout_length=8, num_minibatches=2),
     sim=SimConfig(impl="jax"),
     arenas=8,
     budget=8 * 8 * 20,

@@ -96,3 +96,14 @@ def f():
     from swarmjax import train
 """
     assert _imports(source) == {"training.loop", "config", "ppo", "sim.gaps.KINDS", "train"}
+
+
+def test_no_class_name_is_used_twice() -> None:
+    found = [
+        node.name
+        for folder in (ROOT, ROOT.parent / "benchmarks")
+        for path in folder.rglob("*.py")
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    ]
+    assert sorted(name for name in set(found) if found.count(name) > 1) == []

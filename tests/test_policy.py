@@ -250,7 +250,7 @@ def _exported(learner: ppo.LearnerState) -> Arrays:
 
 @pytest.mark.parametrize("activation", ["tanh", "relu", "swish"])
 def test_mean_action_is_the_mode_of_the_learner(tmp_path: Path, activation: Any) -> None:
-    config = AlgoConfig(hidden=(64, 64), activation=activation)
+    config = AlgoConfig(hidden_sizes=(64, 64), activation=activation)
     learner = ppo.init(jax.random.key(0), config, SIZE, ACTIONS, updates=1)
     draw = np.random.default_rng(4)
     # The mean starts with a gain of 0.01, too little to tell networks apart.

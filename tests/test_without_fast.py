@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 
 WORDS = (
-    "stage=s4 arenas=4 algo.rollout=16 algo.hidden=[8] algo.minibatches=2 budget=128 "
-    "task.step_limit=16 run.tensorboard=false run.compile_cache=null run.dir=run"
+    "stage=s4 arenas=4 algo.rollout_length=16 algo.hidden_sizes=[8] algo.num_minibatches=2 "
+    "budget=128 task.step_limit=16 run.tensorboard=false run.compile_cache=null run.dir=run"
 )
 BLOCKED = """
 import sys
@@ -28,7 +28,7 @@ def test_the_tiny_run_trains_by_mjx_and_autodiff_alone(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["updates"] == 2
-    assert (summary["solver"], summary["gradient"]) == ("mjx", "autodiff")
+    assert (summary["solver"], summary["update_backend"]) == ("mjx", "autodiff")
     assert summary["stepped_by"] == "MJX's own step"
 
 

@@ -79,10 +79,12 @@ class Section:
     Attributes:
         command: name of the command's file in configs/, of a section that is all of a command's.
         removed: why a key is gone, by its old name.
+        renamed: a key's new name, by its old one.
     """
 
     command: ClassVar[str] = ""
     removed: ClassVar[Mapping[str, str]] = {}
+    renamed: ClassVar[Mapping[str, str]] = {}
 
     def __post_init__(self) -> None:
         for item in dataclasses.fields(self):
@@ -176,6 +178,40 @@ def to_dict(config: Section) -> dict[str, Any]:
     return {key: _plain(value) for key, value in dataclasses.asdict(config).items()}
 
 
+def modernise(cls: type[Section], stored: Any) -> Any:
+    """Give stored settings the names of this version, so that `build` takes them.
+
+    Args:
+        cls: the section that they are of.
+        stored: plain data of this version or of an older one.
+
+    Returns:
+        The same with keys and values by their new names, and without keys that are gone; what is
+        no section is left as it is, for `build` to refuse.
+    """
+    if not isinstance(stored, Mapping):
+        return stored
+    fields = {item.name: item for item in dataclasses.fields(cls)}
+    found = {}
+    for old, value in stored.items():
+        key = cls.renamed.get(old, old)
+        if key in fields:
+            found[key] = _modernise_value(fields[key], value)
+        elif key not in cls.removed:
+            found[key] = value
+    return found
+
+
+def _modernise_value(item: dataclasses.Field[Any], value: Any) -> Any:
+    inner = _section(item.type)
+    if inner is not None and isinstance(value, list | tuple):
+        return [modernise(inner, each) for each in value]
+    if inner is not None:
+        return modernise(inner, value)
+    renamed = item.metadata.get("renamed", {})
+    return renamed.get(value, value) if isinstance(value, str) else value
+
+
 def _plain(value: object) -> object:
     """Turn the tuples of nested plain data into lists."""
     if isinstance(value, dict):
@@ -237,12 +273,21 @@ def unknown_key(key: str, cls: type[Section], where: str = "") -> ConfigError:
     """
     if key in cls.removed:
         return ConfigError(f"{where}{key} is no longer a key: {cls.removed[key]}")
+    if key in cls.renamed:
+        new = cls.renamed[key]
+        return ConfigError(f"{where}{key} is called {where}{new} now: give {where}{new}.")
     known = names(cls)
     dotted = {full.rpartition(".")[2]: full for full in reversed(keys(cls))}
-    near = [dotted[key]] if key in dotted else difflib.get_close_matches(key, known, n=1)
-    near = near or [dotted[leaf] for leaf in difflib.get_close_matches(key, dotted, n=1)]
+    once = {name: name for name in known} | dict(cls.renamed)
+    near = [dotted[key]] if key in dotted else _near(key, once)
+    near = near or _near(key, dotted)
     hint = f"did you mean {where}{near[0]}?" if near else f"give one of {', '.join(known)}."
     return ConfigError(f"{where}{key} is not a key: {hint}")
+
+
+def _near(key: str, meant: Mapping[str, str]) -> list[str]:
+    """Return what the name nearest to a key stands for, if one is near."""
+    return [meant[name] for name in difflib.get_close_matches(key, meant, n=1)]
 
 
 def _is_derived(item: dataclasses.Field[Any]) -> bool:

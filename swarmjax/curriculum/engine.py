@@ -68,7 +68,7 @@ class Schedule(NamedTuple):
     cohort_updates: Array | np.int32
 
 
-class Tally(NamedTuple):
+class CohortTally(NamedTuple):
     """Episodes of one cohort that have ended, by the stage on which they began, [S] each.
 
     Attributes:
@@ -136,13 +136,13 @@ class Curriculum:
     cohort: Array
     age: Array
     since: Array
-    current: Tally
-    previous: Tally
+    current: CohortTally
+    previous: CohortTally
     record: Record
     met: Array
 
 
-class Verdict(NamedTuple):
+class CohortVerdict(NamedTuple):
     """What an update brought to light.
 
     Attributes:
@@ -156,7 +156,7 @@ class Verdict(NamedTuple):
     success: Array
 
 
-class Choice(NamedTuple):
+class StageChoice(NamedTuple):
     """What a mode chose.
 
     Attributes:
@@ -191,7 +191,7 @@ class Decision(NamedTuple):
         return (self.reason == BY_THRESHOLD) | (self.reason == BY_BUDGET)
 
 
-Mode = Callable[[Curriculum, Schedule, CurriculumConfig, Verdict, Array], Choice]
+Mode = Callable[[Curriculum, Schedule, CurriculumConfig, CohortVerdict, Array], StageChoice]
 
 
 def schedule(
@@ -276,7 +276,7 @@ def init(schedule: Schedule, options: CurriculumConfig, mode: Mode) -> Curriculu
         record=Record(jnp.zeros(stages, jnp.int32), *[unknown] * 6),
         met=zero,
     )
-    begun = Verdict(over=jnp.array(True), judged=jnp.zeros(stages, bool), success=unknown)
+    begun = CohortVerdict(over=jnp.array(True), judged=jnp.zeros(stages, bool), success=unknown)
     return _settle(blank, schedule, mode(blank, schedule, options, begun, zero - 1))
 
 
@@ -351,7 +351,7 @@ def advance(
     judged = over & (curriculum.previous.targets > 0)
     record = _judge(curriculum.record, curriculum.previous, judged, options)
     judging = replace(curriculum, record=record)
-    verdict = Verdict(over=over, judged=judged, success=_deciding(record, options))
+    verdict = CohortVerdict(over=over, judged=judged, success=_deciding(record, options))
     choice = mode(judging, schedule, options, verdict, update)
     decision = Decision(
         reason=choice.reason,
@@ -362,12 +362,12 @@ def advance(
     return _settle(_next_cohort(judging, choice.reason, over), schedule, choice), decision
 
 
-def _no_episodes(stages: int) -> Tally:
+def _no_episodes(stages: int) -> CohortTally:
     zero = jnp.zeros(stages, jnp.int32)
-    return Tally(zero, zero, zero, zero, zero, jnp.zeros(stages, jnp.float32))
+    return CohortTally(zero, zero, zero, zero, zero, jnp.zeros(stages, jnp.float32))
 
 
-def _add(tally: Tally, ended: Ended, cohort: Array) -> Tally:
+def _add(tally: CohortTally, ended: Ended, cohort: Array) -> CohortTally:
     """Adds the episodes of one cohort to its tally."""
     stages = jnp.arange(tally.episodes.shape[0])[:, None, None]
     mine = (ended.cohort == cohort) & (ended.stage == stages)  # [S, T, A]
@@ -375,7 +375,7 @@ def _add(tally: Tally, ended: Ended, cohort: Array) -> Tally:
     def total(x: Array) -> Array:
         return jnp.sum(jnp.where(mine, x, 0), axis=(1, 2))
 
-    new = Tally(
+    new = CohortTally(
         episodes=total(ended.episodes),
         targets=total(ended.targets),
         reached=total(ended.reached),
@@ -383,10 +383,10 @@ def _add(tally: Tally, ended: Ended, cohort: Array) -> Tally:
         contacts=total(jnp.sum(ended.contacts, axis=-1)),
         reward=total(ended.reward),
     )
-    return Tally(*(a + b for a, b in zip(tally, new, strict=True)))
+    return CohortTally(*(a + b for a, b in zip(tally, new, strict=True)))
 
 
-def _judge(record: Record, tally: Tally, judged: Array, options: CurriculumConfig) -> Record:
+def _judge(record: Record, tally: CohortTally, judged: Array, options: CurriculumConfig) -> Record:
     """Writes a whole cohort down for the stages [S] that it had episodes on."""
     robots, episodes = jnp.maximum(tally.targets, 1), jnp.maximum(tally.episodes, 1)
     verdict = Record(
@@ -436,7 +436,7 @@ def _next_cohort(curriculum: Curriculum, reason: Array, over: Array) -> Curricul
     )
 
 
-def _settle(curriculum: Curriculum, schedule: Schedule, choice: Choice) -> Curriculum:
+def _settle(curriculum: Curriculum, schedule: Schedule, choice: StageChoice) -> Curriculum:
     """Takes a mode's choice over."""
     robots = jnp.where(choice.weights > 0.0, jnp.asarray(schedule.stages.robots), 0)
     return replace(

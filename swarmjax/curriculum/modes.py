@@ -16,12 +16,12 @@ from swarmjax.curriculum.engine import (
     BY_THRESHOLD,
     REWEIGHED,
     STAYED,
-    Choice,
+    CohortVerdict,
     Curriculum,
     Mode,
     Record,
     Schedule,
-    Verdict,
+    StageChoice,
 )
 
 _UNKNOWN_LEARNABILITY = 0.25  # the most that p (1 - p) can be, so that what is unknown is tried
@@ -31,9 +31,9 @@ def sequential(
     curriculum: Curriculum,
     schedule: Schedule,
     options: CurriculumConfig,
-    verdict: Verdict,
+    verdict: CohortVerdict,
     update: Array,
-) -> Choice:
+) -> StageChoice:
     """All arenas are on the newest stage, and go on to the next together, or back.
 
     A stage is left for the next when a whole cohort of it has reached `threshold`, or at its
@@ -52,16 +52,16 @@ def sequential(
     """
     stage, reason = _step(curriculum, schedule, verdict, update)
     weights = jax.nn.one_hot(stage, curriculum.weights.shape[0], dtype=jnp.float32)
-    return Choice(stage=stage, weights=weights, reason=reason)
+    return StageChoice(stage=stage, weights=weights, reason=reason)
 
 
 def mixed(
     curriculum: Curriculum,
     schedule: Schedule,
     options: CurriculumConfig,
-    verdict: Verdict,
+    verdict: CohortVerdict,
     update: Array,
-) -> Choice:
+) -> StageChoice:
     """Decides as `sequential`, but keeps `earlier_share` of the arenas on earlier stages, evenly.
 
     Args:
@@ -78,7 +78,7 @@ def mixed(
     index = jnp.arange(curriculum.weights.shape[0])
     share = jnp.where(stage > 0, jnp.asarray(schedule.earlier_share), 0.0)
     earlier = jnp.where(index < stage, share / jnp.maximum(stage, 1), 0.0)
-    return Choice(
+    return StageChoice(
         stage=stage, weights=jnp.where(index == stage, 1.0 - share, earlier), reason=reason
     )
 
@@ -87,9 +87,9 @@ def adaptive(
     curriculum: Curriculum,
     schedule: Schedule,
     options: CurriculumConfig,
-    verdict: Verdict,
+    verdict: CohortVerdict,
     update: Array,
-) -> Choice:
+) -> StageChoice:
     """All stages at once, weighed anew after every cohort by their `score`, none below the floor.
 
     `learnability` is p (1 - p), p the success: nothing is learned where all or nothing succeeds
@@ -117,7 +117,7 @@ def adaptive(
     floor = jnp.asarray(schedule.floor)
     weights = floor / stages + (1.0 - floor) * share
     reason = jnp.where(verdict.over & jnp.any(verdict.judged), REWEIGHED, STAYED)
-    return Choice(
+    return StageChoice(
         stage=jnp.full_like(curriculum.stage, stages - 1),
         weights=jnp.where(verdict.over, weights, curriculum.weights),
         reason=reason.astype(jnp.int32),
@@ -128,7 +128,7 @@ MODES: dict[str, Mode] = {"sequential": sequential, "mixed": mixed, "adaptive": 
 
 
 def _step(
-    curriculum: Curriculum, schedule: Schedule, verdict: Verdict, update: Array
+    curriculum: Curriculum, schedule: Schedule, verdict: CohortVerdict, update: Array
 ) -> tuple[Array, Array]:
     """Returns the stage, one further or back or the same, and why."""
     stage, deadline = curriculum.stage, jnp.asarray(schedule.deadline)

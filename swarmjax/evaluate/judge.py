@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from swarmjax.evaluate.config import EvaluateConfig
-from swarmjax.evaluate.rays import Scene
+from swarmjax.evaluate.rays import RayScene
 from swarmjax.policy import Policy, PolicyError
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps
@@ -50,7 +50,7 @@ class Judge:
     electronics: Electronics
     model: mujoco.MjModel
     ids: sim_model.Ids
-    scene: Scene
+    scene: RayScene
     geom_robot: np.ndarray
     geom_kind: np.ndarray
     substeps: int
@@ -90,7 +90,7 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
         electronics=electronics,
         model=compiled,
         ids=ids,
-        scene=Scene(
+        scene=RayScene(
             model=compiled,
             ids=ids,
             hull_radius=config.robot.hull_radius,

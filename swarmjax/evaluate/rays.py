@@ -16,7 +16,7 @@ _RAY_GROUPS = np.array([i not in (HULL_GROUP, FLOOR_GROUP) for i in range(6)], n
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Scene:
+class RayScene:
     """What rays are cast in.
 
     Attributes:
@@ -35,7 +35,7 @@ class Scene:
 
 
 def cast_rays(
-    scene: Scene,
+    scene: RayScene,
     data: np.ndarray,
     pose: np.ndarray,
     obstacle: np.ndarray,
@@ -82,7 +82,7 @@ def cast_rays(
     return seen, geoms
 
 
-def brightness(scene: Scene, shades: infrared.Reflectance, geom: np.ndarray) -> np.ndarray:
+def brightness(scene: RayScene, shades: infrared.Reflectance, geom: np.ndarray) -> np.ndarray:
     """Tells how bright the geoms are that rays meet.
 
     Args:
@@ -105,7 +105,9 @@ def brightness(scene: Scene, shades: infrared.Reflectance, geom: np.ndarray) -> 
     return np.take_along_axis(table, geom.reshape(len(geom), -1), axis=1).reshape(geom.shape)
 
 
-def _near(scene: Scene, middle: np.ndarray, place: np.ndarray, obstacle: np.ndarray) -> np.ndarray:
+def _near(
+    scene: RayScene, middle: np.ndarray, place: np.ndarray, obstacle: np.ndarray
+) -> np.ndarray:
     """Tells [A, R, K] whether a ray may meet anything, by circles about it and all things.
 
     Casting a ray costs more than all else, and most have nothing to meet. The walls are taken to

@@ -5,7 +5,7 @@ from typing import NamedTuple
 from swarmjax.policy import Policy
 
 
-class Entry(NamedTuple):
+class LayoutEntry(NamedTuple):
     """One entry of an observation: (quantity - offset) / scale, in units of the quantity."""
 
     name: str
@@ -14,7 +14,7 @@ class Entry(NamedTuple):
     scale: float
 
 
-def entries(policy: Policy) -> list[Entry]:
+def entries(policy: Policy) -> list[LayoutEntry]:
     """Lists the entries of a policy's observation.
 
     Args:
@@ -25,7 +25,7 @@ def entries(policy: Policy) -> list[Entry]:
     """
     layout = policy.meta["observation"]
     keys = ("names", "units", "offset", "scale")
-    return [Entry(*row) for row in zip(*(layout[key] for key in keys), strict=True)]
+    return [LayoutEntry(*row) for row in zip(*(layout[key] for key in keys), strict=True)]
 
 
 def table(policy: Policy) -> str:

@@ -9,7 +9,7 @@ from swarmjax.config.section import MAX_COUNT
 
 # The options of the algorithm that belong to one choice: whose, which, and what null stands for.
 _ALGO_OPTIONS: dict[str, tuple[str, str, float | int]] = {
-    "gae_lambda": ("returns", "gae", 0.95),
+    "gae_lambda": ("advantage", "gae", 0.95),
     "std_decrement": ("exploration", "scheduled", 0.05),
     "std_interval": ("exploration", "scheduled", 250_000),
     "std_floor": ("exploration", "scheduled", 0.1),
@@ -32,6 +32,15 @@ class AlgoConfig(Section):
         ("contact_limit", "contact_price_rate", "contact_price_arrivals"),
         "give a fixed price in the reward instead.",
     )
+    renamed: ClassVar[Mapping[str, str]] = {
+        "rollout": "rollout_length",
+        "minibatches": "num_minibatches",
+        "hidden": "hidden_sizes",
+        "clip": "clip_epsilon",
+        "returns": "advantage",
+        "output": "mean_activation",
+        "gradient": "update_backend",
+    }
 
     name: Literal["ppo", "paper"] = field(
         default="ppo", metadata=about("preset that the numbers started from", derived=True)
@@ -39,13 +48,13 @@ class AlgoConfig(Section):
     policy: Literal["shared", "independent"] = field(
         default="shared", metadata=about("one policy for all agents, or one for each")
     )
-    hidden: tuple[int, ...] = field(
+    hidden_sizes: tuple[int, ...] = field(
         default=(64, 64), metadata=about("widths of the hidden layers", 1, 4096)
     )
     activation: Literal["tanh", "relu", "swish"] = field(
         default="tanh", metadata=about("activation of the hidden layers")
     )
-    output: Literal["linear", "tanh"] = field(
+    mean_activation: Literal["linear", "tanh"] = field(
         default="linear", metadata=about("of the mean action; tanh: within the range of commands")
     )
     initialization: Literal["orthogonal", "uniform"] = field(
@@ -56,17 +65,19 @@ class AlgoConfig(Section):
         default=True,
         metadata=about("by running mean and deviation; false: as they are, within +-10"),
     )
-    rollout: int = field(default=32, metadata=about("control steps per update", 1, MAX_COUNT))
+    rollout_length: int = field(
+        default=32, metadata=about("control steps per update", 1, MAX_COUNT)
+    )
     epochs: int = field(
         default=4, metadata=about("passes over each rollout: 'PPO K epochs'", 1, MAX_COUNT)
     )
-    minibatches: int = field(
+    num_minibatches: int = field(
         default=8, metadata=about("gradient steps per pass; divides arenas", 1, MAX_COUNT)
     )
     discount: float = field(
         default=0.99, metadata=about("per control step: 'discount factor (gamma)'", 0.0, 1.0)
     )
-    returns: Literal["gae", "monte_carlo"] = field(
+    advantage: Literal["gae", "monte_carlo"] = field(
         default="gae",
         metadata=about(
             "gae: bootstrapped, advantages normalised; monte_carlo: summed to the end of episode "
@@ -74,7 +85,7 @@ class AlgoConfig(Section):
         ),
     )
     gae_lambda: float | None = field(
-        default=None, metadata=about("of the advantages; null: 0.95 [returns=gae]", 0.0, 1.0)
+        default=None, metadata=about("of the advantages; null: 0.95 [advantage=gae]", 0.0, 1.0)
     )
     time_out: Literal["bootstrap", "terminal", "leak"] | None = field(
         default=None,
@@ -83,7 +94,7 @@ class AlgoConfig(Section):
             "leak: goes on into the next episode [monte_carlo]; null: the first that is possible"
         ),
     )
-    clip: float = field(
+    clip_epsilon: float = field(
         default=0.2, metadata=about("of the probability ratio: 'PPO epsilon clip'", above=0.0)
     )
     actor_learning_rate: float = field(
@@ -112,7 +123,7 @@ class AlgoConfig(Section):
         default=1.0,
         metadata=about("weight of the squared distance of the mean action from -1..1", 0.0),
     )
-    gradient: Literal["auto", "autodiff", "fused"] = field(
+    update_backend: Literal["auto", "autodiff", "fused"] = field(
         default="auto",
         metadata=about(
             "how gradients are computed; fused: also, minibatches of tiles of valid samples; "
@@ -154,8 +165,8 @@ class AlgoConfig(Section):
     )
 
     def _check(self) -> None:
-        if not self.hidden:
-            raise ConfigError("hidden is []: give at least one layer, as in [64,64].")
+        if not self.hidden_sizes:
+            raise ConfigError("hidden_sizes is []: give at least one layer, as in [64,64].")
         for key, (selector, choice, default) in _ALGO_OPTIONS.items():
             value, chosen = getattr(self, key), getattr(self, selector)
             if chosen != choice and value is not None:
@@ -171,18 +182,18 @@ class AlgoConfig(Section):
                 f"std_floor is {show(self.std_floor)}, but initial_std is "
                 f"{show(self.initial_std)}: give at most {show(self.initial_std)}."
             )
-        if self.output == "tanh" and self.activation != "tanh":
+        if self.mean_activation == "tanh" and self.activation != "tanh":
             raise ConfigError(
-                f"output is tanh, but activation is {self.activation}, and a policy's file has one "
-                "for all layers: give activation=tanh or output=linear."
+                f"mean_activation is tanh, but activation is {self.activation}, and a policy's "
+                "file has one for all layers: give activation=tanh or mean_activation=linear."
             )
 
     def _check_time_out(self) -> None:
-        allowed = _TIME_OUTS[self.returns]
+        allowed = _TIME_OUTS[self.advantage]
         if self.time_out is None:
             object.__setattr__(self, "time_out", allowed[0])
         elif self.time_out not in allowed:
             raise ConfigError(
-                f"time_out is {self.time_out}, but returns is {self.returns}: "
+                f"time_out is {self.time_out}, but advantage is {self.advantage}: "
                 f"give {' or '.join(allowed)}."
             )

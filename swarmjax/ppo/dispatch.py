@@ -41,7 +41,7 @@ def resolve(config: AlgoConfig, observation_size: int, action_size: int) -> Back
     """
     if _fuses(config, observation_size, action_size):
         return "fused"
-    whole = config.minibatches == 1 and jax.default_backend() == "cpu"
+    whole = config.num_minibatches == 1 and jax.default_backend() == "cpu"
     return "blocks" if whole and _has_fast() else "autodiff"
 
 
@@ -69,28 +69,29 @@ def _has_fast() -> bool:
 
 def _fuses(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
     """Whether the kernels compute the gradient; refuses them where they cannot be had."""
-    if config.gradient == "autodiff":
+    if config.update_backend == "autodiff":
         return False
     if not _has_fast():
-        if config.gradient == "auto":
+        if config.update_backend == "auto":
             return False
         raise ConfigError(
-            "algo.gradient is fused, but swarmjax.ppo.fast cannot be imported: give auto or "
+            "algo.update_backend is fused, but swarmjax.ppo.fast cannot be imported: give auto or "
             "autodiff."
         )
     possible = _has_tensor_cores()
     fitting = possible and _fits(config, observation_size, action_size)
-    if config.gradient == "fused" and not possible:
+    if config.update_backend == "fused" and not possible:
         raise ConfigError(
-            "algo.gradient is fused, but there is no NVIDIA GPU of compute capability "
+            "algo.update_backend is fused, but there is no NVIDIA GPU of compute capability "
             f"{_LEAST_GENERATION} or more: give auto or autodiff."
         )
-    if config.gradient == "fused" and not fitting:
+    if config.update_backend == "fused" and not fitting:
         raise ConfigError(
-            f"algo.gradient is fused, but algo.hidden is {show(config.hidden)}, which does not fit "
-            "the chip: give two layers of 16, 32 or 64, or algo.gradient=auto."
+            f"algo.update_backend is fused, but algo.hidden_sizes is {show(config.hidden_sizes)}, "
+            "which does not fit "
+            "the chip: give two layers of 16, 32 or 64, or algo.update_backend=auto."
         )
-    if config.gradient == "auto" and jax.config.jax_default_matmul_precision in _FULL:
+    if config.update_backend == "auto" and jax.config.jax_default_matmul_precision in _FULL:
         return False
     return fitting
 

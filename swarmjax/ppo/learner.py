@@ -178,7 +178,7 @@ def update(
     updates: int,
     backend: Backend = "autodiff",
 ) -> tuple[LearnerState, Metrics]:
-    """Learns from one batch: `config.epochs` passes in `config.minibatches` steps each.
+    """Learns from one batch: `config.epochs` passes in `config.num_minibatches` steps each.
 
     The batch's observations were normalised, and its log densities computed, by the normalizer as
     it is before this update. All epochs keep to that one, so that the ratio of new to old density
@@ -188,7 +188,7 @@ def update(
     Args:
         learner: State before.
         config: The config that made the learner.
-        batch: G groups of N samples; `config.minibatches` divides G.
+        batch: G groups of N samples; `config.num_minibatches` divides G.
         key: Random key, consumed.
         updates: As given to `init`.
         backend: How the update is computed; `dispatch.resolve` chooses.
@@ -216,13 +216,13 @@ def _check(config: AlgoConfig, batch: Batch) -> None:
     chex.assert_rank([batch.valid], 2)
     chex.assert_equal_shape([batch.log_prob, batch.advantage, batch.return_, batch.valid])
     chex.assert_equal_shape_prefix([batch.observation, batch.action, batch.valid], 2)
-    chex.assert_is_divisible(batch.valid.shape[0], config.minibatches)
+    chex.assert_is_divisible(batch.valid.shape[0], config.num_minibatches)
 
 
 def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch) -> Minibatch:
     """What the loss takes, still [G, N, ...]: normalised, and zero where not valid."""
     valid, advantage = batch.valid.astype(bool), batch.advantage
-    if config.returns == "gae":
+    if config.advantage == "gae":
         advantage = _normalize_advantages(advantage, valid)
     samples = Minibatch(
         observation=normalize(learner, batch.observation),
@@ -250,7 +250,7 @@ def _learn(
     config: AlgoConfig, updates: int, begun: Progress, samples: Minibatch, key: jax.Array
 ) -> tuple[Progress, Metrics]:
     """All epochs, in minibatches; the metrics of each are [epochs, minibatches]."""
-    expected_valid = jnp.sum(samples.valid) / config.minibatches
+    expected_valid = jnp.sum(samples.valid) / config.num_minibatches
     step = functools.partial(_step, config, updates, expected_valid)
     epoch = functools.partial(_epoch, config, step, samples)
     return jax.lax.scan(epoch, begun, jax.random.split(key, config.epochs))
@@ -265,7 +265,7 @@ def _epoch(
 ) -> tuple[Progress, Metrics]:
     """One pass over all samples. Whole groups are shuffled: rows to gather, not single samples."""
     groups = samples.valid.shape[0]
-    order = jax.random.permutation(key, groups).reshape(config.minibatches, -1)
+    order = jax.random.permutation(key, groups).reshape(config.num_minibatches, -1)
 
     def learn(progress: Progress, rows: jax.Array) -> tuple[Progress, Metrics]:
         minibatch = jax.tree.map(lambda x: x[rows].reshape(-1, *x.shape[2:]), samples)

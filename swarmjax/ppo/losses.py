@@ -78,13 +78,13 @@ def ppo_loss(
     ratio = jnp.exp(log_ratio)
     value = networks.value(params, config, minibatch.observation)
     metrics = {
-        "policy_loss": -mean(_clipped_surrogate(ratio, minibatch.advantage, config.clip)),
+        "policy_loss": -mean(_clipped_surrogate(ratio, minibatch.advantage, config.clip_epsilon)),
         "value_loss": mean(0.5 * (value - minibatch.return_) ** 2),
         "bound_loss": mean(jnp.sum(networks.beyond_range(action_mean) ** 2, axis=-1)),
         "entropy": mean(networks.entropy(std)),
         # Unbiased and never negative: Schulman 2020, "Approximating KL Divergence", estimator k3.
         "approx_kl": mean(ratio - 1.0 - log_ratio),
-        "clip_fraction": mean(jnp.abs(ratio - 1.0) > config.clip),
+        "clip_fraction": mean(jnp.abs(ratio - 1.0) > config.clip_epsilon),
     }
     loss = (
         metrics["policy_loss"]

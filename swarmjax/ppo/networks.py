@@ -34,7 +34,7 @@ class _Torso(nn.Module):
 
     @nn.compact
     def __call__(self, features: jax.Array) -> jax.Array:
-        for index, width in enumerate(self.config.hidden):
+        for index, width in enumerate(self.config.hidden_sizes):
             layer = _layer(self.config, features, width, _HIDDEN_GAIN, f"hidden_{index}")
             features = _ACTIVATIONS[self.config.activation](layer(features))
         return features
@@ -56,7 +56,7 @@ class _Actor(nn.Module):
             (self.action_size,),
             jnp.float32,
         )
-        return _OUTPUTS[self.config.output](layer(features)), log_std
+        return _OUTPUTS[self.config.mean_activation](layer(features)), log_std
 
 
 class _Critic(nn.Module):

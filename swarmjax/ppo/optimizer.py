@@ -32,7 +32,7 @@ def make(config: AlgoConfig, updates: int) -> optax.GradientTransformation:
     Returns:
         An optimiser of `{"actor": .., "critic": ..}`.
     """
-    steps = updates * config.epochs * config.minibatches
+    steps = updates * config.epochs * config.num_minibatches
 
     def adam(learning_rate: float) -> optax.GradientTransformation:
         schedule = {

@@ -29,7 +29,7 @@ from swarmjax.replay import page as replay_page
 from swarmjax.replay import record
 from swarmjax.replay import video as replay_video
 from swarmjax.replay.config import ReplayConfig
-from swarmjax.replay.record import Episode
+from swarmjax.replay.record import ReplayEpisode
 from swarmjax.task.stage_files import load_levels
 
 
@@ -42,7 +42,7 @@ class Pick(NamedTuple):
 
 def replay(
     settings: ReplayConfig, entrants: Sequence[Entrant], progress: Progress
-) -> list[Episode]:
+) -> list[ReplayEpisode]:
     """Records the episodes that are asked for.
 
     Args:
@@ -139,7 +139,7 @@ def _record(
     chosen: Sequence[Cell],
     picks: Sequence[Pick],
     report: Callable[[int], None],
-) -> list[Episode]:
+) -> list[ReplayEpisode]:
     """Records episodes, those of one cell side by side."""
     found = {}
     for i in sorted({pick.cell for pick in picks}):
@@ -153,7 +153,7 @@ def _record(
         for pick, by_policy in zip(mine, zip(*runs, strict=True), strict=True):
             number = int(cell.episodes[pick.row])
             label = f"level {number}" if len(chosen) == 1 else f"{cell.name}, level {number}"
-            found[pick] = Episode(label, number, list(by_policy))
+            found[pick] = ReplayEpisode(label, number, list(by_policy))
     return [found[pick] for pick in picks]
 
 

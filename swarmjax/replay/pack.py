@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from swarmjax.config import ConfigError
-from swarmjax.replay.record import Episode, Recording
+from swarmjax.replay.record import Recording, ReplayEpisode
 
 LENGTH = 2e-4  # m; poses are at most half of it off
 ANGLE = 1e-3  # rad; likewise
@@ -32,7 +32,7 @@ _PALETTE = (
 _GOLDEN = 0.381966  # of a turn: hues that are this far apart stay apart, however many there are
 
 
-def pack(about: Mapping[str, Any], episodes: Sequence[Episode], reach: float) -> bytes:
+def pack(about: Mapping[str, Any], episodes: Sequence[ReplayEpisode], reach: float) -> bytes:
     """Packs recordings.
 
     Args:
@@ -133,7 +133,7 @@ def _columns(recording: Recording, reach: float) -> dict[str, np.ndarray]:
     return {name: np.rint(each).reshape(rows, -1) for name, each in series.items()}
 
 
-def _describe(episode: Episode) -> dict[str, Any]:
+def _describe(episode: ReplayEpisode) -> dict[str, Any]:
     """Returns what a level's header says, lengths in m to 10 um."""
     scene = episode.runs[0].scene
     sensor = scene.sensor

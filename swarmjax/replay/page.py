@@ -11,7 +11,7 @@ from swarmjax import epuck, provenance
 from swarmjax.policy import Policy
 from swarmjax.replay import pack
 from swarmjax.replay.config import ReplayConfig
-from swarmjax.replay.record import Episode
+from swarmjax.replay.record import ReplayEpisode
 from swarmjax.sim import gaps
 
 _SCRIPTS = ("replay_data.js", "replay_draw.js", "replay.js")
@@ -20,7 +20,7 @@ _SCRIPTS = ("replay_data.js", "replay_draw.js", "replay.js")
 def page(
     settings: ReplayConfig,
     policies: Sequence[Policy],
-    episodes: Sequence[Episode],
+    episodes: Sequence[ReplayEpisode],
     words: str,
 ) -> str:
     """Lays the page out.

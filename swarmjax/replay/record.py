@@ -17,7 +17,7 @@ from swarmjax.task.level import Level
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Scene:
+class ReplayScene:
     """What stands still in an episode.
 
     Attributes:
@@ -49,7 +49,7 @@ class Recording:
         arrival: [R] control steps until it arrived, 0 if it has not.
     """
 
-    scene: Scene
+    scene: ReplayScene
     pose: np.ndarray
     ray: np.ndarray
     distance: np.ndarray
@@ -59,7 +59,7 @@ class Recording:
     arrival: np.ndarray
 
 
-class Episode(NamedTuple):
+class ReplayEpisode(NamedTuple):
     """What became of one level.
 
     Attributes:
@@ -202,7 +202,7 @@ def _look(judge: Judge, arenas: Arenas) -> Frame:
     )
 
 
-def _cut(frames: Frame, scene: Scene, reach: float, earning: RewardConfig) -> Recording:
+def _cut(frames: Frame, scene: ReplayScene, reach: float, earning: RewardConfig) -> Recording:
     """Makes a recording of the frames of one arena [N, ...], up to the end of its episode."""
     over = frames.arrived.all(axis=-1)
     frames = Frame(*(field[: over.argmax() + 1 if over.any() else None] for field in frames))
@@ -231,11 +231,11 @@ def _cut(frames: Frame, scene: Scene, reach: float, earning: RewardConfig) -> Re
     )
 
 
-def _scene(level: Level, mount: infrared.Mount | None) -> Scene:
+def _scene(level: Level, mount: infrared.Mount | None) -> ReplayScene:
     """Keeps what stands still in an arena, and how its sensors sit."""
     at_origin = np.zeros((len(level.target), 3))
     origin, toward = infrared.rays(at_origin, np, mount)
-    return Scene(
+    return ReplayScene(
         side=float(level.side),
         target=level.target.astype(float),
         box=level.obstacle[level.obstacle_present].astype(float),

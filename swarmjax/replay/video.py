@@ -20,7 +20,7 @@ from swarmjax.atomic_file import replacing
 from swarmjax.config import ConfigError
 from swarmjax.replay import pack
 from swarmjax.replay.config import ReplayConfig
-from swarmjax.replay.record import Episode, Recording
+from swarmjax.replay.record import Recording, ReplayEpisode
 from swarmjax.sim.model import HALF_HEIGHT
 
 FRAME_RATE = 30  # 1/s
@@ -67,7 +67,7 @@ def check() -> None:
 def write(
     path: Path,
     settings: ReplayConfig,
-    episodes: Sequence[Episode],
+    episodes: Sequence[ReplayEpisode],
     report: Callable[[int], None] = lambda _: None,
 ) -> None:
     """Films episodes one after the other, two policies side by side.
@@ -91,7 +91,7 @@ def write(
                 report(1)
 
 
-def count(settings: ReplayConfig, episodes: Sequence[Episode]) -> int:
+def count(settings: ReplayConfig, episodes: Sequence[ReplayEpisode]) -> int:
     """Counts the pictures of a film.
 
     Args:
@@ -120,7 +120,7 @@ def rows(settings: ReplayConfig, runs: Sequence[Recording]) -> list[int]:
     return moving + [last] * round(HOLD * FRAME_RATE)
 
 
-def _pictures(settings: ReplayConfig, episodes: Sequence[Episode]) -> Iterator[np.ndarray]:
+def _pictures(settings: ReplayConfig, episodes: Sequence[ReplayEpisode]) -> Iterator[np.ndarray]:
     """Draws the pictures [height, width, 3]."""
     for _, _, runs in episodes:
         width = HEIGHT * 16 // 9 if len(runs) == 1 else HEIGHT * 4 // 3

@@ -150,7 +150,7 @@ def _figure(name: str, png: bytes) -> str:
 
 def _decisions(history: History) -> str:
     """Tables promotions and demotions, and of the reweighings of a seed their number and last."""
-    step = history.config.arenas * history.config.algo.rollout
+    step = history.config.arenas * history.config.algo.rollout_length
     rows = [
         (
             row["seed"],

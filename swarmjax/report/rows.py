@@ -112,7 +112,7 @@ def trained_lately(history: History) -> np.ndarray:
     long may a verdict still come in. After that it is what the stage was left with.
     """
     task, algo = history.config.task, history.config.algo
-    lag = _COHORTS_OF_A_VERDICT * math.ceil(task.step_limit / algo.rollout)
+    lag = _COHORTS_OF_A_VERDICT * math.ceil(task.step_limit / algo.rollout_length)
     updates = history.updates[None, :, None]
     given = np.where(history.weights > 0.0, updates, -np.inf)
     return updates - np.maximum.accumulate(given, axis=1) <= lag

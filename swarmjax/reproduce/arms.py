@@ -19,7 +19,7 @@ from swarmjax.run.trainer import Stop
 _EXPANDED, _MODERN = "_expanded", "modern_"
 _STAGES = {"curriculum": "paper_curriculum", "baseline": "paper6"}
 # Of the default 128 arenas of 32 control steps a million of them are 244 updates; of these 1,953.
-_FEW = ("arenas=16", "algo.rollout=32")
+_FEW = ("arenas=16", "algo.rollout_length=32")
 
 
 def settings(given: ReproduceConfig, arm: Arm, out: Path) -> TrainConfig:
@@ -53,8 +53,11 @@ def settings(given: ReproduceConfig, arm: Arm, out: Path) -> TrainConfig:
         [
             "algo=paper",
             *shared,
-            *(f"algo.{key}={getattr(given, key)}" for key in ("rollout", "epochs", "time_out")),
-            *([f"start={out / kind}"] if expanded else []),
+            *(
+                f"algo.{key}={getattr(given, key)}"
+                for key in ("rollout_length", "epochs", "time_out")
+            ),
+            *([f"init_from={out / kind}"] if expanded else []),
         ]
     )
     if not arm.startswith(_MODERN):
@@ -93,7 +96,7 @@ def _go_on(made: TrainConfig, directory: Path) -> TrainConfig:
     if not (directory / "config.json").exists():
         return made
     stored = from_stored(read_config(directory), "stored ")
-    kept = replace(made, run=replace(made.run, dir=stored.run.dir), start=stored.start)
+    kept = replace(made, run=replace(made.run, dir=stored.run.dir), init_from=stored.init_from)
     if kept != stored:
         raise ConfigError(
             f"{directory} holds a run of another config than this version makes of the "

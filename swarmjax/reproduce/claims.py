@@ -110,7 +110,7 @@ class Claim:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verdict:
+class ClaimVerdict:
     """What became of a claim.
 
     Attributes:
@@ -126,12 +126,12 @@ class Verdict:
     findings: tuple[Finding, ...]
 
 
-def judge(data: Reproduction) -> list[Verdict]:
+def judge(data: Reproduction) -> list[ClaimVerdict]:
     """Judges every claim of the paper."""
     return [verdict(data, claim) for claim in CLAIMS]
 
 
-def verdict(data: Reproduction, claim: Claim) -> Verdict:
+def verdict(data: Reproduction, claim: Claim) -> ClaimVerdict:
     """Judges a claim by all of its readings."""
     findings = tuple(finding(data, reading) for reading in claim.readings)
     held = {each.holds for each in findings}
@@ -145,7 +145,7 @@ def verdict(data: Reproduction, claim: Claim) -> Verdict:
         reason = "an arm is missing"
     else:
         reason = "readings disagree" if {True, False} <= held else "a reading is open"
-    return Verdict(claim=claim, outcome=outcome, reason=reason, findings=findings)
+    return ClaimVerdict(claim=claim, outcome=outcome, reason=reason, findings=findings)
 
 
 def finding(data: Reproduction, reading: Reading) -> Finding:
@@ -167,7 +167,7 @@ def goals(data: Reproduction) -> list[Finding]:
     return [finding(data, goal) for goal in GOALS]
 
 
-def markdown(verdicts: Sequence[Verdict]) -> str:
+def markdown(verdicts: Sequence[ClaimVerdict]) -> str:
     """Tables verdicts, for a page of Markdown."""
     rows = []
     for each in verdicts:

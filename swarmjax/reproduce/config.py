@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
 from swarmjax.config import ConfigError, Section, about, build, files, to_dict
-from swarmjax.config.section import MAX_COUNT
+from swarmjax.config.section import MAX_COUNT, modernise
 
 _REPRODUCE_RESUME_KEYS = ("resume", "minutes", "device", "arms", "episodes", "workers")
 
@@ -36,6 +36,7 @@ class ReproduceConfig(Section):
     """
 
     command: ClassVar[str] = "reproduce"
+    renamed: ClassVar[Mapping[str, str]] = {"rollout": "rollout_length"}
 
     seeds: int = field(default=10, metadata=about("of each arm; an interval takes 3", 1, 4096))
     seed: int = field(default=0, metadata=about("the first of them", 0, MAX_COUNT))
@@ -52,7 +53,7 @@ class ReproduceConfig(Section):
     arms: tuple[Arm, ...] = field(
         default=ARMS, metadata=about("which runs; *_expanded goes on with the one before it")
     )
-    rollout: int = field(
+    rollout_length: int = field(
         default=6000, metadata=about("control steps of an update of the paper's", 1, MAX_COUNT)
     )
     epochs: int = field(
@@ -99,10 +100,10 @@ class ReproduceConfig(Section):
                 f"seeds is {self.seeds}, too few for an interval: give {LEAST_SEEDS} or more."
             )
         for key in ("budget", "fine_tune"):
-            if getattr(self, key) < self.rollout:
+            if getattr(self, key) < self.rollout_length:
                 raise ConfigError(
                     f"{key} is {getattr(self, key)}, which ends before the first update: give at "
-                    f"least {self.rollout}, the control steps of one."
+                    f"least {self.rollout_length}, the control steps of one."
                 )
         if not self.arms:
             raise ConfigError(f"arms is []: give some of {', '.join(ARMS)}.")
@@ -136,5 +137,7 @@ def load_reproduce(
                 f"{word} cannot be given: resume keeps the rest of the stored reproduction and "
                 f"takes {', '.join(_REPRODUCE_RESUME_KEYS)} only."
             )
-    kept = to_dict(build(ReproduceConfig, stored, "stored ")) | {"minutes": None}
+    kept = to_dict(build(ReproduceConfig, modernise(ReproduceConfig, stored), "stored ")) | {
+        "minutes": None
+    }
     return build(ReproduceConfig, kept | files.values(words))

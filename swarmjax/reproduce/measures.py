@@ -12,52 +12,52 @@ from typing import Literal
 import numpy as np
 
 from swarmjax.evaluate.statistics import Interval
-from swarmjax.reproduce.rows import Log, Reproduction
+from swarmjax.reproduce.rows import Reproduction, RunLog
 
 WINDOW = 20  # episodes of a rolling mean: "an averaging window of 20 values" (Figure 7)
 STEADY = 0.8  # share of a window that counts as success: what promotes from a stage, too
 KEPT = 0.5  # share below which a later window loses it; why it is not 0.8, `steady` says
 
 type Axis = Literal["episode", "steps"]
-type Measure = Callable[[Log], np.ndarray]  # [E] of a log
+type Measure = Callable[[RunLog], np.ndarray]  # [E] of a log
 
 
-def first_reached(log: Log) -> np.ndarray:
+def first_reached(log: RunLog) -> np.ndarray:
     """Whether [E] robot 1 reached its target: the paper's "the robot"."""
     return log.reached[:, 0]
 
 
-def all_reached(log: Log) -> np.ndarray:
+def all_reached(log: RunLog) -> np.ndarray:
     """Whether [E] every robot that took part reached its target."""
     return (log.reached | ~log.present).all(axis=1)
 
 
-def targets(log: Log) -> np.ndarray:
+def targets(log: RunLog) -> np.ndarray:
     """Share [E] of the targets that were reached: the paper's success rate (section 3.2)."""
     return log.reached.sum(axis=1) / _robots(log)
 
 
-def first_reward(log: Log) -> np.ndarray:
+def first_reward(log: RunLog) -> np.ndarray:
     """Cumulative reward [E] of robot 1, m: Figure 7 is "for one robot"."""
     return log.reward[:, 0]
 
 
-def mean_reward(log: Log) -> np.ndarray:
+def mean_reward(log: RunLog) -> np.ndarray:
     """Cumulative reward [E], mean over the robots that took part, m."""
     return log.reward.sum(axis=1) / _robots(log)
 
 
-def sensed_share(log: Log) -> np.ndarray:
+def sensed_share(log: RunLog) -> np.ndarray:
     """Share [E] of robot steps with something within infrared range: the paper's collisions."""
     return log.sensed.sum(axis=1) / np.maximum(log.robot_steps.sum(axis=1), 1)
 
 
-def contacts(log: Log) -> np.ndarray:
+def contacts(log: RunLog) -> np.ndarray:
     """Contacts [E] per robot that took part."""
     return log.contacts.sum(axis=1) / _robots(log)
 
 
-def _robots(log: Log) -> np.ndarray:
+def _robots(log: RunLog) -> np.ndarray:
     return log.present.sum(axis=1)
 
 
@@ -110,7 +110,7 @@ def steady(success: np.ndarray, window: int = WINDOW, share: float = STEADY) -> 
     return int(good.argmax()) if good.any() else None
 
 
-def along(log: Log, axis: Axis) -> np.ndarray:
+def along(log: RunLog, axis: Axis) -> np.ndarray:
     """Where [E] episodes are: their numbers in the run, or the arena steps at which they ended."""
     return log.number if axis == "episode" else log.arena_steps
 

@@ -16,7 +16,7 @@ from swarmjax.evaluate import statistics
 from swarmjax.evaluate.statistics import iqm
 from swarmjax.reproduce import claims, measures
 from swarmjax.reproduce import rows as reproduce_rows
-from swarmjax.reproduce.claims import Verdict
+from swarmjax.reproduce.claims import ClaimVerdict
 from swarmjax.reproduce.measures import NUMBER, PLACE, SHARE, Axis, Measure, Unit
 from swarmjax.reproduce.rows import ARMS, EXPANDED, LAST, Reproduction
 
@@ -73,7 +73,7 @@ def write(out: Path) -> Path:
 
 def page(
     data: Reproduction,
-    verdicts: Sequence[Verdict],
+    verdicts: Sequence[ClaimVerdict],
     plots: "Sequence[Plot]",
     figures: Mapping[str, bytes],
 ) -> str:
@@ -187,14 +187,14 @@ def _lacking(data: Reproduction) -> str:
     return f'<p class="lacking">{escape(text)}</p>\n'
 
 
-def _counts(verdicts: Sequence[Verdict]) -> str:
+def _counts(verdicts: Sequence[ClaimVerdict]) -> str:
     """Says how many claims came to what."""
     found = [each.outcome for each in verdicts]
     counts = ", ".join(f"{found.count(outcome)} {outcome}" for outcome in _MARKS)
     return f"Of {len(found)} claims: {counts}."
 
 
-def _verdicts(verdicts: Sequence[Verdict]) -> str:
+def _verdicts(verdicts: Sequence[ClaimVerdict]) -> str:
     """Tables the verdicts, with the numbers that say so."""
     rows = []
     for each in verdicts:
@@ -215,7 +215,7 @@ def _verdicts(verdicts: Sequence[Verdict]) -> str:
     return f'<div class="scroll"><table class="verdicts">\n{heads}{"".join(rows)}</table></div>\n'
 
 
-def _criteria(verdicts: Sequence[Verdict]) -> str:
+def _criteria(verdicts: Sequence[ClaimVerdict]) -> str:
     """Lists what would bear each claim out."""
     lines = [
         f"<dt>{escape(each.claim.name)}</dt><dd>&ldquo;{escape(each.claim.quote)}&rdquo;: "

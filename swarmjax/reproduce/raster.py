@@ -8,7 +8,7 @@ from matplotlib.patches import Patch
 
 from swarmjax.reproduce import measures
 from swarmjax.reproduce.measures import Axis, Measure
-from swarmjax.reproduce.rows import Log, Reproduction
+from swarmjax.reproduce.rows import Reproduction, RunLog
 from swarmjax.reproduce.style import AXES, PAPER, WIDTH, thousands
 
 _COLUMNS = 700  # of a raster: about as many as the dots along it
@@ -58,7 +58,7 @@ def raster(data: Reproduction, arms: tuple[str, ...], *, axis: Axis, stage: str 
 
 
 def columns(
-    log: Log, success: Measure, axis: Axis, stage: str | None, edges: np.ndarray
+    log: RunLog, success: Measure, axis: Axis, stage: str | None, edges: np.ndarray
 ) -> np.ndarray:
     """Shares of success in the columns of a raster.
 
@@ -89,7 +89,7 @@ def columns(
     return np.where(ended, found, under_way)
 
 
-def _edges(logs: list[Log], axis: Axis) -> np.ndarray:
+def _edges(logs: list[RunLog], axis: Axis) -> np.ndarray:
     """Edges of the columns of a raster: one column an episode, if they are not too many."""
     last = max(int(measures.along(log, axis)[-1]) for log in logs)
     if axis == "episode":

@@ -37,7 +37,7 @@ _MAPS = ("settings", "versions", "device", "commit", "seconds", "compile_s")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Log:
+class RunLog:
     """Episodes of one seed, in the order in which they ended.
 
     Attributes:
@@ -65,13 +65,13 @@ class Log:
     def __len__(self) -> int:
         return len(self.number)
 
-    def on(self, stage: str | None) -> "Log":
+    def on(self, stage: str | None) -> "RunLog":
         """The episodes of one stage, with their numbers in the whole run; None for all."""
         return self if stage is None else self.where(self.stage == stage)
 
-    def where(self, chosen: np.ndarray) -> "Log":
+    def where(self, chosen: np.ndarray) -> "RunLog":
         """The episodes of a mask [E]."""
-        return Log(**{name: values[chosen] for name, values in vars(self).items()})
+        return RunLog(**{name: values[chosen] for name, values in vars(self).items()})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,7 +87,7 @@ class Reproduction:
 
     facts: Row
     seeds: tuple[int, ...]
-    logs: dict[str, tuple[Log, ...]]
+    logs: dict[str, tuple[RunLog, ...]]
     judged: dict[tuple[str, str], dict[str, np.ndarray]]
 
     def lacking(self, arms: Sequence[str]) -> list[str]:
@@ -142,7 +142,7 @@ def _check_format(found: Row, path: Path) -> None:
         raise ConfigError(f"{path} has format {found.get('format')!r}, and {FORMAT} is read here.")
 
 
-def _read_logs(run: Path, seeds: Sequence[int]) -> tuple[Log, ...]:
+def _read_logs(run: Path, seeds: Sequence[int]) -> tuple[RunLog, ...]:
     """Reads the episodes of an arm, by seed."""
     if not (run / EPISODES).exists():
         raise ConfigError(f"{run} has no {EPISODES}: its arm is said to be finished.")
@@ -193,7 +193,7 @@ _FITS = {
 }
 
 
-def _log(rows: list[Row]) -> Log:
+def _log(rows: list[Row]) -> RunLog:
     """Lays the episodes of a seed out, by the arena steps at which they ended."""
     rows = sorted(rows, key=lambda row: row["arena_steps"])
     robots = np.array([row["robots"] for row in rows])
@@ -203,7 +203,7 @@ def _log(rows: list[Row]) -> Log:
         flat = np.concatenate([row[key] for row in rows])
         columns[key] = np.zeros(present.shape, flat.dtype)
         columns[key][present] = flat
-    return Log(
+    return RunLog(
         number=np.arange(1, len(rows) + 1),
         arena_steps=np.array([row["arena_steps"] for row in rows]),
         stage=np.array([row["stage"] for row in rows]),

@@ -90,7 +90,8 @@ def _first_state(
     if update > settings.updates:
         raise ConfigError(
             f"budget is {settings.budget}, but {settings.resume} has spent "
-            f"{update * settings.arenas * settings.algo.rollout} already: give at least that."
+            f"{update * settings.arenas * settings.algo.rollout_length} already: give at least "
+            "that."
         )
     if any(name.startswith(_PRICE) for name in leaves):
         skipped = [*skipped, f"a price on contacts (algo.contact_limit) in {settings.resume}"]
@@ -150,7 +151,7 @@ def _opening(program: Built) -> str:
     """Says what is about to be trained, where, and what steps the robots."""
     settings, engine = program.config, program.world.physics.engine
     names = ", ".join(stage.name for stage in settings.stage)
-    steps, every = settings.arenas * settings.algo.rollout, seeds.numbers(settings)
+    steps, every = settings.arenas * settings.algo.rollout_length, seeds.numbers(settings)
     how = {"vmap": "side by side", "map": "in turn", "cores": "spread over cores"}[
         settings.seeds_by
     ]
@@ -188,7 +189,7 @@ def _write_results(run: Path, program: Built, state: TrainState, tally: Tally) -
     for seed in every:
         file = seed_path(run / POLICY, settings, seed)
         write_policy(file, leaves, settings, tally.update, seed)
-    steps = tally.update * settings.arenas * settings.algo.rollout
+    steps = tally.update * settings.arenas * settings.algo.rollout_length
     train_s, transitions = tally.earlier_s + tally.seconds, tally.transitions
     summary = {
         "stage": settings.stage_name,
@@ -209,7 +210,7 @@ def _write_results(run: Path, program: Built, state: TrainState, tally: Tally) -
         "impl": engine.impl,
         "solver": engine.solver,
         "stepped_by": engine.label,
-        "gradient": program.backend,
+        "update_backend": program.backend,
         "device": provenance.device(),
         "versions": provenance.versions(),
         "commit": provenance.commit(),

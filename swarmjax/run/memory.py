@@ -106,7 +106,7 @@ def refusal(settings: TrainConfig) -> Iterator[None]:
 def fill(
     settings: TrainConfig, measure: Callable[[TrainConfig], int], available: int | None
 ) -> tuple[TrainConfig, str]:
-    """Chooses `arenas`: `algo.minibatches` times a power of two, as many as fit.
+    """Chooses `arenas`: `algo.num_minibatches` times a power of two, as many as fit.
 
     Args:
       settings: of the run, with any number of arenas.
@@ -150,7 +150,7 @@ def line(
     """
     # One update each: a call's metrics are no part of the line, and the same programs serve
     # whatever the budget.
-    control_steps = settings.algo.rollout
+    control_steps = settings.algo.rollout_length
     needed = [measure(replace(settings, arenas=n, budget=n * control_steps)) for n in sizes]
     if len(sizes) == 1:
         return 0.0, needed[0] / sizes[0]
@@ -160,7 +160,7 @@ def line(
 
 def _sizes(settings: TrainConfig) -> list[int]:
     """Numbers that `arenas` may be by all the rest of the config, rising."""
-    found = [replace(settings, arenas=settings.algo.minibatches).arenas]
+    found = [replace(settings, arenas=settings.algo.num_minibatches).arenas]
     with contextlib.suppress(ConfigError):
         while True:
             found.append(replace(settings, arenas=2 * found[-1]).arenas)
@@ -180,9 +180,9 @@ def _advice(settings: TrainConfig, how: str, arenas: float) -> str:
     """Says what to give instead: arenas, rounded down to what can be trained, if that helps."""
     if settings.resume is not None:  # it keeps all that the memory depends on
         return "go on with it on a device that has more"
-    fewest = settings.algo.minibatches
+    fewest = settings.algo.num_minibatches
     if settings.arenas == fewest:
-        return "give fewer seeds, sim.max_robots or algo.rollout"
+        return "give fewer seeds, sim.max_robots or algo.rollout_length"
     return f"give {how} {max(int(arenas) // fewest, 1) * fewest}"
 
 

@@ -108,10 +108,10 @@ def seed_path(path: Path, trained: TrainConfig, seed: int) -> Path:
 
 def _squashed(arrays: dict[str, np.ndarray], algo: AlgoConfig) -> dict[str, np.ndarray]:
     """Writes an output of tanh as one more hidden layer, before a last one that changes nothing."""
-    if algo.output == "linear":
+    if algo.mean_activation == "linear":
         return arrays
     parts = ("kernel", "bias")
-    last = {f"actor/hidden_{len(algo.hidden)}/{p}": arrays[f"actor/mean/{p}"] for p in parts}
+    last = {f"actor/hidden_{len(algo.hidden_sizes)}/{p}": arrays[f"actor/mean/{p}"] for p in parts}
     learners, actions = arrays["actor/mean/bias"].shape
     mean = np.tile(np.eye(actions, dtype=np.float32), (learners, 1, 1))
     zero = np.zeros((learners, actions), np.float32)
@@ -138,9 +138,9 @@ def write_policy(path: Path, leaves: Leaves, trained: TrainConfig, update: int, 
         for i in range(sum(name.endswith("/bias") for name in arrays) - 1)
     )
     found = (len(arrays["actor/log_std"]), widths)
-    if found != (trained.learners, trained.algo.hidden):
+    if found != (trained.learners, trained.algo.hidden_sizes):
         raise CheckpointError(
             f"the checkpoint holds {found[0]} learners of layers {list(widths)}, but the config "
-            f"says {trained.learners} of {list(trained.algo.hidden)}: it is of another run."
+            f"says {trained.learners} of {list(trained.algo.hidden_sizes)}: it is of another run."
         )
     policy_file.write(path, _squashed(arrays, trained.algo), policy_meta(trained, update, seed))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from swarmjax.config import ConfigError, Section, about, build, files, to_dict
-from swarmjax.config.section import MAX_COUNT
+from swarmjax.config.section import MAX_COUNT, modernise
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.task import stage_files
 from swarmjax.task.config import check_realism
@@ -16,12 +16,6 @@ from swarmjax.training.config import ProgramConfig
 # Arenas of all seeds whose episodes are written down one by one: more end thousands a second.
 MOST_LOGGED = 8192
 
-
-# What older versions wrote: section, keys that are gone, and values by key that have a new name.
-_FORMER: tuple[tuple[str, tuple[str, ...], dict[str, dict[str, str]]], ...] = (
-    ("algo", tuple(AlgoConfig.removed), {}),
-    ("sim", (), {"solver": {"newton": "mjx"}}),
-)
 
 # What may change when a run goes on; everything else fixes what it has computed so far.
 _RESUME_KEYS = ("budget", "resume", "run.*")
@@ -67,16 +61,17 @@ class TrainConfig(ProgramConfig):
     """Everything that fixes a training run: its program, and where it is written."""
 
     command: ClassVar[str] = "train"
+    renamed: ClassVar[Mapping[str, str]] = {"start": "init_from", "start_std": "init_from_std"}
 
     run: RunConfig = field(default_factory=RunConfig)
     resume: str | None = field(default=None, metadata=about("run directory to go on with"))
-    start: str | None = field(
+    init_from: str | None = field(
         default=None,
         metadata=about("run directory whose networks and normaliser a new run begins with"),
     )
-    start_std: Literal["keep", "reset"] = field(
+    init_from_std: Literal["keep", "reset"] = field(
         default="keep",
-        metadata=about("exploration that start begins with: as learned, or algo.initial_std"),
+        metadata=about("exploration that init_from begins with: as learned, or algo.initial_std"),
     )
     stage_name: str = field(
         default="",
@@ -90,10 +85,10 @@ class TrainConfig(ProgramConfig):
                 f"{MAX_COUNT}: give at most {MAX_COUNT - self.seeds + 1}."
             )
         self._check_stages()
-        if self.arenas % self.algo.minibatches:
+        if self.arenas % self.algo.num_minibatches:
             raise ConfigError(
-                f"arenas is {self.arenas}, but algo.minibatches is {self.algo.minibatches}: "
-                f"give a multiple of {self.algo.minibatches}."
+                f"arenas is {self.arenas}, but algo.num_minibatches is "
+                f"{self.algo.num_minibatches}: give a multiple of {self.algo.num_minibatches}."
             )
         self._check_budget()
         self._check_counts()
@@ -122,7 +117,7 @@ class TrainConfig(ProgramConfig):
                     )
 
     def _check_counts(self) -> None:
-        steps = max(self.task.step_limit, self.algo.rollout)
+        steps = max(self.task.step_limit, self.algo.rollout_length)
         most = MAX_COUNT // (self.sim.max_robots * steps)
         if self.arenas > most:
             raise ConfigError(
@@ -151,13 +146,13 @@ class TrainConfig(ProgramConfig):
             )
 
     def _check_budget(self) -> None:
-        update = self.arenas * self.algo.rollout
+        update = self.arenas * self.algo.rollout_length
         if self.updates < 1:
             raise ConfigError(
-                f"budget is {self.budget}, but one update takes arenas x algo.rollout = {update} "
-                f"control steps: give at least {update}."
+                f"budget is {self.budget}, but one update takes arenas x algo.rollout_length = "
+                f"{update} control steps: give at least {update}."
             )
-        most = MAX_COUNT // (self.algo.epochs * self.algo.minibatches)
+        most = MAX_COUNT // (self.algo.epochs * self.algo.num_minibatches)
         if self.updates > most:
             raise ConfigError(
                 f"budget is {self.budget}, which is {self.updates} updates of {update} control "
@@ -177,23 +172,7 @@ def from_stored(stored: Mapping[str, Any], where: str = "") -> TrainConfig:
     Raises:
         ConfigError: it is unsound.
     """
-    return build(TrainConfig, _modernise(stored), where)
-
-
-def _modernise(stored: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Give plain data of an older version the names of this one."""
-    if not isinstance(stored, Mapping):
-        return stored
-    found = dict(stored)
-    for name, gone, renamed in _FORMER:
-        section = found.get(name)
-        if isinstance(section, Mapping):
-            kept = {key: value for key, value in section.items() if key not in gone}
-            for key, values in renamed.items():
-                if isinstance(kept.get(key), str):
-                    kept[key] = values.get(kept[key], kept[key])
-            found[name] = kept
-    return found
+    return build(TrainConfig, modernise(TrainConfig, stored), where)
 
 
 def read_config(run: Path) -> dict:
@@ -226,7 +205,7 @@ def load_train(overrides: Sequence[str], *, auto: bool = False) -> TrainConfig:
     Args:
         overrides: the words.
         auto: whether `arenas=auto` may be among them. It leaves the fewest arenas there can be,
-            algo.minibatches; `memory.fill` chooses how many there will be.
+            algo.num_minibatches; `memory.fill` chooses how many there will be.
 
     Raises:
         ConfigError: a word, a choice, a file or a value is unsound.
@@ -234,11 +213,11 @@ def load_train(overrides: Sequence[str], *, auto: bool = False) -> TrainConfig:
 
     def complete(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:
         if auto and mapping.get("arenas") == "auto":
-            mapping["arenas"] = build(AlgoConfig, mapping.get("algo", {}), "algo.").minibatches
-        if "start_std" in mapping and mapping.get("start") is None:
+            mapping["arenas"] = build(AlgoConfig, mapping.get("algo", {}), "algo.").num_minibatches
+        if "init_from_std" in mapping and mapping.get("init_from") is None:
             raise ConfigError(
-                f"start_std is {mapping['start_std']}, but there is no start: give start=DIR with "
-                "it, the directory of a run."
+                f"init_from_std is {mapping['init_from_std']}, but there is no init_from: give "
+                "init_from=DIR with it, the directory of a run."
             )
         stages = stage_files.expand(mapping.get("stage", {}), chosen["stage"])
         return mapping | {"stage": stages, "stage_name": chosen["stage"]}

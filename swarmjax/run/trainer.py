@@ -294,7 +294,7 @@ def _recorder(run: Path, program: Built, done: int) -> Recorder:
         tensorboard=settings.run.tensorboard,
         episodes=settings.run.episodes,
         update=done,
-        arena_steps=done * settings.arenas * settings.algo.rollout,
+        arena_steps=done * settings.arenas * settings.algo.rollout_length,
     )
 
 
@@ -338,7 +338,7 @@ def _report(
     """Adds a call to the tally, writes it down and shows it."""
     settings = program.config
     names = [stage.name for stage in settings.stage]
-    control_steps = settings.arenas * settings.algo.rollout
+    control_steps = settings.arenas * settings.algo.rollout_length
     tally.update += n
     tally.seconds += seconds
     rows = recorder.rows(metrics, n, names, seeds.numbers(settings), control_steps)
@@ -357,14 +357,14 @@ def _report(
 
 def _log_episodes(
     settings: TrainConfig,
-    log: episodes.Log,
+    log: episodes.EpisodeLog,
     updates: np.ndarray,
     record: Recorder,
     display: Display,
 ) -> None:
     """Writes the episodes of a call down."""
     names, numbers = [stage.name for stage in settings.stage], seeds.numbers(settings)
-    steps = settings.arenas * settings.algo.rollout
+    steps = settings.arenas * settings.algo.rollout_length
     rows, lost = episodes.rows(log, updates, names, numbers, steps)
     record.write_episodes(rows)
     if lost:
@@ -400,11 +400,13 @@ def _check_finite(settings: TrainConfig, rows: list[Row]) -> None:
 def _speeds(program: Built, rows: list[Row], seconds: float) -> dict[str, float]:
     """Speeds of a call: arena, robot and physics steps, and transitions, of all seeds a second."""
     settings = program.config
-    arena_steps = len(rows) * settings.arenas * settings.algo.rollout
+    arena_steps = len(rows) * settings.arenas * settings.algo.rollout_length
     substeps = physics_substeps(settings.robot, settings.sim.substeps)
     return {
         "arena_steps_per_s": arena_steps / seconds,
-        "robot_steps_per_s": settings.algo.rollout * sum(row["robots"] for row in rows) / seconds,
+        "robot_steps_per_s": settings.algo.rollout_length
+        * sum(row["robots"] for row in rows)
+        / seconds,
         "physics_steps_per_s": arena_steps * substeps / seconds,
         "transitions_per_s": sum(row["transitions"] for row in rows) / seconds,
     }

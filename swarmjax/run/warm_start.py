@@ -1,4 +1,4 @@
-"""`start=DIR`: a new run begins with what another one learned, its networks and its normaliser.
+"""`init_from=DIR`: a new run begins with what another one learned, its networks and its normaliser.
 
 Everything else begins afresh: optimiser, learning rate, curriculum, arenas, keys and counters. Of
 the curriculum the number of robots that have trained is kept, so that a promotion copies no
@@ -56,14 +56,14 @@ def read(settings: TrainConfig) -> Source | None:
     Raises:
       ConfigError: if there is none, or its networks are not those of the config.
     """
-    if settings.start is None or settings.resume is not None:
+    if settings.init_from is None or settings.resume is not None:
         return None
-    run, stored = Path(settings.start), _read_config(settings.start)
-    _check_alike(settings.start, stored, settings)
+    run, stored = Path(settings.init_from), _read_config(settings.init_from)
+    _check_alike(settings.init_from, stored, settings)
     try:
         leaves, update, skipped = checkpoint.restore(run)
     except CheckpointError as error:
-        raise _refused(settings.start, error) from None
+        raise _refused(settings.init_from, error) from None
     prefixes = (*(f"learners/{name}/" for name in _CARRIED), f"learners/{_EXPLORED}")
     times = settings.seeds // stored.seeds
     carried = {
@@ -80,7 +80,7 @@ def carry(source: Source, state: TrainState, settings: TrainConfig) -> TrainStat
     Args:
       source: as `read` gave it.
       state: as `seeds.init` gave it.
-      settings: the config of the new run; `start_std` says whose exploration it begins with.
+      settings: the config of the new run; `init_from_std` says whose exploration it begins with.
 
     Returns:
       The state, with the networks and normalisers of the source, and a curriculum that knows how
@@ -90,7 +90,7 @@ def carry(source: Source, state: TrainState, settings: TrainConfig) -> TrainStat
       ConfigError: if the checkpoint is not of the config beside it.
     """
     fresh = {name: getattr(state.learners, name) for name in _CARRIED}
-    if settings.start_std == "keep" and f"learners/{_EXPLORED}" in source.leaves:
+    if settings.init_from_std == "keep" and f"learners/{_EXPLORED}" in source.leaves:
         fresh[_EXPLORED] = state.learners.explored
     template = {"learners": fresh, "curriculum": {"met": state.curriculum.met}}
     try:
@@ -98,7 +98,7 @@ def carry(source: Source, state: TrainState, settings: TrainConfig) -> TrainStat
     except CheckpointError as error:
         raise _refused(str(source.run), error) from None
     carried = found["learners"]
-    if settings.start_std == "reset":
+    if settings.init_from_std == "reset":
         log_std = state.learners.params["actor"]["log_std"]
         actor = carried["params"]["actor"] | {"log_std": log_std}
         carried["params"] = carried["params"] | {"actor": actor}
@@ -107,42 +107,52 @@ def carry(source: Source, state: TrainState, settings: TrainConfig) -> TrainStat
     return replace(state, learners=replace(state.learners, **carried), curriculum=curriculum)
 
 
-def _read_config(start: str) -> TrainConfig:
+def _read_config(init_from: str) -> TrainConfig:
     try:
-        return from_stored(read_config(Path(start)), "stored ")
+        return from_stored(read_config(Path(init_from)), "stored ")
     except ConfigError as error:
-        raise _refused(start, error) from None
+        raise _refused(init_from, error) from None
 
 
-def _refused(start: str, error: Exception) -> ConfigError:
+def _refused(init_from: str, error: Exception) -> ConfigError:
     return ConfigError(
-        f"start is {show(start)}: it takes the directory of a run with a sound checkpoint, "
+        f"init_from is {show(init_from)}: it takes the directory of a run with a sound checkpoint, "
         f"but {error}"
     )
 
 
-def _check_alike(start: str, stored: TrainConfig, settings: TrainConfig) -> None:
+def _check_alike(init_from: str, stored: TrainConfig, settings: TrainConfig) -> None:
     """Refuses networks of another shape or number, and those that would misread what they see."""
     if stored.seeds not in (1, settings.seeds):
         raise ConfigError(
-            f"start is {show(start)}, a run of {stored.seeds} seeds, but seeds is "
+            f"init_from is {show(init_from)}, a run of {stored.seeds} seeds, but seeds is "
             f"{settings.seeds}: give seeds={stored.seeds}, or a run of one seed."
         )
     policy = f"algo.policy={stored.algo.policy}"
     if stored.algo.policy == "independent":
         policy += f" sim.max_robots={stored.sim.max_robots}"
-    hidden, activation = show(stored.algo.hidden), stored.algo.activation
-    output = stored.algo.output
+    hidden, activation = show(stored.algo.hidden_sizes), stored.algo.activation
+    output = stored.algo.mean_activation
     seen, needed = (resolve_encoding(each.task, each.realism) for each in (stored, settings))
     for name, held, wanted, remedy in (
         ("number of learners", stored.learners, settings.learners, policy),
-        ("algo.hidden", hidden, show(settings.algo.hidden), f"algo.hidden={hidden}"),
+        (
+            "algo.hidden_sizes",
+            hidden,
+            show(settings.algo.hidden_sizes),
+            f"algo.hidden_sizes={hidden}",
+        ),
         ("algo.activation", activation, settings.algo.activation, f"algo.activation={activation}"),
-        ("algo.output", output, settings.algo.output, f"algo.output={output}"),
+        (
+            "algo.mean_activation",
+            output,
+            settings.algo.mean_activation,
+            f"algo.mean_activation={output}",
+        ),
         ("encoding of observations", seen, needed, f"task.encoding={seen}"),
     ):
         if held != wanted:
             raise ConfigError(
-                f"start is {show(start)}, whose {name} is {held}, but here it is {wanted}: "
+                f"init_from is {show(init_from)}, whose {name} is {held}, but here it is {wanted}: "
                 f"give {remedy}, or another run."
             )

@@ -94,7 +94,7 @@ def resolve_solver(solver: str, impl: str, body: str, robots: int) -> str:
     return "swarm" if possible and _discs() is not None else "mjx"
 
 
-class Choice(NamedTuple):
+class EngineChoice(NamedTuple):
     """How the physics is stepped: all that `auto` and null stand for is filled in.
 
     Attributes:
@@ -110,7 +110,7 @@ class Choice(NamedTuple):
     ls_iterations: int
 
 
-def choose(sim: "SimConfig", body: str) -> Choice:
+def choose(sim: "SimConfig", body: str) -> EngineChoice:
     """Resolves the settings of the simulation for a robot's body.
 
     Args:
@@ -130,11 +130,13 @@ def choose(sim: "SimConfig", body: str) -> Choice:
         iterations = _MOST_SWEEPS
     elif (solver, impl) == ("mjx", "jax"):
         iterations, ls_iterations = _NEWTON_STEPS[body]
-    return Choice(impl, solver, sim.iterations or iterations, sim.ls_iterations or ls_iterations)
+    return EngineChoice(
+        impl, solver, sim.iterations or iterations, sim.ls_iterations or ls_iterations
+    )
 
 
 def load_engine(
-    model: "mujoco.MjModel", ids: "Ids", robot: "RobotConfig", choice: Choice, arenas: int
+    model: "mujoco.MjModel", ids: "Ids", robot: "RobotConfig", choice: EngineChoice, arenas: int
 ) -> "Engine":
     """Loads what takes the physics steps.
 

@@ -1,7 +1,8 @@
 """What a robot is asked to do: the settings of task and reward."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
 from swarmjax import epuck
 from swarmjax.config import ConfigError, Section, about, show
@@ -14,6 +15,8 @@ from swarmjax.sim.realism_config import RealismConfig
 class RewardConfig(Section):
     """Weights of the named terms of the reward: equation 3 of the paper, and prices."""
 
+    renamed: ClassVar[Mapping[str, str]] = {"time": "step_penalty"}
+
     progress: float = field(default=1.0, metadata=about("per metre nearer to the target"))
     proximity: float = field(
         default=0.0, metadata=about("per control step with something in infrared range")
@@ -23,7 +26,7 @@ class RewardConfig(Section):
     robot_contact: float = field(
         default=0.0, metadata=about("besides, per contact event with another robot")
     )
-    time: float = field(default=-0.002, metadata=about("per control step until arrival"))
+    step_penalty: float = field(default=-0.002, metadata=about("per control step until arrival"))
 
 
 @dataclass(frozen=True, kw_only=True)

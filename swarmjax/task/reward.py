@@ -63,7 +63,7 @@ def robot_contact(step: Step) -> Array:
     return step.contact_begins[..., KINDS.index("robot")].astype(jnp.float32)
 
 
-def time(step: Step) -> Array:
+def step_penalty(step: Step) -> Array:
     """1 for every control step."""
     return jnp.ones_like(step.distance)
 
@@ -74,7 +74,7 @@ TERMS: dict[str, Callable[[Step], Array]] = {
     "arrival": arrival,
     "contact": contact,
     "robot_contact": robot_contact,
-    "time": time,
+    "step_penalty": step_penalty,
 }
 
 

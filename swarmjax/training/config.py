@@ -50,7 +50,7 @@ class ProgramConfig(Section):
     @property
     def updates(self) -> int:
         """Updates that the budget pays for; what is left over is not spent."""
-        return self.budget // (self.arenas * self.algo.rollout)
+        return self.budget // (self.arenas * self.algo.rollout_length)
 
     @property
     def learners(self) -> int:
@@ -65,4 +65,4 @@ class ProgramConfig(Section):
     @property
     def waiting(self) -> int:
         """Episodes that are drawn for each arena ahead of a rollout."""
-        return max(1, self.algo.rollout // _STEPS_PER_EPISODE)
+        return max(1, self.algo.rollout_length // _STEPS_PER_EPISODE)

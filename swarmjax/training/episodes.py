@@ -21,7 +21,7 @@ MOST_HELD = 2**19  # episodes that a call may hand on, over all updates and seed
 Row = dict[str, Any]
 
 
-class Log(NamedTuple):
+class EpisodeLog(NamedTuple):
     """Episodes that ended in one update, in the order in which they ended; E fit in.
 
     Attributes:
@@ -45,7 +45,7 @@ def room(config: ProgramConfig) -> int:
     One more for each arena than wait for it, the one that is under way; or as many as a step limit
     ends, where that is shorter; or one at each control step, of which there are no more.
     """
-    steps, limit = config.algo.rollout, config.task.step_limit
+    steps, limit = config.algo.rollout_length, config.task.step_limit
     return config.arenas * min(steps, max(config.waiting, steps // limit) + 1)
 
 
@@ -54,7 +54,7 @@ def rows_of_call(config: ProgramConfig) -> int:
     return max(1, MOST_HELD // (room(config) * config.seeds))
 
 
-def pack(ended: Ended, size: int) -> Log:
+def pack(ended: Ended, size: int) -> EpisodeLog:
     """Leaves out where no episode ended.
 
     Args:
@@ -74,7 +74,7 @@ def pack(ended: Ended, size: int) -> Log:
         flat = x.reshape(-1, *x.shape[2:])
         return jnp.take(flat, index, axis=0, mode="fill", fill_value=0)
 
-    return Log(
+    return EpisodeLog(
         ended=jnp.sum(over, dtype=jnp.int32),
         arena_steps=jnp.where(index < over.size, (index // arenas + 1) * arenas, 0),
         stage=take(ended.stage),
@@ -84,7 +84,7 @@ def pack(ended: Ended, size: int) -> Log:
 
 
 def rows(
-    log: Log,
+    log: EpisodeLog,
     updates: np.ndarray,
     stages: Sequence[str],
     seeds: Sequence[int],
@@ -114,7 +114,7 @@ def rows(
     return found, lost
 
 
-def _row(log: Log, index: int, stages: Sequence[str], before: int) -> Row:
+def _row(log: EpisodeLog, index: int, stages: Sequence[str], before: int) -> Row:
     """Describes one episode, of the robots that took part."""
     present = np.asarray(log.robots.present[index])
     values: Mapping[str, np.ndarray] = log.robots._asdict()

@@ -126,7 +126,7 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
         program, state.learners, state.arenas, starts, rollout_key
     )
     batch = rollout.batch(trajectory, config.algo)
-    explored = rollout.explore(program, state.learners, config.algo.rollout)
+    explored = rollout.explore(program, state.learners, config.algo.rollout_length)
     learners, learned = jax.vmap(
         lambda learner, b, k: ppo.update(
             learner, config.algo, b, k, config.updates, program.backend

@@ -85,7 +85,7 @@ def schedule(config: ProgramConfig) -> Schedule:
         config.curriculum,
         updates=config.updates,
         step_limit=config.task.step_limit,
-        rollout=config.algo.rollout,
+        rollout=config.algo.rollout_length,
     )
 
 

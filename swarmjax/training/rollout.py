@@ -148,7 +148,7 @@ def collect(
     arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
     begun = jnp.zeros_like(arenas.clock)
     carry = (arenas, _values(config, learners, arenas.observation), begun)
-    steps = config.rollout
+    steps = config.rollout_length
     keys = jax.random.split(key, steps)
     (arenas, *_), (trajectory, counts) = jax.lax.scan(step, carry, (keys, 1 + jnp.arange(steps)))
     packed = jax.vmap(physics.pack)(arenas.sim)
@@ -171,7 +171,7 @@ def batch(trajectory: Trajectory, config: AlgoConfig) -> Batch:
     Returns:
       [L] batches of A groups of T * N samples.
     """
-    advantages, returns = {"gae": _bootstrapped, "monte_carlo": _monte_carlo}[config.returns](
+    advantages, returns = {"gae": _bootstrapped, "monte_carlo": _monte_carlo}[config.advantage](
         trajectory, config
     )
 

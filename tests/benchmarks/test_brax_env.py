@@ -33,7 +33,7 @@ def program() -> Program:
     """Two robots where three are compiled in; one solver iteration, which compiles sooner."""
     stage = StageConfig(name="pair", robots=2, side=0.5)
     sim = SimConfig(impl="jax", max_robots=3, max_obstacles=0, iterations=1, ls_iterations=1)
-    task, algo = TaskConfig(step_limit=16), AlgoConfig(rollout=8, minibatches=2)
+    task, algo = TaskConfig(step_limit=16), AlgoConfig(rollout_length=8, num_minibatches=2)
     config = TrainConfig(stage=(stage,), task=task, algo=algo, sim=sim, arenas=4, budget=32)
     return Program(config, programs.load_world(config))
 
@@ -103,7 +103,13 @@ def test_brax_is_given_playgrounds_numbers(tiny_config: TrainConfig) -> None:
         ),
         # 32 updates of 8 control steps are 12 of 20.
         (
-            ["trainer=brax", "settings=playground", "arenas=32", "algo.rollout=8", "budget=8192"],
+            [
+                "trainer=brax",
+                "settings=playground",
+                "arenas=32",
+                "algo.rollout_length=8",
+                "budget=8192",
+            ],
             "points is 30, but the budget is 12 updates: give at most as many.",
         ),
         (

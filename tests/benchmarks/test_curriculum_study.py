@@ -176,7 +176,7 @@ def test_the_judge_gives_means_by_seed_and_stage(trained: TrainConfig) -> None:
     learners.params["actor"]["mean"]["bias"] += np.array([[[1.0, 0.0]], [[0.5, 0.3]]], np.float32)
     found = curriculum.load_judge(study, trained, judged)(learners)
     world = programs.load_world(
-        replace(trained, arenas=4, algo=replace(trained.algo, minibatches=1))
+        replace(trained, arenas=4, algo=replace(trained.algo, num_minibatches=1))
     )
     alone = jax.jit(
         partial(engine_mjx.outcomes, world, trained.algo, steps=trained.task.step_limit)

@@ -76,7 +76,7 @@ def calls(program: Program, pass_time: Callable[[float], None]) -> Calls:
         pass_time(next(taken))
         return state, {"transitions": np.full((SEEDS, 1000), 7.0)}
 
-    stub = timing.Program(call, compile_s=0.0, size=0)
+    stub = timing.TimedProgram(call, compile_s=0.0, size=0)
     prepared = Prepared(
         program=program,
         schedule=programs.schedule(program.config),

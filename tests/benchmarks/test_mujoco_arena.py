@@ -9,7 +9,7 @@ import steering
 from sentences import refusal
 
 from benchmarks import cpu_paper_way, mujoco_arena
-from benchmarks.mujoco_arena import Arena
+from benchmarks.mujoco_arena import MujocoArena
 from swarmjax import policy
 from swarmjax.evaluate import engine_c
 from swarmjax.evaluate.config import EvaluateConfig
@@ -28,7 +28,7 @@ def test_an_arena_does_what_the_judge_does(settings: EvaluateConfig, tmp_path: P
     judge = engine_c.load(settings, trained)
     levels = [engine_c.draw_level(judge.stage, judge.spacing, 3, n) for n in range(5, 7)]
     judged = engine_c.simulate(judge, levels)
-    arena = Arena(settings, first=5)
+    arena = MujocoArena(settings, first=5)
     for n in range(2):
         seen, over, steps = arena.reset(), False, 0
         while not over:
@@ -42,8 +42,8 @@ def test_an_arena_does_what_the_judge_does(settings: EvaluateConfig, tmp_path: P
 
 
 def test_rewards_are_those_of_the_task(settings: EvaluateConfig) -> None:
-    weights = replace(settings.task.reward, proximity=-0.5, contact=-0.25, time=-0.125)
-    arena = Arena(replace(settings, task=replace(settings.task, reward=weights)))
+    weights = replace(settings.task.reward, proximity=-0.5, contact=-0.25, step_penalty=-0.125)
+    arena = MujocoArena(replace(settings, task=replace(settings.task, reward=weights)))
     arena.reset()
     random, touched, near = np.random.default_rng(0), 0, 0
     for _ in range(STEPS):
@@ -69,7 +69,9 @@ def test_rewards_are_those_of_the_task(settings: EvaluateConfig) -> None:
 
 def test_a_reward_that_it_does_not_know_is_refused(settings: EvaluateConfig) -> None:
     task = replace(settings.task, reward=replace(settings.task.reward, arrival=1.0))
-    assert refusal(Arena, replace(settings, task=task)) == "task.reward.arrival is 1.0: give 0."
+    assert (
+        refusal(MujocoArena, replace(settings, task=task)) == "task.reward.arrival is 1.0: give 0."
+    )
 
 
 def test_returns_end_with_their_episodes() -> None:

@@ -12,12 +12,12 @@ import pytest
 from sentences import refusal
 
 from benchmarks import peers, robots_speed, run, run_page, run_tables, steps_per_second
-from benchmarks.run import Entry, Line, Output, RunConfig
+from benchmarks.run import Line, Output, SuiteEntry, SuiteRunConfig
 from benchmarks.suites import SUITES
 from swarmjax.run.settings import load_train
 
-ENTRY = Entry(name="e", module="m", over="arenas", values=("8", "4", "2"), seconds=20.0)
-ALONE = Entry(name="a", module="m", seconds=20.0)
+ENTRY = SuiteEntry(name="e", module="m", over="arenas", values=("8", "4", "2"), seconds=20.0)
+ALONE = SuiteEntry(name="a", module="m", seconds=20.0)
 
 Script = Callable[[str], None]
 
@@ -27,7 +27,7 @@ def script(monkeypatch: pytest.MonkeyPatch) -> Script:
     """Puts a script in the place of benchmarks; `values` are those that it is asked for."""
 
     def put(body: str) -> None:
-        def command_line(entry: Entry, values: list[str]) -> list[str]:
+        def command_line(entry: SuiteEntry, values: list[str]) -> list[str]:
             head = f"import json, os, sys, time\nvalues = {values!r}\n"
             head += "def say(**line): print(json.dumps(line), flush=True)\n"
             return [sys.executable, "-c", head + body]
@@ -37,7 +37,7 @@ def script(monkeypatch: pytest.MonkeyPatch) -> Script:
     return put
 
 
-def _run(entry: Entry, path: Path, seconds: float = math.inf) -> list[Line]:
+def _run(entry: SuiteEntry, path: Path, seconds: float = math.inf) -> list[Line]:
     run.run_entry(entry, Output(path), time.monotonic() + seconds)
     return run.read(path)
 
@@ -55,7 +55,7 @@ def test_entries_of_a_suite_have_names_of_their_own_and_a_benchmark(suite: str) 
 
 
 def test_an_entry_of_a_name_is_the_same_in_all_suites() -> None:
-    found: dict[str, Entry] = {}
+    found: dict[str, SuiteEntry] = {}
     for entries in SUITES.values():
         for entry in entries:
             assert found.setdefault(entry.name, entry) == entry
@@ -69,9 +69,9 @@ def test_words_of_training_are_taken() -> None:
 
 
 def test_only_some_entries() -> None:
-    chosen = RunConfig(suite="peers", out="x", only=("peer_vmas", "planar-warp"))
+    chosen = SuiteRunConfig(suite="peers", out="x", only=("peer_vmas", "planar-warp"))
     assert [entry.name for entry in run.entries(chosen)] == ["planar-warp", "peer_vmas"]
-    assert run.entries(RunConfig(table="x", docs="y")) == []
+    assert run.entries(SuiteRunConfig(table="x", docs="y")) == []
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_only_some_entries() -> None:
     ],
 )
 def test_settings_that_do_not_fit_are_refused(given: dict, expected: str) -> None:
-    assert expected in refusal(lambda: RunConfig(**given))
+    assert expected in refusal(lambda: SuiteRunConfig(**given))
 
 
 # --- resuming
@@ -107,7 +107,7 @@ def test_what_is_left_of_an_entry() -> None:
 
 
 def test_the_command_of_a_process() -> None:
-    entry = Entry(name="e", module="m", words=("a=1",), over="arenas", values=("8", "4"))
+    entry = SuiteEntry(name="e", module="m", words=("a=1",), over="arenas", values=("8", "4"))
     assert run.command_line(entry, ["8", "4"])[1:] == ["-m", "benchmarks.m", "a=1", "arenas=8,4"]
     assert run.command_line(ALONE, [None])[1:] == ["-m", "benchmarks.m"]
 
@@ -139,7 +139,7 @@ def test_a_process_that_dies_costs_one_value(tmp_path: Path, script: Script) -> 
 
 def test_a_silent_process_is_ended(tmp_path: Path, script: Script) -> None:
     script("time.sleep(60)")
-    entry = Entry(name="a", module="m", seconds=0.2)
+    entry = SuiteEntry(name="a", module="m", seconds=0.2)
     (line,) = _run(entry, tmp_path / "out.jsonl")
     assert line["failed"] == "printed nothing for 0.2 s"
 
@@ -159,7 +159,7 @@ def test_a_missing_peer_is_skipped_and_said(tmp_path: Path, script: Script) -> N
 
 def test_each_value_may_have_a_process_of_its_own(tmp_path: Path, script: Script) -> None:
     script("say(benchmark='m', arenas=int(values[0]), asked=len(values))")
-    entry = Entry(name="e", module="m", over="arenas", values=("8", "4"), each=1, seconds=20.0)
+    entry = SuiteEntry(name="e", module="m", over="arenas", values=("8", "4"), each=1, seconds=20.0)
     lines = _run(entry, tmp_path / "out.jsonl")
     assert [(line["arenas"], line["asked"]) for line in lines] == [(8, 1), (4, 1)]
 

@@ -26,11 +26,13 @@ def own_configs(tmp_path, monkeypatch):
 
 
 def test_groups_and_keys_in_any_order():
-    train = load_train(["stage.side=0.9", "robot=planar", "stage=s3", "algo=ppo", "algo.clip=0.1"])
+    train = load_train(
+        ["stage.side=0.9", "robot=planar", "stage=s3", "algo=ppo", "algo.clip_epsilon=0.1"]
+    )
     (stage,) = train.stage
     assert (stage.name, stage.side, stage.robots) == ("s3", 0.9, 3)
     assert train.stage_name == "s3"
-    assert train.algo.clip == 0.1
+    assert train.algo.clip_epsilon == 0.1
 
 
 def test_of_a_key_given_twice_the_last_counts():

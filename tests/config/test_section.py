@@ -30,7 +30,7 @@ STAGE = {"name": "s", "robots": 2, "side": 1.0}
     ("load", "words"),
     [
         (load_train, []),
-        (load_train, ["stage=s3", "algo.hidden=[8,16,32]", "run.chunk=all", "run.dir=a b"]),
+        (load_train, ["stage=s3", "algo.hidden_sizes=[8,16,32]", "run.chunk=all", "run.dir=a b"]),
         (load_train, ["stage.sequence=[s2,s1]", "sim.iterations=4", "run.chunk=7"]),
         (partial(load_levels, EvaluateConfig), ["policy=p", "stage=expanded", "workers=2"]),
         (partial(files.load, ExportConfig), ["run=r", "step=3"]),
@@ -58,7 +58,7 @@ def test_round_trip_of_any_sound_configuration(
     side = max(0.4, smallest_side(probe) + extra)
     data = {
         "stage": [dataclasses.asdict(probe) | {"side": side}],
-        "algo": {"rollout": rollout},
+        "algo": {"rollout_length": rollout},
         "arenas": 8 * factor,
         "budget": 8 * factor * rollout + spare,
     }
@@ -136,8 +136,8 @@ def test_chunk_takes_a_number_or_a_word(value, made):
 
 
 def test_lists_become_tuples():
-    train = build(TrainConfig, {"stage": [STAGE], "algo": {"hidden": [8, 16.0]}})
-    assert train.algo.hidden == (8, 16)
+    train = build(TrainConfig, {"stage": [STAGE], "algo": {"hidden_sizes": [8, 16.0]}})
+    assert train.algo.hidden_sizes == (8, 16)
     assert isinstance(train.stage, tuple)
 
 
@@ -161,4 +161,6 @@ def test_a_missing_key_is_named():
 
 def test_sections_made_by_hand_are_held_to_their_bounds():
     assert refusal(lambda: SimConfig(max_robots=0)) == "max_robots is 0: give 1 to 100."
-    assert refusal(lambda: RewardConfig(time=math.nan)) == ("time is nan: give any finite number.")
+    assert refusal(lambda: RewardConfig(step_penalty=math.nan)) == (
+        "step_penalty is nan: give any finite number."
+    )

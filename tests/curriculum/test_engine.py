@@ -20,10 +20,10 @@ from swarmjax.curriculum.engine import (
     NEVER,
     REWEIGHED,
     STAYED,
+    CohortTally,
     Curriculum,
     Decision,
     Schedule,
-    Tally,
 )
 from swarmjax.curriculum.log import log
 from swarmjax.curriculum.modes import MODES
@@ -274,7 +274,7 @@ def test_the_share_of_arenas_is_the_weight(raw: list[float], arenas: int, cohort
 
 
 def _many(stages: int, weights: np.ndarray, cohort: int) -> Curriculum:
-    none = Tally(*[jnp.zeros(stages)] * 6)
+    none = CohortTally(*[jnp.zeros(stages)] * 6)
     zero = jnp.int32(0)
     return Curriculum(
         stage=zero,

@@ -23,11 +23,11 @@ from swarmjax.curriculum.engine import (
     REASONS,
     REWEIGHED,
     STAYED,
-    Choice,
+    CohortVerdict,
     Curriculum,
     Record,
     Schedule,
-    Verdict,
+    StageChoice,
 )
 from swarmjax.curriculum.modes import MODES
 from swarmjax.ppo import learner as ppo
@@ -70,14 +70,20 @@ def _state(stage: int, stages: int, cohort: int = 9, since: int = 5) -> Curricul
     return replace(start, **{key: jnp.int32(value) for key, value in number.items()})
 
 
-def _verdict(success: list[float], over: bool = True, judged: bool = True) -> Verdict:
+def _verdict(success: list[float], over: bool = True, judged: bool = True) -> CohortVerdict:
     values = jnp.array(success, jnp.float32)
-    return Verdict(over=jnp.array(over), judged=over & judged & ~jnp.isnan(values), success=values)
+    return CohortVerdict(
+        over=jnp.array(over), judged=over & judged & ~jnp.isnan(values), success=values
+    )
 
 
 def _choose(
-    options: CurriculumConfig, state: Curriculum, numbers: Schedule, verdict: Verdict, update: int
-) -> Choice:
+    options: CurriculumConfig,
+    state: Curriculum,
+    numbers: Schedule,
+    verdict: CohortVerdict,
+    update: int,
+) -> StageChoice:
     return MODES[options.mode](state, numbers, options, verdict, jnp.int32(update))
 
 
@@ -350,7 +356,7 @@ def step() -> Step:
         stage=tuple(StageConfig(name=f"s{i}", robots=n, side=s) for i, (n, s) in enumerate(sizes)),
         robot=RobotConfig(max_speed=0.6, max_wheel_speed=40.0),
         task=TaskConfig(step_limit=8 * COHORT, target_radius=0.09),
-        algo=AlgoConfig(hidden=(8,), rollout=8, minibatches=2, initial_std=1.5),
+        algo=AlgoConfig(hidden_sizes=(8,), rollout_length=8, num_minibatches=2, initial_std=1.5),
         sim=SimConfig(impl="jax", max_robots=2, max_obstacles=0),
         arenas=ARENAS,
     )

@@ -51,7 +51,7 @@ def world() -> World:
 
 @pytest.fixture(scope="module")
 def judge(world: World) -> Run:
-    algo = AlgoConfig(hidden=(2,), activation="relu")
+    algo = AlgoConfig(hidden_sizes=(2,), activation="relu")
     return jax.jit(partial(engine_mjx.outcomes, world, algo, steps=STEPS))
 
 

@@ -36,7 +36,7 @@ def _by_flax(arrays: Arrays, activation: Activation, seen: np.ndarray) -> np.nda
         def layer(name: str) -> dict[str, jax.Array]:
             return {part: mine[f"actor/{name}/{part}"] for part in ("kernel", "bias")}
 
-        torso = {f"hidden_{i}": layer(f"hidden_{i}") for i in range(len(config.hidden))}
+        torso = {f"hidden_{i}": layer(f"hidden_{i}") for i in range(len(config.hidden_sizes))}
         actor = {"torso": torso, "mean": layer("mean"), "log_std": mine["actor/log_std"]}
         moments = normalizer.Normalizer(
             count=jnp.ones(()),
@@ -80,7 +80,7 @@ def _by_c(trained: Policy, seen: np.ndarray, folder: Path) -> np.ndarray:
 @pytest.mark.parametrize("learners", [1, 3])
 @pytest.mark.parametrize("activation", ["tanh", "relu", "swish"])
 def test_all_forms_of_a_policy_agree(activation: Activation, learners: int, tmp_path: Path) -> None:
-    arrays = policies.arrays(hidden=AlgoConfig().hidden, learners=learners)
+    arrays = policies.arrays(hidden=AlgoConfig().hidden_sizes, learners=learners)
     given = several(learners)
     trained = saved(tmp_path / "policy.npz", arrays, activation=activation, **given)
     seen = policies.seen(trained, OBSERVATIONS)

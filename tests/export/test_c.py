@@ -22,7 +22,7 @@ from swarmjax.sim.config import RobotConfig
 STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wshadow",
           "-Wconversion", "-Wdouble-promotion")  # fmt: skip
 CORTEX_M4F = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
-HIDDEN = AlgoConfig().hidden
+HIDDEN = AlgoConfig().hidden_sizes
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs Debian's package gcc")
 needs_arm = pytest.mark.skipif(

@@ -27,7 +27,7 @@ TABLE_1 = {
     "state space dimension": (observation.SIZE, 10),
     "action space dimension": (programs.ACTION_SIZE, 2),
     "discount factor (gamma)": (PAPER.algo.discount, 0.99),
-    "PPO epsilon clip": (PAPER.algo.clip, 0.2),
+    "PPO epsilon clip": (PAPER.algo.clip_epsilon, 0.2),
     "PPO K epochs": (PAPER.algo.epochs, 80),
     "optimizer learning rate actor": (PAPER.algo.actor_learning_rate, 0.0003),
     "optimizer learning rate critic": (PAPER.algo.critic_learning_rate, 0.001),
@@ -54,7 +54,7 @@ def test_the_help_names_the_rows_of_the_algorithm() -> None:
 def test_the_preset_leaves_no_number_of_the_learner_to_a_default() -> None:
     given = files.read_preset("algo", "paper")
     # One has no meaning, one says how numbers come about, not which.
-    others = {"gae_lambda", "gradient"}
+    others = {"gae_lambda", "update_backend"}
     assert set(given["algo"]) | others == {f.name for f in dataclasses.fields(AlgoConfig)}
     assert PAPER.algo.gae_lambda is None
     rewards = {f.name for f in dataclasses.fields(RewardConfig)}
@@ -106,21 +106,21 @@ def test_the_clamp_of_each_wheel_takes_the_turn_of_a_fast_command() -> None:
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["algo.returns=monte_carlo", "algo.gae_lambda=0.9"],
-         "algo.gae_lambda is 0.9, but returns is monte_carlo: gae_lambda is an option of gae, so "
-         "give null or returns=gae."),
+        (["algo.advantage=monte_carlo", "algo.gae_lambda=0.9"],
+         "algo.gae_lambda is 0.9, but advantage is monte_carlo: gae_lambda is an option of gae, so "
+         "give null or advantage=gae."),
         (["algo.std_floor=0.2"],
          "algo.std_floor is 0.2, but exploration is learned: std_floor is an option of scheduled, "
          "so give null or exploration=scheduled."),
         (["algo=paper", "algo.time_out=bootstrap"],
-         "algo.time_out is bootstrap, but returns is monte_carlo: give terminal or leak."),
+         "algo.time_out is bootstrap, but advantage is monte_carlo: give terminal or leak."),
         (["algo.time_out=leak"],
-         "algo.time_out is leak, but returns is gae: give bootstrap or terminal."),
+         "algo.time_out is leak, but advantage is gae: give bootstrap or terminal."),
         (["algo=paper", "algo.std_floor=0.7"],
          "algo.std_floor is 0.7, but initial_std is 0.6: give at most 0.6."),
-        (["algo.output=tanh", "algo.activation=relu"],
-         "algo.output is tanh, but activation is relu, and a policy's file has one for all "
-         "layers: give activation=tanh or output=linear."),
+        (["algo.mean_activation=tanh", "algo.activation=relu"],
+         "algo.mean_activation is tanh, but activation is relu, and a policy's file has one for "
+         "all layers: give activation=tanh or mean_activation=linear."),
         (["algo=paper", "budget=3e9"],
          "budget is 3000000000, but algo.exploration is scheduled by control steps that are "
          "counted in 32 bits: give at most 2147483647."),
@@ -128,8 +128,8 @@ def test_the_clamp_of_each_wheel_takes_the_turn_of_a_fast_command() -> None:
          "curriculum.normalizer is relearn, but algo.normalize_observations is false: give keep "
          "or algo.normalize_observations=true."),
         (["algo=paper", "budget=5999"],
-         "budget is 5999, but one update takes arenas x algo.rollout = 6000 control steps: give "
-         "at least 6000."),
+         "budget is 5999, but one update takes arenas x algo.rollout_length = 6000 control steps: "
+         "give at least 6000."),
         (["algo.name=paper"], "algo.name cannot be given: choose a file, as in algo=ppo."),
     ],
 )  # fmt: skip
@@ -141,7 +141,7 @@ def test_options_take_their_defaults_where_they_have_a_meaning() -> None:
     plain = AlgoConfig()
     assert (plain.gae_lambda, plain.time_out) == (0.95, "bootstrap")
     assert (plain.std_decrement, plain.std_interval, plain.std_floor) == (None, None, None)
-    other = AlgoConfig(returns="monte_carlo", exploration="scheduled")
+    other = AlgoConfig(advantage="monte_carlo", exploration="scheduled")
     assert (other.gae_lambda, other.time_out) == (None, "terminal")
     assert (other.std_decrement, other.std_interval, other.std_floor) == (0.05, 250_000, 0.1)
     assert build(AlgoConfig, to_dict(other)) == other

@@ -45,7 +45,7 @@ def _replay(config: TrainConfig, steps: int, arrived: np.ndarray) -> Replay:
             stds[time_step] = std
             done = arrived[time_step]
             time_step += 1
-            if time_step % algo.rollout == 0:
+            if time_step % algo.rollout_length == 0:
                 updates.append((time_step, std))
             if time_step % algo.std_interval == 0:
                 std = max(round(std - algo.std_decrement, 4), algo.std_floor)
@@ -67,7 +67,7 @@ def test_the_deviation_of_every_one_of_a_million_steps() -> None:
 def test_the_updates_of_a_million_steps() -> None:
     replay = _replay(PAPER, PAPER.budget, np.zeros(PAPER.budget, bool))
     assert PAPER.updates == len(replay.updates) == 166
-    made = [(i + 1) * PAPER.arenas * PAPER.algo.rollout for i in range(PAPER.updates)]
+    made = [(i + 1) * PAPER.arenas * PAPER.algo.rollout_length for i in range(PAPER.updates)]
     assert made == [step for step, _ in replay.updates]
     # An update learns with the deviation of its rollout's last step; one that falls together with
     # a step down, as at 750,000, comes first.
@@ -96,7 +96,7 @@ def _round(
     arenas, path, ended = rollout.collect(
         program, state.learners, state.arenas, starts, rollout_key
     )
-    learners = rollout.explore(program, state.learners, config.algo.rollout)
+    learners = rollout.explore(program, state.learners, config.algo.rollout_length)
     mean = jax.vmap(lambda one, seen: loop.ppo.mode(one, config.algo, seen), in_axes=(0, 1))(
         learners, path.observation
     )
@@ -113,7 +113,7 @@ def _round(
 
 def _check_run(config: TrainConfig, updates: int) -> None:
     """Drives, and compares every step with the replay."""
-    steps = updates * config.algo.rollout
+    steps = updates * config.algo.rollout_length
     found = _drive(config, updates)
     path = {name: found[name].reshape(-1) for name in ("square", "log_prob", "done", "arrived")}
     replay = _replay(config, steps, path["arrived"].astype(bool))
@@ -131,7 +131,7 @@ def _check_run(config: TrainConfig, updates: int) -> None:
 
 def _config(scale: int) -> TrainConfig:
     """The paper's numbers of steps divided by `scale`: one robot, with a target nearby."""
-    algo = replace(PAPER.algo, rollout=6000 // scale, std_interval=250_000 // scale)
+    algo = replace(PAPER.algo, rollout_length=6000 // scale, std_interval=250_000 // scale)
     return replace(
         PAPER,
         stage=(StageConfig(name="one", robots=1, side=0.4),),

@@ -27,7 +27,9 @@ def config() -> TrainConfig:
         paper,
         stage=paper.stage[1:3],  # of two robots and of three, with the fence
         sim=replace(paper.sim, max_robots=3, max_obstacles=1),
-        algo=replace(paper.algo, hidden=(8,), rollout=ROLLOUT, epochs=3, std_interval=250),
+        algo=replace(
+            paper.algo, hidden_sizes=(8,), rollout_length=ROLLOUT, epochs=3, std_interval=250
+        ),
         # Nobody arrives in so short a time, so that promotion is by the deadline.
         task=replace(paper.task, step_limit=LIMIT),
         curriculum=replace(paper.curriculum, exploration="reset"),

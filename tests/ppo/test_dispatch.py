@@ -32,14 +32,16 @@ def test_auto_is_fused_on_an_nvidia_gpu_where_the_layers_fit(
 ) -> None:
     _on(monkeypatch, **device)
     assert dispatch.resolve(AlgoConfig(), OBSERVATION, ACTION) == choice
-    assert dispatch.resolve(AlgoConfig(gradient="autodiff"), OBSERVATION, ACTION) == "autodiff"
-    assert dispatch.resolve(AlgoConfig(hidden=(8,)), OBSERVATION, ACTION) == "autodiff"
+    assert (
+        dispatch.resolve(AlgoConfig(update_backend="autodiff"), OBSERVATION, ACTION) == "autodiff"
+    )
+    assert dispatch.resolve(AlgoConfig(hidden_sizes=(8,)), OBSERVATION, ACTION) == "autodiff"
 
 
 def test_a_whole_batch_is_taken_in_blocks_on_a_cpu_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = AlgoConfig(minibatches=1)
+    whole = AlgoConfig(num_minibatches=1)
     assert dispatch.resolve(whole, OBSERVATION, ACTION) == "blocks"
-    assert dispatch.resolve(AlgoConfig(minibatches=2), OBSERVATION, ACTION) == "autodiff"
+    assert dispatch.resolve(AlgoConfig(num_minibatches=2), OBSERVATION, ACTION) == "autodiff"
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert dispatch.resolve(whole, OBSERVATION, ACTION) == "autodiff"
     _on(monkeypatch, compute_capability="9.0")
@@ -50,25 +52,27 @@ def test_full_precision_is_left_to_autodiff(monkeypatch: pytest.MonkeyPatch) -> 
     _on(monkeypatch, compute_capability="9.0")
     with jax.default_matmul_precision("highest"):
         assert dispatch.resolve(AlgoConfig(), OBSERVATION, ACTION) == "autodiff"
-        assert dispatch.resolve(AlgoConfig(gradient="fused"), OBSERVATION, ACTION) == "fused"
+        assert dispatch.resolve(AlgoConfig(update_backend="fused"), OBSERVATION, ACTION) == "fused"
     with jax.default_matmul_precision("tensorfloat32"):
         assert dispatch.resolve(AlgoConfig(), OBSERVATION, ACTION) == "fused"
 
 
 def test_fused_is_refused_where_it_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigError) as no_gpu:
-        dispatch.resolve(AlgoConfig(gradient="fused"), OBSERVATION, ACTION)
+        dispatch.resolve(AlgoConfig(update_backend="fused"), OBSERVATION, ACTION)
     assert str(no_gpu.value) == (
-        "algo.gradient is fused, but there is no NVIDIA GPU of compute capability 8 or more: give "
-        "auto or autodiff."
+        "algo.update_backend is fused, but there is no NVIDIA GPU of compute capability 8 or "
+        "more: give auto or autodiff."
     )
     _on(monkeypatch, compute_capability="9.0")
-    assert dispatch.resolve(AlgoConfig(gradient="fused"), OBSERVATION, ACTION) == "fused"
+    assert dispatch.resolve(AlgoConfig(update_backend="fused"), OBSERVATION, ACTION) == "fused"
     with pytest.raises(ConfigError) as unfit:
-        dispatch.resolve(AlgoConfig(gradient="fused", hidden=(48, 64)), OBSERVATION, ACTION)
+        dispatch.resolve(
+            AlgoConfig(update_backend="fused", hidden_sizes=(48, 64)), OBSERVATION, ACTION
+        )
     assert str(unfit.value) == (
-        "algo.gradient is fused, but algo.hidden is [48,64], which does not fit the chip: give two "
-        "layers of 16, 32 or 64, or algo.gradient=auto."
+        "algo.update_backend is fused, but algo.hidden_sizes is [48,64], which does not fit the "
+        "chip: give two layers of 16, 32 or 64, or algo.update_backend=auto."
     )
 
 
@@ -77,8 +81,8 @@ def test_without_the_faster_ways_there_is_autodiff(monkeypatch: pytest.MonkeyPat
     assert dispatch.find("fused") is not None
     assert dispatch.find("autodiff") is None
     monkeypatch.setitem(sys.modules, "swarmjax.ppo.fast", None)  # cannot be imported
-    assert dispatch.resolve(AlgoConfig(minibatches=1), OBSERVATION, ACTION) == "autodiff"
+    assert dispatch.resolve(AlgoConfig(num_minibatches=1), OBSERVATION, ACTION) == "autodiff"
     _on(monkeypatch, compute_capability="9.0")
     assert dispatch.resolve(AlgoConfig(), OBSERVATION, ACTION) == "autodiff"
     with pytest.raises(ConfigError, match=r"swarmjax\.ppo\.fast cannot be imported"):
-        dispatch.resolve(AlgoConfig(gradient="fused"), OBSERVATION, ACTION)
+        dispatch.resolve(AlgoConfig(update_backend="fused"), OBSERVATION, ACTION)

@@ -11,7 +11,11 @@ from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch
 
 SCHEDULED = AlgoConfig(
-    hidden=(8,), minibatches=1, exploration="scheduled", std_interval=100, entropy_cost=0.01
+    hidden_sizes=(8,),
+    num_minibatches=1,
+    exploration="scheduled",
+    std_interval=100,
+    entropy_cost=0.01,
 )
 
 
@@ -50,7 +54,7 @@ def test_a_learner_explores_with_the_level_of_its_last_step() -> None:
 
 
 def test_without_a_schedule_a_learner_stays_as_it_is() -> None:
-    learned = AlgoConfig(hidden=(8,), minibatches=1)
+    learned = AlgoConfig(hidden_sizes=(8,), num_minibatches=1)
     state = learner.init(jax.random.key(0), learned, 3, 2, 5)
     assert state.explored is None
     assert learner.explore(state, learned, 10) is state

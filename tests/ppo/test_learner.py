@@ -14,8 +14,8 @@ from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch, LearnerState
 
 G, N, OBSERVATION, U, UPDATES = 8, 6, 3, 2, 5
-CONFIG = AlgoConfig(hidden=(8,), epochs=3, minibatches=4, entropy_cost=0.01)
-ONE_STEP = AlgoConfig(hidden=(8,), epochs=1, minibatches=1)
+CONFIG = AlgoConfig(hidden_sizes=(8,), epochs=3, num_minibatches=4, entropy_cost=0.01)
+ONE_STEP = AlgoConfig(hidden_sizes=(8,), epochs=1, num_minibatches=1)
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -204,18 +204,18 @@ def test_minibatches_without_a_valid_sample_are_no_steps() -> None:
     updated, _ = _update(state, _spoilt(batch, valid), jax.random.key(1))
     steps = optax.tree.get_all_with_path(updated.optimizer_state, "count")
     orders = [
-        jax.random.permutation(key, G).reshape(CONFIG.minibatches, -1)
+        jax.random.permutation(key, G).reshape(CONFIG.num_minibatches, -1)
         for key in jax.random.split(jax.random.key(1), CONFIG.epochs)
     ]
     expected = sum(int(np.isin(order, [0, 5]).any(axis=1).sum()) for order in orders)
-    assert expected < CONFIG.epochs * CONFIG.minibatches
+    assert expected < CONFIG.epochs * CONFIG.num_minibatches
     assert [int(count) for _, count in steps] == [expected] * 4
 
 
 def test_each_epoch_learns_from_every_group_once() -> None:
     state = _fresh()
     batch = _batch(state)
-    config = AlgoConfig(hidden=(8,), epochs=2, minibatches=4, critic_learning_rate=1e-12)
+    config = AlgoConfig(hidden_sizes=(8,), epochs=2, num_minibatches=4, critic_learning_rate=1e-12)
     # With a critic that stands still, the value loss averages over every sample exactly when each
     # epoch visits each group once. Returns 2**g tell every choice of groups apart.
     returns = jnp.broadcast_to(2.0 ** jnp.arange(G)[:, None], (G, N))
@@ -253,7 +253,9 @@ def test_one_norm_clips_the_gradient_of_both_networks() -> None:
 
 
 def test_linear_schedule_falls_to_zero_over_the_run_and_constant_does_not() -> None:
-    constant = AlgoConfig(hidden=(8,), epochs=1, minibatches=1, learning_rate_schedule="constant")
+    constant = AlgoConfig(
+        hidden_sizes=(8,), epochs=1, num_minibatches=1, learning_rate_schedule="constant"
+    )
     state = _fresh(config=ONE_STEP)
     for done in range(UPDATES + 1):
         batch = _batch(state, done, ONE_STEP)
@@ -338,7 +340,7 @@ def test_shapes_that_would_broadcast_are_refused(field: str) -> None:
 
 def test_minibatches_that_do_not_divide_the_groups_are_refused() -> None:
     state = _fresh()
-    config = AlgoConfig(hidden=(8,), minibatches=3)
+    config = AlgoConfig(hidden_sizes=(8,), num_minibatches=3)
     with pytest.raises(AssertionError):
         _update(state, _batch(state), jax.random.key(0), config=config)
 
@@ -373,7 +375,7 @@ def test_observations_may_be_left_as_they_are() -> None:
 
 
 def test_advantages_of_monte_carlo_returns_are_taken_as_they_are() -> None:
-    config = replace(ONE_STEP, returns="monte_carlo", gae_lambda=None, time_out=None)
+    config = replace(ONE_STEP, advantage="monte_carlo", gae_lambda=None, time_out=None)
     state = _fresh(config=config)
     batch = _batch(state, 0, config)
     _, metrics = _update(state, batch, jax.random.key(1), config=config)

@@ -13,7 +13,9 @@ from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.losses import Minibatch, ppo_loss
 
 B, OBSERVATION, U = 24, 3, 2
-CONFIG = AlgoConfig(hidden=(8,), clip=0.2, value_cost=0.7, entropy_cost=0.03, bound_cost=0.4)
+CONFIG = AlgoConfig(
+    hidden_sizes=(8,), clip_epsilon=0.2, value_cost=0.7, entropy_cost=0.03, bound_cost=0.4
+)
 PARAMS = networks.init_params(jax.random.key(0), CONFIG, OBSERVATION, U)
 PARAMS["actor"]["mean"]["kernel"] *= 150.0  # so that means lie on both sides of -1 and of 1
 
@@ -76,7 +78,7 @@ def test_a_clipped_ratio_has_no_gradient_and_an_unclipped_one_has() -> None:
     minibatch = _minibatch()
     mean, std = networks.action_distribution(PARAMS, CONFIG, minibatch.observation)
     log_prob = networks.log_prob(mean, std, minibatch.action)
-    config = AlgoConfig(hidden=(8,), clip=0.2, entropy_cost=0.0, bound_cost=0.0)
+    config = AlgoConfig(hidden_sizes=(8,), clip_epsilon=0.2, entropy_cost=0.0, bound_cost=0.0)
 
     def slope(ratio: float, advantage: float) -> float:
         samples = replace(

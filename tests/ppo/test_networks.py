@@ -15,7 +15,7 @@ from swarmjax.ppo import networks
 from swarmjax.ppo.config import AlgoConfig
 
 OBSERVATION, U = 3, 2
-CONFIG = AlgoConfig(hidden=(8, 5), initial_std=0.6)
+CONFIG = AlgoConfig(hidden_sizes=(8, 5), initial_std=0.6)
 ACTIVATIONS = {
     "tanh": np.tanh,
     "relu": lambda x: np.maximum(x, 0.0),
@@ -70,7 +70,7 @@ def test_std_starts_at_the_configured_one_for_every_observation() -> None:
 
 @pytest.mark.parametrize("activation", ["tanh", "relu", "swish"])
 def test_networks_equal_a_forward_pass_in_numpy(activation: str) -> None:
-    config = AlgoConfig(hidden=(8, 5), activation=activation)
+    config = AlgoConfig(hidden_sizes=(8, 5), activation=activation)
     params = _params(config)
     observation = np.asarray(jax.random.normal(jax.random.key(1), (4, 6, OBSERVATION)))
     mean, _ = networks.action_distribution(params, config, observation)
@@ -118,7 +118,7 @@ def test_wrong_observation_size_is_refused(network: Callable[..., object]) -> No
 
 
 def test_pytorchs_initialisation_spreads_weights_and_biases_by_their_inputs() -> None:
-    config = AlgoConfig(hidden=(64, 32), initialization="uniform")
+    config = AlgoConfig(hidden_sizes=(64, 32), initialization="uniform")
     params = networks.init_params(jax.random.key(0), config, 100, 50)
     for network, last in (("actor", "mean"), ("critic", "value")):
         torso = params[network]["torso"]
@@ -137,13 +137,13 @@ def test_pytorchs_initialisation_spreads_weights_and_biases_by_their_inputs() ->
 
 
 def test_an_output_of_tanh_keeps_the_mean_within_the_commands() -> None:
-    linear = AlgoConfig(hidden=(8,))
+    linear = AlgoConfig(hidden_sizes=(8,))
     params = networks.init_params(jax.random.key(0), linear, 3, 2)
     params["actor"]["mean"]["kernel"] *= 300.0
     observation = jax.random.normal(jax.random.key(1), (5, 3))
     mean, std = networks.action_distribution(params, linear, observation)
     squashed, same = networks.action_distribution(
-        params, AlgoConfig(hidden=(8,), output="tanh"), observation
+        params, AlgoConfig(hidden_sizes=(8,), mean_activation="tanh"), observation
     )
     assert np.abs(mean).max() > 1.0
     np.testing.assert_allclose(squashed, np.tanh(mean), rtol=1e-6)  # float32
@@ -152,7 +152,7 @@ def test_an_output_of_tanh_keeps_the_mean_within_the_commands() -> None:
 
 @pytest.mark.parametrize(("exploration", "moves"), [("learned", True), ("scheduled", False)])
 def test_no_gradient_reaches_a_scheduled_deviation(exploration: str, moves: bool) -> None:
-    config = AlgoConfig(hidden=(8,), exploration=exploration)
+    config = AlgoConfig(hidden_sizes=(8,), exploration=exploration)
     params = networks.init_params(jax.random.key(0), config, 3, 2)
 
     def total(params: networks.Params) -> jax.Array:

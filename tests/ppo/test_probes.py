@@ -21,10 +21,10 @@ from swarmjax.ppo.learner import Batch, LearnerState
 
 WORLDS, UPDATES = 32, 60
 CONFIG = AlgoConfig(
-    hidden=(16, 16),
-    rollout=8,
+    hidden_sizes=(16, 16),
+    rollout_length=8,
     epochs=4,
-    minibatches=4,
+    num_minibatches=4,
     discount=0.5,
     actor_learning_rate=1e-2,
     critic_learning_rate=1e-2,
@@ -83,7 +83,7 @@ def _iterate(
 ) -> tuple[tuple[LearnerState, World], None]:
     state, world = carry
     rollout_key, update_key = jax.random.split(key)
-    keys = jax.random.split(rollout_key, CONFIG.rollout)
+    keys = jax.random.split(rollout_key, CONFIG.rollout_length)
     world, steps = jax.lax.scan(functools.partial(_act, probe, state), world, keys)
     advantage, return_ = generalized_advantages(
         steps["reward"],

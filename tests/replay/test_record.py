@@ -24,7 +24,7 @@ from swarmjax.task.config import RewardConfig, TaskConfig
 from swarmjax.task.stage_files import load_levels
 
 WEIGHTS = RewardConfig(
-    progress=2.0, proximity=-0.01, arrival=0.5, contact=-0.3, robot_contact=-0.2, time=-1e-4
+    progress=2.0, proximity=-0.01, arrival=0.5, contact=-0.3, robot_contact=-0.2, step_penalty=-1e-4
 )
 
 
@@ -66,7 +66,7 @@ def test_equation_3_by_hand():
         arrives=np.array([False, True]),
         contact_begins=np.ones((2, 3), bool),
     )
-    paper = RewardConfig(proximity=-0.001, contact=0.0, time=0.0)
+    paper = RewardConfig(proximity=-0.001, contact=0.0, step_penalty=0.0)
     found = replay_record.terms(steps, paper)
     np.testing.assert_allclose(found["progress"], [0.004, 0.0], atol=1e-12)  # 1 - 0.996 rounds
     np.testing.assert_array_equal(found["proximity"], [0.0, -0.001])

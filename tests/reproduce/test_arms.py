@@ -26,7 +26,7 @@ def test_the_paper_arms_are_the_preset() -> None:
     assert MADE["baseline"].seeds == 10
     for arm in ("curriculum", "baseline"):
         fine = MADE[f"{arm}_expanded"]
-        assert fine.start == str(OUT / arm)
+        assert fine.init_from == str(OUT / arm)
         assert (fine.stage_name, fine.budget, fine.algo) == ("paper_expanded", 250_000, PAPER.algo)
 
 
@@ -36,7 +36,7 @@ def test_the_modern_arms_differ_in_the_trainer_alone() -> None:
         modern, paper = MADE[f"modern_{arm}"], MADE[arm]
         for name in ("stage", "robot", "realism", "task", "sim", "budget", "seeds"):
             assert getattr(modern, name) == getattr(paper, name), name
-        assert replace(modern.algo, rollout=default.algo.rollout) == default.algo
+        assert replace(modern.algo, rollout_length=default.algo.rollout_length) == default.algo
         assert modern.curriculum == default.curriculum
         assert modern.updates == 1_000_000 // (16 * 32)
 
@@ -49,10 +49,15 @@ def test_each_arm_has_its_directory_and_its_log() -> None:
 
 def test_options_reach_the_arms() -> None:
     given = ReproduceConfig(
-        rollout=3000, epochs=40, time_out="leak", step_limit=750, threshold=0.5, robot="planar"
+        rollout_length=3000,
+        epochs=40,
+        time_out="leak",
+        step_limit=750,
+        threshold=0.5,
+        robot="planar",
     )
     made = reproduce_arms.settings(given, "curriculum", OUT)
-    assert (made.algo.rollout, made.algo.epochs, made.algo.time_out) == (3000, 40, "leak")
+    assert (made.algo.rollout_length, made.algo.epochs, made.algo.time_out) == (3000, 40, "leak")
     assert (made.task.step_limit, made.curriculum.threshold) == (750, 0.5)
     assert made.robot == load_train([]).robot
 

@@ -68,7 +68,7 @@ def test_auto_fills_the_share_with_a_power_of_two(
     settings = replace(
         SETTINGS,
         arenas=minibatches,
-        algo=AlgoConfig(minibatches=minibatches),
+        algo=AlgoConfig(num_minibatches=minibatches),
         run=RunConfig(memory_share=share),
     )
     chosen, why = memory.fill(settings, _linear(10**6, 1000), 10**8)
@@ -106,7 +106,7 @@ def test_auto_measures_two_small_programs_whatever_the_budget() -> None:
 
 @pytest.mark.parametrize(("minibatches", "arenas"), [(8, 128), (6, 96), (200, 200)])
 def test_auto_on_a_cpu_is_the_default(minibatches: int, arenas: int) -> None:
-    settings = replace(SETTINGS, arenas=minibatches, algo=AlgoConfig(minibatches=minibatches))
+    settings = replace(SETTINGS, arenas=minibatches, algo=AlgoConfig(num_minibatches=minibatches))
     chosen, why = memory.fill(settings, lambda _: pytest.fail("nothing to measure"), None)
     assert chosen == replace(settings, arenas=arenas)
     assert why == f"arenas=auto: {arenas}, as wherever no GPU tells its memory."
@@ -133,7 +133,7 @@ def test_training_begins_with_the_choice(
 
 
 def test_the_command_line_takes_auto() -> None:
-    settings, auto = train._settings(["arenas=auto", "algo.minibatches=4"])
+    settings, auto = train._settings(["arenas=auto", "algo.num_minibatches=4"])
     assert auto
     assert settings.arenas == 4
     settings, auto = train._settings(["arenas=auto", "arenas=64"])
@@ -141,8 +141,12 @@ def test_the_command_line_takes_auto() -> None:
     assert settings.arenas == 64
     with pytest.raises(ConfigError, match=r"^arenas is 'auto': give a whole number\.$"):
         load_train(["arenas=auto"])
-    with pytest.raises(ConfigError, match=r"^algo\.minibatches is 'many': give a whole number\.$"):
-        train._settings(["arenas=auto", "algo.minibatches=many"])
+    with pytest.raises(
+        ConfigError,
+        match=r"^algo\.num_minibatches is 'many': give a whole "
+        r"number\.$",
+    ):
+        train._settings(["arenas=auto", "algo.num_minibatches=many"])
 
 
 # Refusals
@@ -178,12 +182,12 @@ def test_a_run_too_large_is_refused_with_what_fits() -> None:
 def test_where_fewer_arenas_cannot_be_something_else_is_named() -> None:
     with pytest.raises(ConfigError) as caught:
         memory.check(replace(SETTINGS, arenas=8), 4 * GIB, 3 * GIB)
-    assert str(caught.value).endswith(": give fewer seeds, sim.max_robots or algo.rollout.")
+    assert str(caught.value).endswith(": give fewer seeds, sim.max_robots or algo.rollout_length.")
     with pytest.raises(ConfigError) as caught, memory.refusal(replace(SETTINGS, arenas=8)):
         raise jax.errors.JaxRuntimeError("INTERNAL: CUDA_ERROR_OUT_OF_MEMORY: out of memory")
     assert str(caught.value) == (
         "arenas is 8, but the memory of the device is full: give fewer seeds, sim.max_robots or "
-        "algo.rollout."
+        "algo.rollout_length."
     )
     with pytest.raises(ConfigError) as caught:
         memory.check(replace(SETTINGS, resume="runs/one"), 4 * GIB, 3 * GIB)
@@ -211,9 +215,9 @@ WORDS = [
     "sim.impl=jax",
     "sim.max_robots=2",
     "sim.max_obstacles=0",
-    "algo.rollout=2",
+    "algo.rollout_length=2",
     "algo.epochs=1",
-    "algo.hidden=[4]",
+    "algo.hidden_sizes=[4]",
     "task.step_limit=8",
     "budget=1e9",
 ]

@@ -122,7 +122,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["a\nb"], "'a\\nb' is not a setting: give key=value."),
         (["hydra/launcher=x"], "'hydra/launcher=x' is not a setting: give key=value."),
         (["arena=3"], "arena is not a key: did you mean arenas?"),
-        (["algo.clp=1"], "algo.clp is not a key: did you mean algo.clip?"),
+        (["algo.clp=1"], "algo.clp is not a key: did you mean algo.clip_epsilon?"),
         (["task.reward.progres=1"], "task.reward.progres is not a key: did you mean "
          "task.reward.progress?"),
         (["robots=3"], "robots is not a key: did you mean stage.robots?"),
@@ -131,11 +131,11 @@ def test_import_needs_neither_jax_nor_hydra():
          "algo.actor_learning_rate?"),
         (["stage_name=x"], "stage_name is not a key: did you mean stage?"),
         (["hydra.verbose=1"], "hydra is not a key: give one of stage, robot, task, algo, "
-         "curriculum, sim, seed, seeds, seeds_by, arenas, budget, realism, run, resume, start, "
-         "start_std."),
+         "curriculum, sim, seed, seeds, seeds_by, arenas, budget, realism, run, resume, init_from, "
+         "init_from_std."),
         # What Hydra's grammar refuses.
-        (["algo.hidden=[64"], "'algo.hidden=[64' cannot be read: quote a value with special "
-         "characters, as in \"algo.hidden='a=b'\"."),
+        (["algo.hidden_sizes=[64"], "'algo.hidden_sizes=[64' cannot be read: quote a value with "
+         "special characters, as in \"algo.hidden_sizes='a=b'\"."),
         (["arenas=1,2"], "'arenas=1,2' gives several values, and a run takes one: write a list "
          "as arenas=[1,2]."),
         (["arenas=${nope}"], "the settings cannot be resolved: Interpolation key 'nope' not "
@@ -167,9 +167,10 @@ def test_import_needs_neither_jax_nor_hydra():
          "layout is fence: give 1 or more."),
         # Types and bounds.
         (["task=3"], "task is 3: give keys of its own, as task.control_step."),
-        (["algo.hidden=64"], "algo.hidden is 64: give a list, as in [64,64]."),
-        (["algo.hidden=[]"], "algo.hidden is []: give at least one layer, as in [64,64]."),
-        (["algo.hidden=[64,0]"], "algo.hidden is [64,0]: give 1 to 4096."),
+        (["algo.hidden_sizes=64"], "algo.hidden_sizes is 64: give a list, as in [64,64]."),
+        (["algo.hidden_sizes=[]"], "algo.hidden_sizes is []: give at least one layer, as in "
+        "[64,64]."),
+        (["algo.hidden_sizes=[64,0]"], "algo.hidden_sizes is [64,0]: give 1 to 4096."),
         (["algo.activation=gelu"], "algo.activation is 'gelu': give tanh, relu or swish."),
         (["run.chunk=some"], "run.chunk is 'some': give a whole number, all or auto."),
         (["run.chunk=0"], "run.chunk is 0: give 1 to 2147483647."),
@@ -246,9 +247,9 @@ def test_import_needs_neither_jax_nor_hydra():
         (["seed=2147483647", "seeds=2"], "seed is 2147483647, but seeds is 2 and the last seed "
          "may be 2147483647: give at most 2147483646."),
         (["seeds_by=pmap"], "seeds_by is 'pmap': give vmap, map or cores."),
-        (["arenas=100"], "arenas is 100, but algo.minibatches is 8: give a multiple of 8."),
-        (["budget=4095"], "budget is 4095, but one update takes arenas x algo.rollout = 4096 "
-         "control steps: give at least 4096."),
+        (["arenas=100"], "arenas is 100, but algo.num_minibatches is 8: give a multiple of 8."),
+        (["budget=4095"], "budget is 4095, but one update takes arenas x algo.rollout_length = "
+         "4096 control steps: give at least 4096."),
         # 1e15 // 4096 = 244140625000; 4 epochs of 8 minibatches: (2**31 - 1) // 32 = 67108863, and
         # 67108863 * 4096 = 274877902848.
         (["budget=1e15"], "budget is 1000000000000000, which is 244140625000 updates of 4096 "
@@ -467,7 +468,7 @@ def test_a_solver_is_refused_by_its_old_name():
 
 
 def test_what_older_versions_stored_is_read_with_its_old_names_and_keys():
-    expected = load_train(["sim.solver=mjx", "algo.clip=0.1"])
+    expected = load_train(["sim.solver=mjx", "algo.clip_epsilon=0.1"])
     stored = to_dict(expected)
     stored["sim"]["solver"] = "newton"
     stored["algo"] |= dict.fromkeys(GONE, 0.5)
@@ -490,11 +491,11 @@ def test_resume_may_stop_again():
 
 def test_a_run_from_before_the_choice_of_gradient_goes_on():
     stored = to_dict(load_train([]))
-    assert stored["algo"].pop("gradient") == "auto"
-    assert load_resume(stored, []).algo.gradient == "auto"
+    assert stored["algo"].pop("update_backend") == "auto"
+    assert load_resume(stored, []).algo.update_backend == "auto"
 
 
-@pytest.mark.parametrize("word", ["arenas=256", "stage=s3", "algo.clip=0.1", "run=3"])
+@pytest.mark.parametrize("word", ["arenas=256", "stage=s3", "algo.clip_epsilon=0.1", "run=3"])
 def test_resume_refuses_other_keys(word):
     stored = to_dict(load_train([]))
     assert refusal(load_resume, stored, [word]) == (

@@ -26,10 +26,10 @@ TINY = [
     "sim.max_robots=2",
     "sim.max_obstacles=0",
     "arenas=4",
-    "algo.rollout=4",
-    "algo.minibatches=2",
+    "algo.rollout_length=4",
+    "algo.num_minibatches=2",
     "algo.epochs=1",
-    "algo.hidden=[8]",
+    "algo.hidden_sizes=[8]",
     "task.step_limit=8",
     f"budget={4 * 4 * 9}",
     "run.tensorboard=false",
@@ -94,11 +94,11 @@ def test_a_run_directory_holds_what_it_promises(whole: Path) -> None:
     summary = json.loads((whole / "summary.json").read_text())
     assert summary["updates"] == 9
     assert summary["budget_spent"] is True
-    assert (summary["impl"], summary["gradient"]) == ("jax", "autodiff")
+    assert (summary["impl"], summary["update_backend"]) == ("jax", "autodiff")
     assert summary["seeds"] == [0]
     assert summary["transitions"] == [sum(row["transitions"] for row in rows)]
     stored = json.loads((whole / "config.json").read_text())
-    assert build(TrainConfig, stored).algo.hidden == (8,)
+    assert build(TrainConfig, stored).algo.hidden_sizes == (8,)
 
 
 @pytest.mark.parametrize("chunk", ["7", "all", "auto"])
@@ -210,7 +210,7 @@ def test_several_seeds_resume_exactly(several: Path, tmp_path: Path) -> None:
 )
 def test_a_budget_too_short_for_its_stages_is_said(updates: int, said: str) -> None:
     words = [*TINY, "stage=curriculum", "stage.sequence=[s1,s2]", "task.step_limit=8"]
-    settings = load_train([*words, "arenas=4", "algo.rollout=4", f"budget={16 * updates}"])
+    settings = load_train([*words, "arenas=4", "algo.rollout_length=4", f"budget={16 * updates}"])
     sentence = " ".join(lifecycle._short_budget(settings, programs.schedule(settings)))
     assert said in sentence
     assert bool(said) == bool(sentence)
@@ -325,7 +325,7 @@ def test_a_checkpoint_of_another_shape_is_refused(
     whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stored = json.loads((whole / "config.json").read_text())
-    stored["algo"]["hidden"] = [16]
+    stored["algo"]["hidden_sizes"] = [16]
     (tmp_path / "config.json").write_text(json.dumps(stored))
     (tmp_path / "checkpoints").symlink_to(whole / "checkpoints")
     sentence = _refusal(capsys, "train", f"resume={tmp_path}")
@@ -340,7 +340,7 @@ def test_a_checkpoint_of_another_shape_is_refused(
         (["budget=ten"], ["budget", "ten", "whole number"]),
         (["stage=s6", "stage.robots=6"], ["stage.robots", "6", "sim.max_robots", "5"]),
         (["stage=s6", "stage.side=0.5"], ["stage.side", "0.5", "at least"]),
-        (["arenas=6", "algo.minibatches=4"], ["arenas", "6", "multiple of 4"]),
+        (["arenas=6", "algo.num_minibatches=4"], ["arenas", "6", "multiple of 4"]),
         (["seeds=0"], ["seeds", "0", "1 to 4096"]),
         (["run.dir=/proc/none"], ["run.dir", "/proc/none", "cannot be written"]),
     ],

@@ -28,10 +28,10 @@ TINY = [
     "sim.max_robots=2",
     "sim.max_obstacles=0",
     "arenas=4",
-    "algo.rollout=4",
-    "algo.minibatches=2",
+    "algo.rollout_length=4",
+    "algo.num_minibatches=2",
     "algo.epochs=1",
-    "algo.hidden=[8]",
+    "algo.hidden_sizes=[8]",
     "task.step_limit=8",
     f"budget={4 * 4 * UPDATES}",
     "run.tensorboard=false",
@@ -105,7 +105,7 @@ def _flip_one_bit(step: Path) -> None:
 
 
 def test_networks_and_normaliser_are_carried_and_nothing_else(trained: Path) -> None:
-    source, state, settings = _load([*OTHER, f"start={trained}"])
+    source, state, settings = _load([*OTHER, f"init_from={trained}"])
     found = checkpoint.to_leaves(warm_start.carry(source, state, settings))
     fresh = checkpoint.to_leaves(state)
     learned = checkpoint.restore(trained)[0]
@@ -129,16 +129,16 @@ def test_networks_and_normaliser_are_carried_and_nothing_else(trained: Path) -> 
 
 def test_it_is_known_how_many_robots_have_trained(trained: Path) -> None:
     # A promotion copies no learner over one that has learned: two robots trained, one begins.
-    source, state, settings = _load(["stage.robots=1", f"start={trained}"])
+    source, state, settings = _load(["stage.robots=1", f"init_from={trained}"])
     assert state.curriculum.met.tolist() == [1]
     assert warm_start.carry(source, state, settings).curriculum.met.tolist() == [2]
 
 
 def test_exploration_is_reset_only_where_that_is_said(trained: Path) -> None:
-    words = [f"start={trained}", "algo.initial_std=0.25"]
+    words = [f"init_from={trained}", "algo.initial_std=0.25"]
     source, state, keeping = _load(words)
     kept = checkpoint.to_leaves(warm_start.carry(source, state, keeping))
-    resetting = load_train([*TINY, *words, "start_std=reset"])
+    resetting = load_train([*TINY, *words, "init_from_std=reset"])
     reset = checkpoint.to_leaves(warm_start.carry(source, state, resetting))
     learned = checkpoint.restore(trained)[0]
     np.testing.assert_array_equal(kept[LOG_STD], learned[LOG_STD], strict=True)
@@ -164,11 +164,11 @@ def test_a_schedule_of_exploration_goes_on_unless_it_is_reset(
         found = checkpoint.to_leaves(warm_start.carry(source, state, settings)).get(EXPLORED)
         return None if found is None else found[0].tolist()
 
-    begun = f"start={tmp_path / 'run'}"
+    begun = f"init_from={tmp_path / 'run'}"
     assert explored(*SCHEDULED, begun) == [UPDATES * 16]  # four arenas, rollouts of four
-    assert explored(*SCHEDULED, begun, "start_std=reset") == [0]
+    assert explored(*SCHEDULED, begun, "init_from_std=reset") == [0]
     # A learned deviation has no schedule to go on with, and needs none.
-    assert explored(*SCHEDULED, f"start={trained}") == [0]
+    assert explored(*SCHEDULED, f"init_from={trained}") == [0]
     assert explored(begun) is None
 
 
@@ -186,7 +186,7 @@ def pair(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_several_seeds_begin_with_as_many_lane_by_lane(trained: Path, pair: Path) -> None:
-    source, state, settings = _load([f"start={pair}", "seeds=2", "seed=5"])
+    source, state, settings = _load([f"init_from={pair}", "seeds=2", "seed=5"])
     found = checkpoint.to_leaves(warm_start.carry(source, state, settings))
     learned = checkpoint.restore(trained)[0]
     for name in (name for name in found if name.startswith(CARRIED)):
@@ -196,7 +196,7 @@ def test_several_seeds_begin_with_as_many_lane_by_lane(trained: Path, pair: Path
 
 @pytest.mark.slow
 def test_several_seeds_may_all_begin_with_the_same_one(trained: Path) -> None:
-    source, state, settings = _load([f"start={trained}", "seeds=3"])
+    source, state, settings = _load([f"init_from={trained}", "seeds=3"])
     found = checkpoint.to_leaves(warm_start.carry(source, state, settings))
     fresh, learned = checkpoint.to_leaves(state), checkpoint.restore(trained)[0]
     for name, leaf in found.items():
@@ -210,10 +210,10 @@ def test_several_seeds_may_all_begin_with_the_same_one(trained: Path) -> None:
 def test_any_other_number_of_seeds_is_refused(
     count: int, pair: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sentence = _refusal(capsys, monkeypatch, *TINY, f"start={pair}", f"seeds={count}")
+    sentence = _refusal(capsys, monkeypatch, *TINY, f"init_from={pair}", f"seeds={count}")
     assert sentence == (
-        f"start is '{pair}', a run of 2 seeds, but seeds is {count}: give seeds=2, or a run of one "
-        "seed."
+        f"init_from is '{pair}', a run of 2 seeds, but seeds is {count}: give seeds=2, or a run "
+        "of one seed."
     )
 
 
@@ -223,7 +223,7 @@ def test_a_damaged_checkpoint_is_passed_over_and_said(
     damaged, run = tmp_path / "damaged", tmp_path / "run"
     shutil.copytree(trained, damaged)
     _flip_one_bit(damaged / "checkpoints" / "3")
-    assert train.main([*TINY, f"start={damaged}", f"run.dir={run}", "run.stop_after=0"]) == 0
+    assert train.main([*TINY, f"init_from={damaged}", f"run.dir={run}", "run.stop_after=0"]) == 0
     output = capsys.readouterr().out
     assert f"checkpoint 3 of {damaged} is damaged" in output
     assert f"what {damaged} had learned after 2 updates" in output
@@ -240,13 +240,13 @@ def test_a_started_run_resumes_without_the_run_it_started_from(
 ) -> None:
     gone, whole, parts = tmp_path / "gone", tmp_path / "whole", tmp_path / "parts"
     shutil.copytree(trained, gone)
-    words = [*TINY, f"start={gone}", "seed=1"]
+    words = [*TINY, f"init_from={gone}", "seed=1"]
     assert train.main([*words, f"run.dir={whole}"]) == 0
     assert train.main([*words, f"run.dir={parts}", "run.stop_after=1"]) == 0
     shutil.rmtree(gone)
     assert train.main([f"resume={parts}"]) == 0
     for run in (whole, parts):
-        assert read_config(run)["start"] == str(gone)
+        assert read_config(run)["init_from"] == str(gone)
     assert digest(checkpoint.restore(parts)[0]) == digest(checkpoint.restore(whole)[0])
     assert [row["update"] for row in _rows(parts)] == list(range(UPDATES))
     assert _rows(parts) == _rows(whole)
@@ -260,16 +260,16 @@ def test_a_started_run_resumes_without_the_run_it_started_from(
             "number of learners is 1, but here it is 2: give algo.policy=shared",
         ),
         (
-            ["algo.hidden=[8,8]"],
-            "algo.hidden is [8], but here it is [8,8]: give algo.hidden=[8]",
+            ["algo.hidden_sizes=[8,8]"],
+            "algo.hidden_sizes is [8], but here it is [8,8]: give algo.hidden_sizes=[8]",
         ),
         (
             ["algo.activation=relu"],
             "algo.activation is tanh, but here it is relu: give algo.activation=tanh",
         ),
         (
-            ["algo.output=tanh"],
-            "algo.output is linear, but here it is tanh: give algo.output=linear",
+            ["algo.mean_activation=tanh"],
+            "algo.mean_activation is linear, but here it is tanh: give algo.mean_activation=linear",
         ),
         (
             ["realism=webots"],
@@ -284,8 +284,8 @@ def test_other_networks_are_refused(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    sentence = _refusal(capsys, monkeypatch, *TINY, *words, f"start={trained}", "run.dry=true")
-    assert sentence == f"start is '{trained}', whose {what}, or another run."
+    sentence = _refusal(capsys, monkeypatch, *TINY, *words, f"init_from={trained}", "run.dry=true")
+    assert sentence == f"init_from is '{trained}', whose {what}, or another run."
 
 
 def test_independent_learners_are_told_how_many_they_were(
@@ -294,8 +294,8 @@ def test_independent_learners_are_told_how_many_they_were(
     stored = to_dict(load_train([*TINY, "algo.policy=independent"]))
     (tmp_path / "config.json").write_text(json.dumps(stored))
     monkeypatch.chdir(tmp_path)
-    assert _refusal(capsys, monkeypatch, *TINY, "start=.") == (
-        "start is '.', whose number of learners is 2, but here it is 1: give "
+    assert _refusal(capsys, monkeypatch, *TINY, "init_from=.") == (
+        "init_from is '.', whose number of learners is 2, but here it is 1: give "
         "algo.policy=independent sim.max_robots=2, or another run."
     )
 
@@ -307,8 +307,8 @@ def test_what_is_no_sound_run_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    words = [*TINY, "start=bad", "run.dir=new"]
-    takes = "start is 'bad': it takes the directory of a run with a sound checkpoint, but "
+    words = [*TINY, "init_from=bad", "run.dir=new"]
+    takes = "init_from is 'bad': it takes the directory of a run with a sound checkpoint, but "
     sentence = _refusal(capsys, monkeypatch, *words)
     assert sentence == f"{takes}bad is no run directory: it has no config.json."
 
@@ -331,12 +331,12 @@ def test_a_checkpoint_that_its_config_belies_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     stored = read_config(trained)
-    stored["algo"]["hidden"] = [16]
+    stored["algo"]["hidden_sizes"] = [16]
     (tmp_path / "config.json").write_text(json.dumps(stored))
     (tmp_path / "checkpoints").symlink_to(trained / "checkpoints")
-    words = [f"start={tmp_path}", "algo.hidden=[16]", f"run.dir={tmp_path / 'new'}"]
+    words = [f"init_from={tmp_path}", "algo.hidden_sizes=[16]", f"run.dir={tmp_path / 'new'}"]
     sentence = _refusal(capsys, monkeypatch, *TINY, *words)
-    assert sentence.startswith(f"start is '{tmp_path}': it takes the directory of a run with")
+    assert sentence.startswith(f"init_from is '{tmp_path}': it takes the directory of a run with")
     # The output layer of the actor is the first that is looked at: [seeds, learners, width, U].
     assert "but the checkpoint holds float32[1, 1, 8, 2] for " in sentence
     assert "this run's config needs float32[1, 1, 16, 2]." in sentence
@@ -346,22 +346,22 @@ def test_a_checkpoint_that_its_config_belies_is_refused(
     ("words", "sentence"),
     [
         (
-            ["start=a", "resume={}"],
-            "start='a' cannot be given: resume keeps the rest of the stored run and takes "
+            ["init_from=a", "resume={}"],
+            "init_from='a' cannot be given: resume keeps the rest of the stored run and takes "
             "budget, resume, run.* only.",
         ),
         (
-            ["start_std=reset"],
-            "start_std is reset, but there is no start: give start=DIR with it, the directory "
-            "of a run.",
+            ["init_from_std=reset"],
+            "init_from_std is reset, but there is no init_from: give init_from=DIR with it, the "
+            "directory of a run.",
         ),
         (
-            ["start_std=keep", "start=null"],
-            "start_std is keep, but there is no start: give start=DIR with it, the directory "
-            "of a run.",
+            ["init_from_std=keep", "init_from=null"],
+            "init_from_std is keep, but there is no init_from: give init_from=DIR with it, the "
+            "directory of a run.",
         ),
-        (["start=a", "start_std=new"], "start_std is 'new': give keep or reset."),
-        (["start="], "start is '': give text or null."),
+        (["init_from=a", "init_from_std=new"], "init_from_std is 'new': give keep or reset."),
+        (["init_from="], "init_from is '': give text or null."),
     ],
 )
 def test_keys_that_do_not_fit_together_are_refused(

@@ -432,7 +432,7 @@ def test_few_arenas_have_room_for_every_pair(arenas: int, room: int) -> None:
     """5 robots, 4 boxes, 4 walls: 10 pairs of robots and 5 x 8 others; of many, 3 a robot."""
     given = settings("warp", "planar")
     sim = dataclasses.replace(given.sim, solver="mjx", max_robots=5, max_obstacles=4)
-    minibatches = dataclasses.replace(given.algo, minibatches=1)
+    minibatches = dataclasses.replace(given.algo, num_minibatches=1)
     many = dataclasses.replace(given, sim=sim, algo=minibatches, arenas=arenas, budget=10**6)
     assert programs.load_world(many).physics.engine.template._impl.naconmax == room
 

@@ -415,7 +415,7 @@ FEW, LIFE = 4, 40  # arenas, and control steps of an episode
 def real() -> Drawn:
     """Two robots that drive about an obstacle, with all that realism makes of them."""
     arena = ["stage=s2", "stage.obstacles=1", "sim.max_robots=3", "sim.max_obstacles=1"]
-    size = [f"arenas={FEW}", f"task.step_limit={LIFE}", "algo.minibatches=2", "budget=1000000"]
+    size = [f"arenas={FEW}", f"task.step_limit={LIFE}", "algo.num_minibatches=2", "budget=1000000"]
     config = load_train([*arena, *size, "realism=real", "sim.impl=jax"])
     world, stages = programs.load_world(config), task_stage.stack(config.stage)
     draw = jax.jit(functools.partial(rollout.draw_starts, world, stages, np.zeros(FEW, np.int32)))

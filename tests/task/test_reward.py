@@ -11,8 +11,8 @@ from swarmjax.task import reward
 from swarmjax.task.config import RewardConfig
 
 RANGE = 0.04  # m
-NOTHING = RewardConfig(progress=0.0, proximity=0.0, contact=0.0, time=0.0)
-EQUATION_3 = RewardConfig(proximity=-0.001, contact=0.0, time=0.0)
+NOTHING = RewardConfig(progress=0.0, proximity=0.0, contact=0.0, step_penalty=0.0)
+EQUATION_3 = RewardConfig(proximity=-0.001, contact=0.0, step_penalty=0.0)
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def step() -> reward.Step:
         ("arrival", [0, 0, 1, 0]),
         ("contact", [0, 1, 2, 0]),
         ("robot_contact", [0, 1, 1, 0]),  # robots are the first of the three kinds
-        ("time", [1, 1, 1, 1]),
+        ("step_penalty", [1, 1, 1, 1]),
     ],
 )
 def test_term_and_its_weight(step: reward.Step, name: str, expected: list[float]) -> None:
@@ -66,7 +66,9 @@ def test_default_adds_prices_of_contacts_and_time(step: reward.Step) -> None:
 
 
 def test_terms_add_up(step: reward.Step) -> None:
-    weights = RewardConfig(progress=2.0, proximity=-1.0, arrival=8.0, contact=-0.5, time=-0.25)
+    weights = RewardConfig(
+        progress=2.0, proximity=-1.0, arrival=8.0, contact=-0.5, step_penalty=-0.25
+    )
     # 2 * progress - proximity + 8 * arrival - contact / 2 - 1/4, exact in binary.
     expected = [0.25 - 0.25, -1.0 - 0.5 - 0.25, 0.0625 - 1.0 + 8.0 - 1.0 - 0.25, -0.5 - 0.25]
     np.testing.assert_array_equal(reward.total(step, weights), expected)

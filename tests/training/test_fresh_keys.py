@@ -29,7 +29,9 @@ ARENAS, STEPS = 8, 8  # of the tiny configuration; control steps of a rollout
 @pytest.fixture(scope="module")
 def program(tiny_config: TrainConfig) -> Program:
     """One robot an arena, which compiles sooner; an episode is over at the end of each rollout."""
-    algo = replace(tiny_config.algo, hidden=(4,), epochs=1, minibatches=4, max_grad_norm=None)
+    algo = replace(
+        tiny_config.algo, hidden_sizes=(4,), epochs=1, num_minibatches=4, max_grad_norm=None
+    )
     config = replace(
         tiny_config,
         stage=(StageConfig(name="alone", robots=1, side=0.5),),
@@ -107,7 +109,7 @@ def test_every_update_shuffles_in_an_order_of_its_own(start: TrainState, update:
 def test_every_epoch_shuffles_in_an_order_of_its_own() -> None:
     """Two of four groups are valid: in one minibatch they are one step, in two they are two."""
     epochs, groups = 12, 4
-    config = AlgoConfig(hidden=(4,), epochs=epochs, minibatches=2)
+    config = AlgoConfig(hidden_sizes=(4,), epochs=epochs, num_minibatches=2)
     learner = ppo.init(jax.random.key(0), config, 3, 2, 1)
     zeros = jnp.zeros((groups, 1))
     batch = Batch(

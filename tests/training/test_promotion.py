@@ -19,7 +19,12 @@ from swarmjax.training import promotion
 
 LEARNERS, OBSERVED = 5, 3
 ALGO = AlgoConfig(
-    hidden=(4,), policy="independent", epochs=2, minibatches=1, initial_std=0.5, rollout=8
+    hidden_sizes=(4,),
+    policy="independent",
+    epochs=2,
+    num_minibatches=1,
+    initial_std=0.5,
+    rollout_length=8,
 )
 
 

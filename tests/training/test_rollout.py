@@ -221,7 +221,7 @@ def test_a_step_limit_may_be_terminal_to_bootstrapped_returns() -> None:
 def test_monte_carlo_returns_are_targets_and_advantages(time_out: str) -> None:
     shape = (20, 2, 3, 1)
     trajectory = _random_trajectory(shape)
-    config = AlgoConfig(discount=0.9, returns="monte_carlo", time_out=time_out)
+    config = AlgoConfig(discount=0.9, advantage="monte_carlo", time_out=time_out)
     found = rollout.batch(trajectory, config)
     reward, terminated, truncated, valid = (np.asarray(x) for x in trajectory[5:9])
     following, returns = np.zeros(shape[1:]), np.zeros(shape)
@@ -370,7 +370,7 @@ def test_a_long_rollout_draws_an_episode_for_every_32_control_steps(
     tiny_config: TrainConfig,
 ) -> None:
     def waiting(steps: int) -> int:
-        algo = dataclasses.replace(tiny_config.algo, rollout=steps)
+        algo = dataclasses.replace(tiny_config.algo, rollout_length=steps)
         return dataclasses.replace(tiny_config, algo=algo, budget=8 * steps).waiting
 
     assert [waiting(steps) for steps in (1, 32, 63, 64, 6000)] == [1, 1, 1, 2, 187]

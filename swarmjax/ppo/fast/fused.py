@@ -26,7 +26,7 @@ from jax.flatten_util import ravel_pytree
 from swarmjax.ppo import networks
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.fast import kernel
-from swarmjax.ppo.fast.kernel import Launch, Layout, Place, Samples, Tiles
+from swarmjax.ppo.fast.kernel import KernelLayout, Launch, Place, Samples, Tiles
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
 
@@ -57,7 +57,7 @@ def fits(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
     Returns:
         Whether `gradient` may be called.
     """
-    return kernel.fits(observation_size, config.hidden, action_size, LAUNCH.tile)
+    return kernel.fits(observation_size, config.hidden_sizes, action_size, LAUNCH.tile)
 
 
 def choose_launch(
@@ -74,10 +74,10 @@ def choose_launch(
     Returns:
         `LARGE` where the chip has room for it, and the batch has `_LEAST_TILES` for a minibatch.
     """
-    if samples is not None and samples < _LEAST_TILES * config.minibatches * LARGE.tile:
+    if samples is not None and samples < _LEAST_TILES * config.num_minibatches * LARGE.tile:
         return LAUNCH
     memory = _MEMORY.get(_capability(), kernel.SHARED_MEMORY)
-    sizes = (observation_size, config.hidden, action_size)
+    sizes = (observation_size, config.hidden_sizes, action_size)
     return LARGE if kernel.fits(*sizes, LARGE.tile, memory) else LAUNCH
 
 
@@ -154,7 +154,7 @@ def unflatten(flat: Flat, like: Params) -> Params:
     return {name: ravel_pytree(network)[1](flat[name]) for name, network in like.items()}
 
 
-def layouts(params: Params) -> dict[str, Layout]:
+def layouts(params: Params) -> dict[str, KernelLayout]:
     """Says how `flatten` lays the networks out.
 
     Args:
@@ -205,7 +205,7 @@ def shuffle(
 
 def flat_gradient(
     flat: Flat,
-    layout: dict[str, Layout],
+    layout: dict[str, KernelLayout],
     samples: Minibatch,
     tiles: Tiles,
     config: AlgoConfig,
@@ -259,7 +259,7 @@ def flat_gradient(
 
 
 def _actor_sums(
-    run: _Run, actor: jax.Array, layout: Layout, samples: Minibatch, config: AlgoConfig
+    run: _Run, actor: jax.Array, layout: KernelLayout, samples: Minibatch, config: AlgoConfig
 ) -> tuple[jax.Array, Metrics]:
     """Sums over samples of the surrogate's gradient, and of metrics."""
     loss = functools.partial(_surrogate, config, samples.action.shape[1])
@@ -268,7 +268,7 @@ def _actor_sums(
 
 
 def _critic_sums(
-    run: _Run, critic: jax.Array, layout: Layout, samples: Minibatch
+    run: _Run, critic: jax.Array, layout: KernelLayout, samples: Minibatch
 ) -> tuple[jax.Array, Metrics]:
     """Sums over samples of the gradient of half the squared error, of that, and of `valid`."""
     names = ("observation", "return_", "valid")
@@ -288,7 +288,7 @@ def _with_entropy(
     return jnp.where((index >= first) & (index < first + width), moved, gradient)
 
 
-def _layout(network: Params, last: str) -> Layout:
+def _layout(network: Params, last: str) -> KernelLayout:
     leaves, structure = jax.tree.flatten(network)
     ends = list(itertools.accumulate(leaf.size for leaf in leaves))
     firsts = jax.tree.unflatten(structure, [0, *ends[:-1]])
@@ -300,10 +300,10 @@ def _layout(network: Params, last: str) -> Layout:
         for place, layer in zip(at, layers, strict=True)
     )
     vectors = {name: (firsts[name], network[name].size) for name in network if name == "log_std"}
-    return Layout(tuple(places), vectors, ends[-1])
+    return KernelLayout(tuple(places), vectors, ends[-1])
 
 
-def _check(samples: Minibatch, layout: dict[str, Layout], config: AlgoConfig) -> None:
+def _check(samples: Minibatch, layout: dict[str, KernelLayout], config: AlgoConfig) -> None:
     chex.assert_rank([samples.observation, samples.action], 2)
     chex.assert_rank([samples.log_prob, samples.valid], 1)
     chex.assert_equal_shape([samples.log_prob, samples.advantage, samples.return_, samples.valid])
@@ -313,7 +313,7 @@ def _check(samples: Minibatch, layout: dict[str, Layout], config: AlgoConfig) ->
         assert network.layers[0].shape[0] == observation_size
     assert layout["actor"].vectors["log_std"][1] == action_size
     if not fits(config, observation_size, action_size):
-        raise ValueError(f"the kernels do not take hidden layers of {config.hidden}")
+        raise ValueError(f"the kernels do not take hidden layers of {config.hidden_sizes}")
 
 
 def _samples(samples: Minibatch, names: tuple[str, ...]) -> Samples:
@@ -330,7 +330,7 @@ def _surrogate(
     two are equal within the range. With z = (a - mu) / sigma, log pi is the sum over the action of
     -z^2 / 2 - log sigma - log(2 pi) / 2: its slopes are z / sigma by mu and z^2 - 1 by log sigma.
     """
-    mean = jnp.tanh(output) if config.output == "tanh" else output
+    mean = jnp.tanh(output) if config.mean_activation == "tanh" else output
     log_std = vectors["log_std"][None, :]
     standardised = (samples["action"] - mean) * jnp.exp(-log_std)
     log_density = jnp.sum(-0.5 * standardised * standardised - log_std, axis=1)
@@ -340,18 +340,23 @@ def _surrogate(
     log_ratio = jnp.where(valid, log_density - samples["log_prob"], 0.0)
     ratio = jnp.exp(log_ratio)
     gain = ratio * advantage
-    clipped = jnp.minimum(jnp.maximum(ratio, 1.0 - config.clip), 1.0 + config.clip) * advantage
+    clipped = (
+        jnp.minimum(jnp.maximum(ratio, 1.0 - config.clip_epsilon), 1.0 + config.clip_epsilon)
+        * advantage
+    )
     by_density = jnp.where(valid & (gain <= clipped), -gain, 0.0)[:, None]
     beyond = jnp.where(valid[:, None], networks.beyond_range(mean), 0.0)
     slope = by_density * standardised * jnp.exp(-log_std) + 2.0 * config.bound_cost * beyond
-    if config.output == "tanh":
+    if config.mean_activation == "tanh":
         slope *= 1.0 - mean * mean
     return slope, {
         "log_std": by_density * (standardised * standardised - 1.0),
         "policy_loss": jnp.where(valid, -jnp.minimum(gain, clipped), 0.0),
         "bound_loss": jnp.sum(beyond * beyond, axis=1),
         "approx_kl": ratio - 1.0 - log_ratio,  # 0 where not valid
-        "clip_fraction": jnp.where(jnp.abs(ratio - 1.0) > config.clip, 1.0, 0.0),  # likewise
+        "clip_fraction": jnp.where(
+            jnp.abs(ratio - 1.0) > config.clip_epsilon, 1.0, 0.0
+        ),  # likewise
     }
 
 

@@ -68,7 +68,7 @@ class Launch(NamedTuple):
     warps: int
 
 
-class Layout(NamedTuple):
+class KernelLayout(NamedTuple):
     """How the parameters of a network lie in one vector.
 
     Attributes:
@@ -141,7 +141,7 @@ def fits(
 
 def sums(
     parameters: jax.Array,
-    layout: Layout,
+    layout: KernelLayout,
     activation: str,
     loss: Loss,
     samples: Samples,
@@ -183,7 +183,7 @@ def sums(
     return total[: layout.size], dict(zip(told, total[layout.size :], strict=True))
 
 
-def _shapes(layout: Layout, samples: Samples, tile: int) -> Any:
+def _shapes(layout: KernelLayout, samples: Samples, tile: int) -> Any:
     """Shapes of the arguments of a tile: layers, samples and vectors, all padded."""
 
     def array(*shape: int) -> Any:
@@ -197,7 +197,7 @@ def _shapes(layout: Layout, samples: Samples, tile: int) -> Any:
 def _program(
     of_tile: Callable[..., Any],
     shapes: Any,
-    layout: Layout,
+    layout: KernelLayout,
     tile: int,
     parameters: Any,
     samples: dict[str, Any],

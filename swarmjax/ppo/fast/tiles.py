@@ -46,12 +46,18 @@ def learn(
     count, size = arranged.observation.shape
     launch = fused.choose_launch(config, size, arranged.action.shape[-1], count)
     keys = jax.random.split(key, config.epochs)
-    dealt = fused.shuffle(keys, count, valid, config.minibatches, launch)
+    dealt = fused.shuffle(keys, count, valid, config.num_minibatches, launch)
 
     def step(progress: Progress, span: jax.Array) -> tuple[Progress, jax.Array]:
         tiles = dealt._replace(span=span)
         gradient, metrics, taken = fused.flat_gradient(
-            progress[0], layouts, arranged, tiles, config, valid / config.minibatches, launch=launch
+            progress[0],
+            layouts,
+            arranged,
+            tiles,
+            config,
+            valid / config.num_minibatches,
+            launch=launch,
         )
         progress, metrics = optimizer.take(
             config, updates, progress, (gradient, metrics), taken > 0

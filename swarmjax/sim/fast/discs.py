@@ -97,7 +97,7 @@ class Data:
     qfrc_applied: Array
 
 
-class Robots(NamedTuple):
+class DiscRobots(NamedTuple):
     """The robots of an arena, or of many with a leading axis.
 
     Attributes:
@@ -117,7 +117,7 @@ class Robots(NamedTuple):
     weight: Array
 
 
-Solve = Callable[[Discs, Robots, Array, Array], Array]
+Solve = Callable[[Discs, DiscRobots, Array, Array], Array]
 
 
 def load(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve: Solve) -> Discs:
@@ -215,13 +215,13 @@ def step(discs: Discs, model: Model, data: Data, side: Array, obstacle: Array) -
     )
 
 
-def _robots(discs: Discs, model: Model, data: Data) -> Robots:
+def _robots(discs: Discs, model: Model, data: Data) -> DiscRobots:
     """The robots of an arena."""
     mass, turn = model.body_mass[discs.body], model.body_inertia[discs.body, 2]
     fields = data.qpos, data.qvel, data.qfrc_applied, data.qacc_warmstart
     place, rate, force, before = (field.reshape(-1, 3) for field in fields)
     free = force / jnp.stack([mass, mass, turn], axis=-1)
-    return Robots(place, rate, free, before, 1.0 / mass, model.body_invweight0[discs.body, 0])
+    return DiscRobots(place, rate, free, before, 1.0 / mass, model.body_invweight0[discs.body, 0])
 
 
 def spring(discs: Discs) -> tuple[float, float]:

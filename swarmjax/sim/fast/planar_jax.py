@@ -14,11 +14,11 @@ import numpy as np
 from jax import Array
 
 from swarmjax.sim import model as sim_model
-from swarmjax.sim.fast.discs import DEEPEST, TOLERANCE, Discs, Robots, spring
+from swarmjax.sim.fast.discs import DEEPEST, TOLERANCE, DiscRobots, Discs, spring
 from swarmjax.sim.infrared import Box, to_box_frame, turned
 
 
-class Gap(NamedTuple):
+class DiscGap(NamedTuple):
     """What lies between a robot and what it may touch.
 
     Attributes:
@@ -42,7 +42,7 @@ class Contact(NamedTuple):
       stiffness: what a unit of force brings about, J M^-1 J' + R, 1 / kg.
     """
 
-    gap: Gap
+    gap: DiscGap
     give: Array
     demand: Array
     stiffness: Array
@@ -55,7 +55,7 @@ class Motion(NamedTuple):
     y: Array
 
 
-def push_apart(discs: Discs, robots: Robots, side: Array, obstacle: Array) -> Array:
+def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Array:
     """Finds how the robots of one arena accelerate with their contacts.
 
     Args:
@@ -89,7 +89,7 @@ def push_apart(discs: Discs, robots: Robots, side: Array, obstacle: Array) -> Ar
     return jnp.stack([moved.x, moved.y, robots.free[:, 2]], axis=-1)
 
 
-def _contacts(discs: Discs, robots: Robots, fixture: Array) -> Contact:
+def _contacts(discs: Discs, robots: DiscRobots, fixture: Array) -> Contact:
     """All contacts [K, R] of robots: with each fixture [F, 5], then those of each round."""
     x, y, other = robots.place[:, 0], robots.place[:, 1], discs.opponent
     to_fixture = _from_box(x, y, turned(fixture[:, None], jnp), discs.radius)
@@ -97,7 +97,7 @@ def _contacts(discs: Discs, robots: Robots, fixture: Array) -> Contact:
     ahead = jnp.sign(meets).astype(jnp.float32)
     to_robot = _from_disc(x - x[other], y - y[other], ahead, discs.radius)
     to_robot = to_robot._replace(distance=jnp.where(meets == 0, jnp.inf, to_robot.distance))
-    gap = Gap(*map(jnp.concatenate, zip(to_fixture, to_robot, strict=True)))
+    gap = DiscGap(*map(jnp.concatenate, zip(to_fixture, to_robot, strict=True)))
     rate = Motion(robots.rate[:, 0], robots.rate[:, 1])
     still = np.zeros((len(fixture), 1), np.float32)
     weight, mobility = (
@@ -113,7 +113,7 @@ def _against(discs: Discs, motion: Motion, contacts: int) -> Motion:
     return Motion(*(a - jnp.concatenate([still, a[discs.opponent]]) for a in motion))
 
 
-def _pushed(gap: Gap, mobility: Array, free: Motion, force: Array) -> Motion:
+def _pushed(gap: DiscGap, mobility: Array, free: Motion, force: Array) -> Motion:
     """Adds what forces [K, R] bring about."""
     x, y = (jnp.sum(way * force, axis=0) for way in (gap.x, gap.y))
     return Motion(free.x + mobility * x, free.y + mobility * y)
@@ -136,7 +136,7 @@ def _sweep(
     return jnp.stack(found), motion
 
 
-def _from_box(x: Array, y: Array, box: Box, radius: float) -> Gap:
+def _from_box(x: Array, y: Array, box: Box, radius: float) -> DiscGap:
     """Gap between boxes and robots at x and y, m.
 
     From the nearest point of the box; of a centre within it, from the nearest face, unless that is
@@ -154,10 +154,10 @@ def _from_box(x: Array, y: Array, box: Box, radius: float) -> Gap:
     depth = -jnp.maximum(over_x, over_y)
     away = jnp.where(within, jnp.where(depth > DEEPEST, jnp.inf, -depth), length)
     world_x = box.cos * along_x - box.sin * along_y
-    return Gap(world_x, box.sin * along_x + box.cos * along_y, away - radius)
+    return DiscGap(world_x, box.sin * along_x + box.cos * along_y, away - radius)
 
 
-def _from_disc(x: Array, y: Array, ahead: Array, radius: float) -> Gap:
+def _from_disc(x: Array, y: Array, ahead: Array, radius: float) -> DiscGap:
     """Gap between robots that are x and y away, m, from others.
 
     Two hulls in one place push each other along x, as MuJoCo's do: the one that is `ahead` of the
@@ -165,10 +165,10 @@ def _from_disc(x: Array, y: Array, ahead: Array, radius: float) -> Gap:
     """
     apart = jnp.sqrt(x * x + y * y)
     along_x = jnp.where(apart > 0.0, x / apart, -ahead)
-    return Gap(along_x, jnp.where(apart > 0.0, y / apart, 0.0), apart - 2.0 * radius)
+    return DiscGap(along_x, jnp.where(apart > 0.0, y / apart, 0.0), apart - 2.0 * radius)
 
 
-def _contact(discs: Discs, gap: Gap, rate: Motion, weight: Array, mobility: Array) -> Contact:
+def _contact(discs: Discs, gap: DiscGap, rate: Motion, weight: Array, mobility: Array) -> Contact:
     """What contacts ask for.
 
     Args:
@@ -187,7 +187,7 @@ def _contact(discs: Discs, gap: Gap, rate: Motion, weight: Array, mobility: Arra
     return Contact(gap, give, demand, mobility + give)
 
 
-def _along(gap: Gap, motion: Motion) -> Array:
+def _along(gap: DiscGap, motion: Motion) -> Array:
     """J a: how fast robots move away, by how they move against what they may touch."""
     return gap.x * motion.x + gap.y * motion.y
 

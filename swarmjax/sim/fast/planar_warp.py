@@ -20,7 +20,7 @@ from jax.custom_batching import custom_vmap
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.engine import ROWS_PER_ROBOT
 from swarmjax.sim.fast import discs as sim_discs
-from swarmjax.sim.fast.discs import Discs, Robots
+from swarmjax.sim.fast.discs import DiscRobots, Discs
 
 BLOCK = 64  # threads of a block: with few arenas, the blocks of 256 would leave most of a card idle
 _TOLERANCE = wp.constant(sim_discs.TOLERANCE)
@@ -30,7 +30,7 @@ _THICKNESS = wp.constant(sim_model.WALL_HALF_THICKNESS)
 _LENGTH = wp.constant(sim_model.WALL_HALF_LENGTH)
 
 
-def push_apart(discs: Discs, robots: Robots, side: Array, obstacle: Array) -> Array:
+def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Array:
     """Finds how the robots of one arena accelerate with their contacts.
 
     Axes that `vmap` adds are arenas of one kernel, whichever they are.
@@ -66,7 +66,7 @@ def _of_arenas(solve: Any) -> Any:
     return many
 
 
-def _solve(discs: Discs, robots: Robots, side: Array, obstacle: Array) -> Array:
+def _solve(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Array:
     """The accelerations [A, R, 3] of arenas."""
     arenas, count = robots.mobility.shape
     fixtures = obstacle.shape[1] + sim_model.WALLS
@@ -80,7 +80,7 @@ def _solve(discs: Discs, robots: Robots, side: Array, obstacle: Array) -> Array:
 
 
 @wp.struct
-class Arena:
+class WarpArena:
     """What a thread reads and writes.
 
     Attributes:
@@ -129,7 +129,7 @@ def _push_apart(  # noqa: PLR0913  # JAX hands arrays over one by one
     found: wp.array2d[wp.vec3],
 ) -> None:
     """Finds the forces of an arena's contacts and what comes of them."""
-    arena = Arena()
+    arena = WarpArena()
     arena.place = place
     arena.rate = rate
     arena.before = before
@@ -159,14 +159,14 @@ def _push_apart(  # noqa: PLR0913  # JAX hands arrays over one by one
 
 
 @wp.func
-def _let_go(arena: Arena, free: wp.array2d[wp.vec3]) -> None:
+def _let_go(arena: WarpArena, free: wp.array2d[wp.vec3]) -> None:
     """Sets accelerations to those without contacts."""
     for i in range(free.shape[1]):
         arena.found[arena.index, i] = free[arena.index, i]
 
 
 @wp.struct
-class Box:
+class WarpBox:
     """A rectangle: centre (m), cosine and sine of its yaw, half edges (m)."""
 
     x: float
@@ -178,9 +178,9 @@ class Box:
 
 
 @wp.func
-def _obstacle(obstacle: wp.array3d[float], arena: int, m: int) -> Box:
+def _obstacle(obstacle: wp.array3d[float], arena: int, m: int) -> WarpBox:
     """An obstacle of an arena."""
-    box = Box()
+    box = WarpBox()
     box.x = obstacle[arena, m, 0]
     box.y = obstacle[arena, m, 1]
     box.cos = wp.cos(obstacle[arena, m, 2])
@@ -191,9 +191,9 @@ def _obstacle(obstacle: wp.array3d[float], arena: int, m: int) -> Box:
 
 
 @wp.func
-def _wall(side: float, k: int) -> Box:
+def _wall(side: float, k: int) -> WarpBox:
     """The wall east, north, west or south, as `model.fixture_rectangles` has it."""
-    box = Box()
+    box = WarpBox()
     box.cos = wp.where(k % 2 == 1, 0.0, wp.where(k == 0, 1.0, -1.0))
     box.sin = wp.where(k % 2 == 0, 0.0, wp.where(k == 1, 1.0, -1.0))
     away = 0.5 * side + _THICKNESS
@@ -205,7 +205,7 @@ def _wall(side: float, k: int) -> Box:
 
 
 @wp.func
-def _touch_box(arena: Arena, count: int, box: Box) -> int:
+def _touch_box(arena: WarpArena, count: int, box: WarpBox) -> int:
     """Writes the contacts of all robots with a box down; returns how many there are by then."""
     known = count
     for i in range(arena.place.shape[1]):
@@ -215,7 +215,7 @@ def _touch_box(arena: Arena, count: int, box: Box) -> int:
 
 
 @wp.func
-def _touch_robots(arena: Arena, count: int, i: int) -> int:
+def _touch_robots(arena: WarpArena, count: int, i: int) -> int:
     """Writes the contacts of a robot with those after it down; likewise."""
     known = count
     for j in range(i + 1, arena.place.shape[1]):
@@ -225,7 +225,7 @@ def _touch_robots(arena: Arena, count: int, i: int) -> int:
 
 
 @wp.func
-def _from_box(place: wp.vec3, box: Box, radius: float) -> wp.vec3:
+def _from_box(place: wp.vec3, box: WarpBox, radius: float) -> wp.vec3:
     """The unit vector from a box to a robot, x and y, and the gap between them, m.
 
     From the nearest point of the box; of a centre within it, from the nearest face, unless that is
@@ -264,7 +264,7 @@ def _from_disc(x: float, y: float, radius: float) -> wp.vec3:
 
 
 @wp.func
-def _touch(arena: Arena, count: int, gap: wp.vec3, first: int, second: int) -> int:
+def _touch(arena: WarpArena, count: int, gap: wp.vec3, first: int, second: int) -> int:
     """Writes a contact down, if it is one, with a first force; returns how many there are then."""
     if not (gap[2] < 0.0) or count >= arena.row.shape[0]:
         return count
@@ -300,7 +300,7 @@ def _impedance(numbers: wp.array[float], depth: float) -> float:
 
 @wp.func
 def _along(
-    arena: Arena, motion: wp.array2d[wp.vec3], x: float, y: float, first: int, second: int
+    arena: WarpArena, motion: wp.array2d[wp.vec3], x: float, y: float, first: int, second: int
 ) -> float:
     """J a: how fast the two sides of a contact move apart."""
     apart = motion[arena.index, first]
@@ -310,7 +310,7 @@ def _along(
 
 
 @wp.func
-def _push(arena: Arena, contact: int, force: float) -> None:
+def _push(arena: WarpArena, contact: int, force: float) -> None:
     """Adds what a force brings about, a += M^-1 J' f."""
     row = arena.row[contact, arena.index]
     between = arena.between[contact, arena.index]
@@ -321,14 +321,14 @@ def _push(arena: Arena, contact: int, force: float) -> None:
 
 
 @wp.func
-def _push_robot(arena: Arena, robot: int, push: wp.vec3) -> None:
+def _push_robot(arena: WarpArena, robot: int, push: wp.vec3) -> None:
     """Adds what a push brings about."""
     kick = arena.mobility[arena.index, robot] * push
     arena.found[arena.index, robot] = arena.found[arena.index, robot] + kick
 
 
 @wp.func
-def _sweep(arena: Arena, count: int) -> bool:
+def _sweep(arena: WarpArena, count: int) -> bool:
     """Sets every force to its best, the others given; says whether that changed any."""
     largest = wp.float32(0.0)
     change = wp.float32(0.0)
@@ -346,7 +346,7 @@ def _sweep(arena: Arena, count: int) -> bool:
 
 
 @wp.func
-def _finish(arena: Arena, free: wp.array2d[wp.vec3], count: int) -> None:
+def _finish(arena: WarpArena, free: wp.array2d[wp.vec3], count: int) -> None:
     """Works everything out once more from the forces, without the sweeps' rounding."""
     _let_go(arena, free)
     for k in range(count):

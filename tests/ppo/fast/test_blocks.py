@@ -12,7 +12,7 @@ from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.fast import blocks
 from swarmjax.ppo.losses import Minibatch
 
-CONFIG = AlgoConfig(hidden=(8,), minibatches=1, epochs=3, entropy_cost=0.01)
+CONFIG = AlgoConfig(hidden_sizes=(8,), num_minibatches=1, epochs=3, entropy_cost=0.01)
 GROUPS, SAMPLES = 3, 250  # 750 samples: two blocks and a part of one
 OBSERVATION, ACTION = 10, 2
 

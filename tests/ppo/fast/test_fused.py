@@ -24,7 +24,7 @@ from swarmjax.ppo.losses import Minibatch
 from swarmjax.ppo.networks import Params
 
 OBSERVATION, ACTION = 10, 2
-SMALL = AlgoConfig(hidden=(16,), entropy_cost=0.02, value_cost=0.7)
+SMALL = AlgoConfig(hidden_sizes=(16,), entropy_cost=0.02, value_cost=0.7)
 # Sums of float32 in another order, and exp(-log_std) for 1 / std: what is found is about 2e-6.
 RELATIVE = 2e-5
 H100 = AbstractDevice(device_kind="NVIDIA H100 80GB HBM3", num_cores=132, platform="gpu")
@@ -93,13 +93,13 @@ def _assert_close(found: Any, expected: Any) -> None:
     ("changes", "launch", "size", "count"),
     [
         # Seven tiles, the last of 8 samples, for three programs: two find nothing in the end.
-        ({"hidden": (64, 64)}, Launch(32, 3, 4), 200, 140.0),
-        ({"hidden": (32,), "activation": "relu"}, Launch(16, 4, 4), 70, 140.0),
-        ({"hidden": (16, 32, 16), "activation": "swish"}, Launch(16, 100, 4), 64, 60.0),
+        ({"hidden_sizes": (64, 64)}, Launch(32, 3, 4), 200, 140.0),
+        ({"hidden_sizes": (32,), "activation": "relu"}, Launch(16, 4, 4), 70, 140.0),
+        ({"hidden_sizes": (16, 32, 16), "activation": "swish"}, Launch(16, 100, 4), 64, 60.0),
         ({"exploration": "scheduled"}, Launch(64, 1, 4), 65, 40.0),
-        ({"output": "tanh"}, Launch(32, 2, 4), 40, 30.0),
+        ({"mean_activation": "tanh"}, Launch(32, 2, 4), 40, 30.0),
         # With 0.25 expected, the sums are divided by 1.
-        ({"clip": 0.3}, Launch(32, 2, 4), 9, 0.25),
+        ({"clip_epsilon": 0.3}, Launch(32, 2, 4), 9, 0.25),
     ],
 )
 def test_gradient_and_metrics_are_those_of_autodiff(
@@ -110,7 +110,7 @@ def test_gradient_and_metrics_are_those_of_autodiff(
     minibatch = _minibatch(params, config, size)
     expected = _expected(params, minibatch, config, count)
     assert 0.0 < expected[1]["clip_fraction"] * max(count, 1.0) < np.sum(minibatch.valid)
-    assert (expected[1]["bound_loss"] > 0.0) == (config.output == "linear")
+    assert (expected[1]["bound_loss"] > 0.0) == (config.mean_activation == "linear")
     _assert_close(_fused(params, minibatch, config, count, launch), expected)
 
 
@@ -246,7 +246,7 @@ def _assert_learned_alike(found: Any, expected: Any) -> None:
 def test_a_learner_that_takes_all_at_once_learns_as_by_autodiff(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    config = replace(SMALL, minibatches=1, epochs=3)
+    config = replace(SMALL, num_minibatches=1, epochs=3)
     begun = ppo.init(jax.random.key(0), config, OBSERVATION, ACTION, 5)
     batch = _batch(_minibatch(begun.params, config, 8 * 20), 8)
     expected = _learn(config, begun, batch, "autodiff")
@@ -258,7 +258,7 @@ def test_a_learner_that_takes_all_at_once_learns_as_by_autodiff(
 def test_a_learner_steps_through_the_tiles_that_it_has_shuffled(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    config = replace(SMALL, minibatches=4, epochs=2)
+    config = replace(SMALL, num_minibatches=4, epochs=2)
     begun = ppo.init(jax.random.key(0), config, OBSERVATION, ACTION, 5)
     drawn = _minibatch(begun.params, config, 32 * 40)
     _interpret(monkeypatch)
@@ -287,7 +287,7 @@ def test_a_learner_steps_through_the_tiles_that_it_has_shuffled(
 
 
 def test_minibatches_without_a_valid_sample_are_no_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = replace(SMALL, minibatches=4, epochs=3)
+    config = replace(SMALL, num_minibatches=4, epochs=3)
     begun = ppo.init(jax.random.key(0), config, OBSERVATION, ACTION, 5)
     drawn = _minibatch(begun.params, config, 8 * 40)
     _interpret(monkeypatch)
@@ -302,7 +302,7 @@ def test_minibatches_without_a_valid_sample_are_no_steps(monkeypatch: pytest.Mon
 
 
 def test_learners_side_by_side_learn_as_each_does_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = replace(SMALL, minibatches=2, epochs=2)
+    config = replace(SMALL, num_minibatches=2, epochs=2)
     _interpret(monkeypatch)
     begun, batches = [], []
     for seed, share in enumerate((1.0, 0.4, 0.0)):
@@ -348,7 +348,7 @@ def test_what_the_kernels_tell_are_the_metrics_of_the_loss() -> None:
 
 @pytest.mark.parametrize("name", ["actor", "critic"])
 def test_a_layout_finds_each_parameter_in_the_vector(name: str) -> None:
-    params = _params(AlgoConfig(hidden=(16, 32)))
+    params = _params(AlgoConfig(hidden_sizes=(16, 32)))
     layout, flat = fused.layouts(params)[name], np.asarray(fused.flatten(params)[name])
     network = params[name]
     layers = [*network["torso"].values(), network["mean" if name == "actor" else "value"]]
@@ -380,7 +380,7 @@ def test_a_layout_finds_each_parameter_in_the_vector(name: str) -> None:
 def test_layers_fit_by_their_widths_and_by_the_memory_on_the_chip(
     hidden: tuple[int, ...], possible: bool
 ) -> None:
-    config = AlgoConfig(hidden=hidden)
+    config = AlgoConfig(hidden_sizes=hidden)
     assert fused.fits(config, OBSERVATION, ACTION) is possible
     if not possible:
         params = _params(config)
@@ -412,7 +412,7 @@ def test_tiles_are_as_large_as_the_chip_takes(
     capability: str, hidden: tuple[int, ...], expected: Launch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _on(monkeypatch, compute_capability=capability)
-    found = fused.choose_launch(AlgoConfig(hidden=hidden), OBSERVATION, ACTION)
+    found = fused.choose_launch(AlgoConfig(hidden_sizes=hidden), OBSERVATION, ACTION)
     assert found == expected
 
 
@@ -421,5 +421,5 @@ def test_a_small_batch_has_small_tiles(
     samples: int, expected: Launch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _on(monkeypatch, compute_capability="9.0")
-    config = AlgoConfig(minibatches=8)  # 8 tiles of 128 a minibatch are 8,192 samples
+    config = AlgoConfig(num_minibatches=8)  # 8 tiles of 128 a minibatch are 8,192 samples
     assert fused.choose_launch(config, OBSERVATION, ACTION, samples) == expected

@@ -1,0 +1,67 @@
+"""Keys that have a new name: refused with it when they are typed, read where they are stored."""
+
+import pytest
+from sentences import refusal
+
+from swarmjax.config import build, to_dict
+from swarmjax.config.section import modernise
+from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
+from swarmjax.run.settings import TrainConfig, from_stored, load_train
+
+RENAMED = {
+    "algo.rollout": ("algo.rollout_length", 16),
+    "algo.minibatches": ("algo.num_minibatches", 4),
+    "algo.hidden": ("algo.hidden_sizes", [32]),
+    "algo.clip": ("algo.clip_epsilon", 0.1),
+    "algo.returns": ("algo.advantage", "monte_carlo"),
+    "algo.output": ("algo.mean_activation", "tanh"),
+    "algo.gradient": ("algo.update_backend", "autodiff"),
+    "task.reward.time": ("task.reward.step_penalty", -0.01),
+    "start": ("init_from", "runs/a"),
+    "start_std": ("init_from_std", "reset"),
+}
+
+
+@pytest.mark.parametrize(("old", "new"), [(old, new) for old, (new, _) in RENAMED.items()])
+def test_an_old_key_is_refused_with_its_new_name(old: str, new: str) -> None:
+    assert refusal(load_train, [f"{old}=1"]) == f"{old} is called {new} now: give {new}."
+
+
+def test_an_old_key_of_the_reproduction_is_refused_with_its_new_name() -> None:
+    sentence = "rollout is called rollout_length now: give rollout_length."
+    assert refusal(load_reproduce, ["rollout=64"]) == sentence
+
+
+def test_stored_settings_are_read_by_their_old_names() -> None:
+    new = to_dict(load_train(["algo.gae_lambda=null", "algo.time_out=null"]))
+    new["algo"] |= {"gae_lambda": None, "time_out": None}
+    old = {**new, "algo": dict(new["algo"]), "task": {**new["task"]}}
+    old["task"]["reward"] = dict(new["task"]["reward"])
+    for name, (key, value) in RENAMED.items():
+        *path, last = key.split(".")
+        section = old
+        for part in path:
+            section = section[part]
+        del section[last]
+        section[name.rpartition(".")[2]] = value
+    found = to_dict(from_stored(old))
+    for key, value in RENAMED.values():
+        held = found
+        for part in key.split("."):
+            held = held[part]
+        assert held == value
+
+
+def test_a_stored_key_that_was_never_one_is_refused() -> None:
+    stored = to_dict(load_train([])) | {"never": 1}
+    assert refusal(from_stored, stored).startswith("never is not a key: ")
+
+
+def test_what_is_no_section_is_left_for_the_reader_to_refuse() -> None:
+    assert modernise(TrainConfig, 3) == 3
+    assert modernise(TrainConfig, {"algo": 3}) == {"algo": 3}
+
+
+def test_a_stored_reproduction_is_read_by_its_old_name() -> None:
+    stored = modernise(ReproduceConfig, {"rollout": 64, "epochs": 2})
+    assert build(ReproduceConfig, stored).rollout_length == 64
