@@ -9,14 +9,15 @@ import swarmjax
 
 ROOT = Path(swarmjax.__file__).parent
 # What every room may import, and what each may import of the others.
-SHARED = {"config", "epuck", "policy", "policy_file", "atomic_file", "provenance", "command"}
+SHARED = {"config", "epuck", "extension", "policy", "policy_file", "atomic_file"}
+SHARED |= {"provenance", "command"}
 ROOMS = {
     "config": set(),
     "sim": {"config", "epuck"},
-    "task": {"config", "epuck", "sim"},
-    "ppo": {"config"},
+    "task": {"config", "epuck", "extension", "sim"},
+    "ppo": {"config", "extension"},
     "curriculum": {"config", "task"},
-    "training": {"config", "provenance", "sim", "task", "ppo", "curriculum"},
+    "training": {"config", "extension", "provenance", "sim", "task", "ppo", "curriculum"},
     "run": SHARED | {"sim", "task", "ppo", "curriculum", "training"},
     "evaluate": SHARED | {"sim", "task"},
     "export": SHARED | {"sim", "run"},
@@ -31,6 +32,7 @@ ALSO = {
 }
 # What rooms share imports no room but `config`; policy.py, which people take along, nothing.
 ALONE: dict[str, set[str]] = {
+    "extension": {"config"},
     "policy": set(),
     "epuck": set(),
     "atomic_file": set(),

@@ -41,16 +41,45 @@ def compose(
         ConfigError: a word, a choice or a file is unsound.
     """
     words = split_words(cls, overrides)
-    groups = {key: word.partition("=")[2] for key, word in words.items() if choices(key)}
+    groups = {
+        key: word.partition("=")[2].strip("'\"") for key, word in words.items() if choices(key)
+    }
+    own = {key: choice for key, choice in groups.items() if is_path(choice)}
     for key, choice in groups.items():
         check_choice(key, choice, key)
     for key in words.keys() - groups.keys():
         _parse(words[key])
     for group, choice in (defaults(command) | groups).items():
-        read_file(f"{group}/{choice}")  # names a broken file, where Hydra would not
+        if choice is not None:
+            read_choice(group, choice)  # names a broken file, where Hydra would not
     forced = [word if key in groups else f"++{word}" for key, word in words.items()]
-    composed, chosen = _hydra(command, forced)
-    return _resolve(composed), chosen
+    composed, chosen = _hydra(command, [word for word in forced if not _is_of(word, own)])
+    mapping = _resolve(composed)
+    for group, path in own.items():
+        mine = {key: word for key, word in words.items() if key.startswith(f"{group}.")}
+        mapping[group] = _merge(read_choice(group, path), values(mine).get(group, {}))
+    return mapping, chosen | own
+
+
+def is_path(choice: str) -> bool:
+    """Tell whether the choice of a group is a file of the user's rather than one of configs/."""
+    return choice.endswith((".yaml", ".yml"))
+
+
+def _is_of(word: str, groups: Mapping[str, str]) -> bool:
+    """Tell whether a word chooses one of these groups, or sets a key in it."""
+    return word.removeprefix("++").partition("=")[0].partition(".")[0] in groups
+
+
+def _merge(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Set keys of nested plain data, leaving the others."""
+    found = dict(base)
+    for key, value in over.items():
+        inner = found.get(key)
+        if isinstance(inner, dict) and isinstance(value, Mapping):
+            value = _merge(inner, value)
+        found[key] = value
+    return found
 
 
 def load[C: Section](cls: type[C], overrides: Sequence[str], complete: Complete | None = None) -> C:
@@ -124,6 +153,24 @@ def read_file(name: str) -> dict[str, Any]:
     return read_yaml(_config_dir() / f"{name}.yaml")
 
 
+def read_choice(group: str, choice: str) -> dict[str, Any]:
+    """Read the file that the choice of a group names.
+
+    Args:
+        group: a folder of configs/.
+        choice: the name of a file in it, or the path of another file.
+
+    Raises:
+        ConfigError: it cannot be read, or is a file of the user's that chooses other files.
+    """
+    if not is_path(choice):
+        return read_file(f"{group}/{choice}")
+    found = read_yaml(Path(choice))
+    if "defaults" in found:
+        raise ConfigError(f"{choice} has defaults, which only files of configs/ may have: drop it.")
+    return found
+
+
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a file of keys and values as it stands.
 
@@ -175,18 +222,22 @@ def check_choice(group: str, choice: str, key: str) -> None:
 
     Args:
         group: a folder of configs/.
-        choice: the name of a file in it.
+        choice: the name of a file in it, or the path of another file.
         key: what a sentence calls it.
 
     Raises:
         ConfigError: there is none of this name.
     """
     names = choices(group)
-    if choice not in names:
+    if is_path(choice):
+        if not Path(choice).is_file():
+            raise ConfigError(f"{key} is {show(choice)}, and there is no such file.")
+    elif choice not in names:
         # Names as short as s7 and s6 share half their letters, below difflib's own cutoff of 0.6.
         near = difflib.get_close_matches(choice, names, n=1, cutoff=0.5)
         hint = f" (nearest: {near[0]})" if near else ""
-        raise ConfigError(f"{key} is {show(choice)}: give one of {', '.join(names)}{hint}.")
+        file = ", or a file .yaml" if group == "stage" else ""
+        raise ConfigError(f"{key} is {show(choice)}: give one of {', '.join(names)}{hint}{file}.")
 
 
 # Words

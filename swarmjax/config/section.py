@@ -55,6 +55,7 @@ def about(
     above: float = -math.inf,
     below: float = math.inf,
     derived: bool = False,
+    stored: bool = True,
     renamed: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
     """Return the metadata of a field.
@@ -66,10 +67,12 @@ def about(
         above: a number that it must exceed.
         below: a number that it must not reach.
         derived: whether it follows from the files chosen, and is no key of the command line.
+        stored: whether `to_dict` keeps it; what is not stored is worked out again.
         renamed: values that have a new name, by the old one.
     """
     bounds = Bounds(low, high, above, below)
-    return {"meaning": meaning, "bounds": bounds, "derived": derived, "renamed": renamed or {}}
+    found = {"meaning": meaning, "bounds": bounds, "renamed": renamed or {}}
+    return found | {"derived": derived, "stored": stored}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,6 +102,13 @@ class Section:
 
     def _check(self) -> None:
         """Refuse what no single bound can say; keys are named from this section on."""
+
+
+class ByName(dict[str, Any]):
+    """Values by names that the section does not know; never edited, so that settings hash."""
+
+    def __hash__(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return hash(frozenset(self.items()))
 
 
 def _leaves(value: object) -> Iterator[object]:
@@ -175,7 +185,12 @@ def _refuse_renamed(item: dataclasses.Field[Any], value: object, key: str) -> No
 
 def to_dict(config: Section) -> dict[str, Any]:
     """Return a section as plain data for JSON, from which `build` makes it again."""
-    return {key: _plain(value) for key, value in dataclasses.asdict(config).items()}
+    found = {}
+    for item in dataclasses.fields(config):
+        value = getattr(config, item.name)
+        if item.metadata.get("stored", True):
+            found[item.name] = _plain(value)
+    return found
 
 
 def modernise(cls: type[Section], stored: Any) -> Any:
@@ -213,7 +228,9 @@ def _modernise_value(item: dataclasses.Field[Any], value: Any) -> Any:
 
 
 def _plain(value: object) -> object:
-    """Turn the tuples of nested plain data into lists."""
+    """Turn sections into dictionaries, and tuples into lists."""
+    if isinstance(value, Section):
+        return to_dict(value)
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, tuple):
@@ -334,15 +351,11 @@ def convert(hint: object, value: object, key: str) -> object:
     Raises:
         ConfigError: it cannot be turned into that.
     """
-    section = _section(hint)
-    if _is_list(hint):
-        if not isinstance(value, list | tuple):
-            raise ConfigError(f"{key} is {show(value)}: give {_describe(hint)}.")
-        inner = typing.get_args(hint)[0]
-        return tuple(
-            convert(inner, item, _item_key(key, value, index) if section else key)
-            for index, item in enumerate(value)
-        )
+    section, lists = _section(hint), [each for each in options(hint) if _is_list(each)]
+    if lists and not (value is None and type(None) in options(hint)):
+        return _listed(lists[0], value, key)
+    if typing.get_origin(hint) is dict:
+        return _by_name(typing.get_args(hint)[1], value, key)
     if section is not None:
         mapping = typing.cast(Mapping[str, Any], value)
         return build(section, mapping, key if key.endswith(": ") else f"{key}.")
@@ -354,6 +367,25 @@ def convert(hint: object, value: object, key: str) -> object:
         except (TypeError, ValueError, OverflowError):
             continue
     raise ConfigError(f"{key} is {show(value)}: give {_describe(hint)}.")
+
+
+def _listed(hint: object, value: object, key: str) -> tuple[object, ...]:
+    """Convert a list of values of one type."""
+    if not isinstance(value, list | tuple):
+        raise ConfigError(f"{key} is {show(value)}: give {_describe(hint)}.")
+    inner = typing.get_args(hint)[0]
+    section = _section(hint)
+    return tuple(
+        convert(inner, item, _item_key(key, value, index) if section else key)
+        for index, item in enumerate(value)
+    )
+
+
+def _by_name(hint: object, value: object, key: str) -> "ByName":
+    """Convert values of one type, by names that the section does not know."""
+    if not isinstance(value, Mapping):
+        raise ConfigError(f"{key} is {show(value)}: give values by name, as in {key}.NAME=1.")
+    return ByName({str(name): convert(hint, each, f"{key}.{name}") for name, each in value.items()})
 
 
 def _item_key(key: str, items: Sequence[Any], index: int) -> str:
@@ -404,9 +436,13 @@ def _describe(hint: object, bounds: str = "") -> str:
         examples = {int: "[64,64]", str: "[s1,s2]", float | tuple[float, float]: "[0.7,[0.8,1.2]]"}
         inner = typing.get_args(hint)[0]
         return f"a list, as in {examples[inner]}{bounds}" if inner in examples else "a list"
+    if typing.get_origin(hint) is dict:
+        return "values by name"
     words = []
     for option in options(hint):
-        if typing.get_origin(option) is Literal:
+        if _is_list(option):
+            words.append(_describe(option, bounds))
+        elif typing.get_origin(option) is Literal:
             words += typing.get_args(option)
         elif _is_range(option):
             whole = "whole " if typing.get_args(option)[0] is int else ""

@@ -201,6 +201,7 @@ def schedule(
     updates: int,
     step_limit: int,
     rollout: int,
+    drawings: Sequence[str] = (),
 ) -> Schedule:
     """Works the curriculum's numbers out.
 
@@ -212,6 +213,7 @@ def schedule(
       updates: of the whole run.
       step_limit: control steps of an episode, at most.
       rollout: control steps of an update.
+      drawings: names of an extension's ways of drawing levels.
 
     Returns:
       The numbers, an argument of the compiled program.
@@ -221,7 +223,7 @@ def schedule(
         share = options.budget_share * updates / max(len(stages) - 1, 1)
         deadline[:-1] = [math.ceil(share * (i + 1)) for i in range(len(stages) - 1)]
     return Schedule(
-        stages=task_stage.stack(stages),
+        stages=task_stage.stack(stages, drawings),
         deadline=np.array(deadline, np.int32),
         threshold=_number(options.threshold, math.nan),
         demotion=_number(options.demotion, -1.0),

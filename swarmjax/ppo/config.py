@@ -1,11 +1,12 @@
 """The settings of PPO."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.config.section import MAX_COUNT
+from swarmjax.extension import Network
 
 # The options of the algorithm that belong to one choice: whose, which, and what null stands for.
 _ALGO_OPTIONS: dict[str, tuple[str, str, float | int]] = {
@@ -47,6 +48,13 @@ class AlgoConfig(Section):
     )
     policy: Literal["shared", "independent"] = field(
         default="shared", metadata=about("one policy for all agents, or one for each")
+    )
+    network: str | None = field(
+        default=None,
+        metadata=about("of actor and critic: mlp, or a name of extensions; null: theirs, if any"),
+    )
+    torso: Any = field(
+        default=None, metadata=about("module of an extension's network", derived=True, stored=False)
     )
     hidden_sizes: tuple[int, ...] = field(
         default=(64, 64), metadata=about("widths of the hidden layers", 1, 4096)
@@ -197,3 +205,28 @@ class AlgoConfig(Section):
                 f"time_out is {self.time_out}, but advantage is {self.advantage}: "
                 f"give {' or '.join(allowed)}."
             )
+
+
+def resolve(config: AlgoConfig, networks: Sequence[Network]) -> str:
+    """Return the name of the network that a config means.
+
+    Args:
+        config: names a network, or leaves it to the extension.
+        networks: of an extension.
+
+    Raises:
+        ConfigError: there is none of that name, or several to choose from.
+    """
+    names = [piece.name for piece in networks]
+    if config.network is None and len(names) > 1:
+        raise ConfigError(
+            f"extensions holds the networks {', '.join(names)}: choose one, as in "
+            f"algo.network={names[0]}."
+        )
+    name = config.network or [*names, "mlp"][0]
+    if name not in ("mlp", *names):
+        raise ConfigError(
+            f"algo.network is {show(name)}: give one of {', '.join(['mlp', *names])}, or "
+            "extensions=FILE, a file that defines it."
+        )
+    return name

@@ -100,6 +100,8 @@ def _fits(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
     """Whether the kernels take networks of this size."""
     from swarmjax.ppo.fast import fused
 
+    if config.torso is not None:  # the kernels know hidden layers alone
+        return False
     return fused.fits(config, observation_size, action_size)
 
 

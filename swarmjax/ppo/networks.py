@@ -5,6 +5,8 @@ B stands for any number of leading axes, O for the observation and U for the act
 
 import functools
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, cast
 
 import chex
@@ -12,7 +14,9 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from swarmjax.ppo.config import AlgoConfig
+from swarmjax.config import ConfigError
+from swarmjax.extension import Network, describe
+from swarmjax.ppo.config import AlgoConfig, resolve
 
 Params = dict[str, Any]
 
@@ -48,7 +52,7 @@ class _Actor(nn.Module):
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-        features = _Torso(self.config, name="torso")(observation)
+        features = _torso(self.config)(observation)
         layer = _layer(self.config, features, self.action_size, _HEAD_GAIN, "mean")
         log_std = self.param(
             "log_std",
@@ -66,8 +70,13 @@ class _Critic(nn.Module):
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> jax.Array:
-        features = _Torso(self.config, name="torso")(observation)
+        features = _torso(self.config)(observation)
         return _layer(self.config, features, 1, _HEAD_GAIN, "value")(features)[..., 0]
+
+
+def _torso(config: AlgoConfig) -> nn.Module:
+    """Makes what comes before the heads: hidden layers, or an extension's network."""
+    return _Torso(config, name="torso") if config.torso is None else config.torso(name="torso")
 
 
 def _layer(config: AlgoConfig, features: jax.Array, width: int, gain: float, name: str) -> nn.Dense:
@@ -122,7 +131,7 @@ def action_distribution(
         The mean [B, U], within -1..1 if the output is tanh, otherwise unbounded, and the standard
         deviation [U], which no observation changes, nor any gradient if it is scheduled.
     """
-    chex.assert_axis_dimension(observation, -1, _input_size(params["actor"]))
+    _check_input(params["actor"], observation)
     actor = _Actor(config, params["actor"]["log_std"].shape[-1])
     output = actor.apply({"params": params["actor"]}, observation)
     mean, log_std = cast("tuple[jax.Array, jax.Array]", output)
@@ -142,7 +151,7 @@ def value(params: Params, config: AlgoConfig, observation: jax.Array) -> jax.Arr
     Returns:
         The expected discounted return, [B].
     """
-    chex.assert_axis_dimension(observation, -1, _input_size(params["critic"]))
+    _check_input(params["critic"], observation)
     return cast("jax.Array", _Critic(config).apply({"params": params["critic"]}, observation))
 
 
@@ -189,5 +198,52 @@ def entropy(std: jax.Array) -> jax.Array:
     return jnp.sum(jnp.log(std) + 0.5 * math.log(2.0 * math.pi * math.e))
 
 
-def _input_size(network: Params) -> int:
-    return network["torso"]["hidden_0"]["kernel"].shape[-2]
+def _check_input(network: Params, observation: jax.Array) -> None:
+    """Holds an observation to the size that hidden layers take; other networks check it."""
+    first = network.get("torso", {}).get("hidden_0", {})
+    if "kernel" in first:
+        chex.assert_axis_dimension(observation, -1, first["kernel"].shape[-2])
+
+
+def bind(config: AlgoConfig, networks: Sequence[Network], observation_size: int) -> AlgoConfig:
+    """Gives a config the module that it names.
+
+    Args:
+        config: Names a network, or leaves it to the extension.
+        networks: Of an extension.
+        observation_size: O.
+
+    Returns:
+        The config with the module as its `torso`; as it is where that is `mlp`.
+
+    Raises:
+        ConfigError: The network is missing, or does not return features.
+    """
+    name = resolve(config, networks)
+    found = {piece.name: piece for piece in networks}
+    if name == "mlp":
+        return config
+    bound = replace(config, network=name, torso=found[name].function)
+    _check_torso(bound, observation_size)
+    return bound
+
+
+def _check_torso(config: AlgoConfig, observation_size: int) -> None:
+    """Refuses a network that fails, or does not turn [B, O] into [B, F]."""
+    seen = jax.ShapeDtypeStruct((3, observation_size), jnp.float32)
+    where = f"network {config.network}"
+    try:
+        made = config.torso()
+        found, variables = jax.eval_shape(made.init_with_output, jax.random.key(0), seen)
+    except Exception as error:
+        raise ConfigError(f"{where} fails: {describe(error)}.") from None
+    other = sorted(set(variables) - {"params"})
+    if other:
+        raise ConfigError(f"{where} keeps {', '.join(other)}: a network may keep only params.")
+    shape = getattr(found, "shape", ())
+    if len(shape) != 2 or shape[0] != 3 or found.dtype != jnp.float32:
+        kind = getattr(found, "dtype", type(found).__name__)
+        raise ConfigError(
+            f"{where} turns float32 [3, {observation_size}] into {kind} {list(shape)}: return "
+            "float32 [3, F], the features that the heads take."
+        )

@@ -2,14 +2,15 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+from swarmjax import extension
 from swarmjax.config import ConfigError, Section, about, build, files, to_dict
 from swarmjax.config.section import MAX_COUNT, modernise
-from swarmjax.ppo.config import AlgoConfig
-from swarmjax.task import stage_files
+from swarmjax.ppo.config import AlgoConfig, resolve
+from swarmjax.task import pieces, stage_files
 from swarmjax.task.config import check_realism
 from swarmjax.training.config import ProgramConfig
 
@@ -220,9 +221,43 @@ def load_train(overrides: Sequence[str], *, auto: bool = False) -> TrainConfig:
                 "init_from=DIR with it, the directory of a run."
             )
         stages = stage_files.expand(mapping.get("stage", {}), chosen["stage"])
-        return mapping | {"stage": stages, "stage_name": chosen["stage"]}
+        return mapping | {"stage": stages, "stage_name": stage_files.name_of(chosen["stage"])}
 
-    return files.load(TrainConfig, overrides, complete)
+    return settle(files.load(TrainConfig, overrides, complete))
+
+
+def settle(settings: TrainConfig) -> TrainConfig:
+    """Name in full the pieces of extensions that a run uses, with their digests.
+
+    Args:
+        settings: the config; digests that it holds already are those of a stored run.
+
+    Raises:
+        ConfigError: a piece is missing, or is not the one that the stored run used.
+    """
+    found = extension.load(settings.extensions)
+    extension.check_needs(settings.pieces, found, "the stored run")
+    used = pieces.choose(found, settings.task, settings.stage)
+    network = resolve(settings.algo, found.networks)
+    if settings.extensions is None:
+        return settings
+    chosen = found._replace(
+        rewards=tuple(piece for piece, _ in used.terms),
+        observations=used.observations,
+        levels=tuple(each for each in found.levels if each.name in _levels(settings)),
+        networks=tuple(each for each in found.networks if each.name == network),
+    )
+    return replace(
+        settings,
+        task=pieces.resolve(found, settings.task),
+        algo=replace(settings.algo, network=network),
+        pieces=chosen.digests(),
+    )
+
+
+def _levels(settings: TrainConfig) -> set[str]:
+    """Return how the levels of the stages are drawn."""
+    return {stage.level for stage in settings.stage}
 
 
 def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainConfig:
@@ -248,4 +283,4 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
     given = files.values(words)
     kept = to_dict(from_stored(stored, "stored "))
     run = kept["run"] | {"stop_after": None} | given.get("run", {})
-    return build(TrainConfig, kept | given | {"run": run})
+    return settle(build(TrainConfig, kept | given | {"run": run}))

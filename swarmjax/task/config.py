@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from swarmjax import epuck
 from swarmjax.config import ConfigError, Section, about, show
-from swarmjax.config.section import MAX_COUNT
+from swarmjax.config.section import MAX_COUNT, ByName
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
 
@@ -27,6 +27,10 @@ class RewardConfig(Section):
         default=0.0, metadata=about("besides, per contact event with another robot")
     )
     step_penalty: float = field(default=-0.002, metadata=about("per control step until arrival"))
+    extra: dict[str, float] = field(
+        default_factory=ByName,
+        metadata=about("weights of the terms of extensions, by their names; 0: off"),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +53,10 @@ class TaskConfig(Section):
     encoding: Literal["auto", "metric", "webots"] = field(
         default="auto",
         metadata=about("what is observed: m and rad, or as in Webots; auto: as realism.infrared"),
+    )
+    observations: tuple[str, ...] | None = field(
+        default=None,
+        metadata=about("of extensions, in their order; null: all of them"),
     )
     reward: RewardConfig = field(default_factory=RewardConfig)
 

@@ -5,9 +5,12 @@ here, for training and for the judge alike. A factor that is off leaves no trace
 a policy observes the rays as they are, and its wheels turn as commanded.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple
 
+from swarmjax.extension import Observation
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import infrared, motor, noise, response
 from swarmjax.sim.body import Chassis
@@ -18,9 +21,9 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import observation
 from swarmjax.task.config import TaskConfig, resolve_encoding
 from swarmjax.task.factors import Factors
+from swarmjax.task.observation import Encoding, Layout, Readings
 
 Array = Any
-Encoding = Literal["metric", "webots"]
 _SLACK = 1e-4  # of a period: a sample that is due now is not put off by rounding
 
 
@@ -33,12 +36,19 @@ class Electronics:
       encoding: what the policy observes.
       sensor_range: beyond which it observes no infrared distance, m.
       control_step: s.
+      own: observations of an extension that follow the built-in ones.
     """
 
     realism: RealismConfig
     encoding: Encoding
     sensor_range: float
     control_step: float
+    own: tuple[Observation, ...] = ()
+
+    @cached_property
+    def layout(self) -> Layout:
+        """What the entries of an observation are."""
+        return observation.layout(self.encoding, self.own)
 
     @property
     def reach(self) -> float:
@@ -75,21 +85,29 @@ class Sight(NamedTuple):
       reflectance: [..., R, K] of what each ray meets, or None for 1.
       distance: [..., R] to the target, m.
       bearing: [..., R] of the target, rad.
+      own: [..., R, E] observations of an extension; None without any.
     """
 
     ray: Array
     reflectance: Array | None
     distance: Array
     bearing: Array
+    own: Array | None = None
 
 
-def load(task: TaskConfig, realism: RealismConfig, encoding: Encoding | None = None) -> Electronics:
+def load(
+    task: TaskConfig,
+    realism: RealismConfig,
+    encoding: Encoding | None = None,
+    own: Sequence[Observation] = (),
+) -> Electronics:
     """Puts the electronics together.
 
     Args:
       task: the task.
       realism: the factors.
       encoding: what a policy was trained to observe; None follows the task.
+      own: observations of an extension.
 
     Returns:
       The electronics.
@@ -99,6 +117,7 @@ def load(task: TaskConfig, realism: RealismConfig, encoding: Encoding | None = N
         encoding=resolve_encoding(task, realism) if encoding is None else encoding,
         sensor_range=task.sensor_range,
         control_step=task.control_step,
+        own=tuple(own),
     )
 
 
@@ -235,8 +254,8 @@ def _observe(
     """Observes [..., R, O] what there is, infrared as of its last sample."""
     sample = _read_infrared(electronics, factors, sight, clock, xp)
     distance, bearing = _find_target(electronics.realism, factors, sight, clock, xp)
-    layout = observation.LAYOUTS[electronics.encoding]
-    seen = observation.observe(sample, distance, bearing, layout, xp)
+    readings = Readings(sample, distance, bearing, sight.own)
+    seen = observation.observe(readings, electronics.layout, xp)
     if held is None:
         return seen
     due = _is_due(clock, factors.infrared_period, electronics.control_step, xp)

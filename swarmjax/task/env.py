@@ -14,20 +14,22 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
+from swarmjax.extension import NONE, Extensions, LevelDrawing, RewardTerm
 from swarmjax.sim import dispatch, infrared, model, physics
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps as sim_gaps
 from swarmjax.sim.config import RobotConfig, SimConfig, physics_substeps
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import electronics as task_electronics
+from swarmjax.task import extended, observation, pieces, reward
 from swarmjax.task import factors as task_factors
-from swarmjax.task import observation, reward
 from swarmjax.task import stage as task_stage
 from swarmjax.task.config import TaskConfig
 from swarmjax.task.electronics import Electronics, Memory, Sight
 from swarmjax.task.episode import Episode
 from swarmjax.task.factors import Factors
 from swarmjax.task.level import Level, Spacing
+from swarmjax.task.observation import View
 from swarmjax.task.stage_config import StageConfig
 
 
@@ -43,6 +45,8 @@ class World:
       spacing: sizes that levels are drawn with.
       drive: the robot's drive.
       electronics: what lies between policy and world.
+      terms: of the reward, by an extension, with their weights.
+      drawings: ways of drawing levels, by an extension.
     """
 
     robot: RobotConfig
@@ -52,6 +56,13 @@ class World:
     spacing: Spacing
     drive: sim_drive.Drive
     electronics: Electronics
+    terms: tuple[tuple[RewardTerm, float], ...] = ()
+    drawings: tuple[LevelDrawing, ...] = ()
+
+    @property
+    def observation_size(self) -> int:
+        """Entries of an observation, O."""
+        return self.electronics.layout.size
 
 
 @struct.dataclass
@@ -113,6 +124,7 @@ def load(
     sim: SimConfig | None = None,
     *,
     arenas: int = 1,
+    extensions: Extensions = NONE,
 ) -> World:
     """Builds the model and puts it on the device.
 
@@ -123,15 +135,19 @@ def load(
       realism: how its sensors answer, and what is drawn for each episode.
       sim: who steps the physics, and the room for robots and obstacles.
       arenas: how many arenas will be stepped together, at most; only Warp needs to know.
+      extensions: pieces that are not part of the package; `task` names those that are used.
 
     Returns:
       The world that `reset` and `step` run in.
 
     Raises:
-      ConfigError: if Warp is asked for and not installed, or a solver where it cannot be.
+      ConfigError: if Warp is asked for and not installed, or a solver where it cannot be, or a
+        piece of an extension is missing or of the wrong shape.
     """
     robot, task = robot or RobotConfig(), task or TaskConfig()
     realism, sim = realism or RealismConfig(), sim or SimConfig()
+    chosen = pieces.choose(extensions, task, stages)
+    extended.check(chosen, robots=sim.max_robots, obstacles=sim.max_obstacles)
     size = model.ArenaSize(sim.max_robots, sim.max_obstacles, task_stage.largest_half(stages))
     return World(
         robot=robot,
@@ -140,7 +156,9 @@ def load(
         physics=_load_physics(size, robot, task, realism, sim, arenas),
         spacing=Spacing(*size[:2], robot.hull_radius, task.target_radius),
         drive=sim_drive.from_config(robot),
-        electronics=task_electronics.load(task, realism),
+        electronics=task_electronics.load(task, realism, own=chosen.observations),
+        terms=chosen.terms,
+        drawings=chosen.drawings,
     )
 
 
@@ -175,8 +193,9 @@ def reset(world: World, level: Level) -> EnvState:
     """
     robots, obstacles = level.present.shape[0], level.obstacle_present.shape[0]
     factors = task_factors.draw(level.seed, world.realism, world.robot, robots, obstacles, jnp)
+    clock, arrived = jnp.zeros((), jnp.int32), jnp.zeros(robots, bool)
     sight = _look(world, level.start, level, factors)
-    clock = jnp.zeros((), jnp.int32)
+    sight = _look_by_extension(world, sight, level.start, level, arrived, clock)
     memory, seen = task_electronics.begin(world.electronics, factors, sight, clock, jnp)
     return EnvState(
         sim=physics.rest(world.physics, level.start),
@@ -185,7 +204,7 @@ def reset(world: World, level: Level) -> EnvState:
         memory=memory,
         observation=seen,
         clock=clock,
-        arrived=jnp.zeros(robots, bool),
+        arrived=arrived,
         distance=sight.distance,
         apart=jnp.full((robots, len(sim_gaps.KINDS)), sim_gaps.CONTACT_PAUSE),
         episode=_no_episode(robots),
@@ -215,17 +234,19 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
       The new state, and what the step came to.
     """
     chex.assert_shape(action, (state.level.present.shape[0], 2))
-    active = state.level.present & ~state.arrived
+    level, active = state.level, state.level.present & ~state.arrived
     clock = state.clock + 1
     data, memory, pose, sound = _move(world, state, action, active)
-    sight = _look(world, pose, state.level, state.factors)
+    sight = _look(world, pose, level, state.factors)
+    arrives = active & (sight.distance <= world.task.target_radius)
+    arrived = state.arrived | arrives
+    sight = _look_by_extension(world, sight, pose, level, arrived, clock)
     memory, seen = task_electronics.sense(
         world.electronics, memory, state.factors, sight, clock, jnp
     )
-    arrives = active & (sight.distance <= world.task.target_radius)
-    gap = sim_gaps.gaps(pose, state.level.side, state.level.obstacle, world.robot.hull_radius, jnp)
+    gap = sim_gaps.gaps(pose, level.side, level.obstacle, world.robot.hull_radius, jnp)
     begins, apart = sim_gaps.count_contacts(gap, state.apart, world.task.control_step, jnp)
-    begins = begins & state.level.present[:, None]
+    begins = begins & level.present[:, None]
     earned = reward.Step(
         state.distance,
         sight.distance,
@@ -235,9 +256,10 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
         begins & active[:, None],
     )
     valid = active & sound
-    gained = jnp.where(valid, reward.total(earned, world.task.reward), 0.0)
+    if world.terms:
+        earned = _complete(world, earned, state, action, pose)
+    gained = jnp.where(valid, reward.total(earned, world.task.reward, world.terms), 0.0)
     episode = _tally(state.episode, gained, begins, earned, valid)
-    arrived = state.arrived | arrives
     timeout = clock >= world.task.step_limit
     new = replace(
         state,
@@ -256,7 +278,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
         terminated=arrives,
         truncated=active & ~arrives & (timeout | ~sound),
         valid=valid,
-        done=jnp.all(arrived | ~state.level.present) | timeout | ~sound,
+        done=jnp.all(arrived | ~level.present) | timeout | ~sound,
         sound=sound,
     )
 
@@ -296,6 +318,41 @@ def _look(world: World, pose: Array, level: Level, factors: Factors) -> Sight:
     # Looked at by several: without the barrier XLA works rays out anew for each, on a GPU.
     ray, bright = jax.lax.optimization_barrier((ray, bright))
     return Sight(ray, bright, distance, bearing)
+
+
+def _look_by_extension(
+    world: World, sight: Sight, pose: Array, level: Level, arrived: Array, clock: Array
+) -> Sight:
+    """Adds what the observations of an extension see."""
+    if not world.electronics.own:
+        return sight
+    view = View(
+        pose=pose,
+        target=level.target,
+        distance=sight.distance,
+        bearing=sight.bearing,
+        infrared=sight.ray,
+        present=level.present,
+        arrived=arrived,
+        side=level.side,
+        obstacle=level.obstacle,
+        obstacle_present=level.obstacle_present,
+        clock=clock,
+    )
+    return sight._replace(own=extended.look(world.electronics.own, view))
+
+
+def _complete(
+    world: World, step: reward.Step, state: EnvState, action: Array, pose: Array
+) -> reward.Step:
+    """Adds what only the terms of an extension look at."""
+    return step._replace(
+        pose_before=physics.poses(world.physics, state.sim),
+        pose=pose,
+        action=jnp.clip(action, -1.0, 1.0),
+        present=state.level.present,
+        clock=state.clock + 1,
+    )
 
 
 def _tally(

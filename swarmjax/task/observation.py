@@ -1,58 +1,137 @@
-"""What a robot observes: eight infrared distances, and where its target is."""
+"""What a robot observes: the one place that says which entries there are, in which order.
+
+`INPUTS` is the table of them, `layout` describes them to everybody else: policy files, judges,
+exports and tests take names, units and sizes from there. A new input is one row of `INPUTS` and,
+where it needs something new, one field of `Readings`.
+"""
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from swarmjax import epuck
+from swarmjax.extension import Observation
 
 Array = Any
+Encoding = Literal["metric", "webots"]
 SENSORS = epuck.SENSORS
 
-# Name of each entry, in order. The paper says ten and names nine; the tenth is the bearing, as in
-# the published example that the task comes from.
-NAMES = (*(f"infrared_{i}" for i in range(SENSORS)), "target_distance", "target_bearing")
-SIZE = len(NAMES)
+
+class Readings(NamedTuple):
+    """What there is to put into an observation, before it is scaled.
+
+    Attributes:
+      infrared: [..., K] m or counts, as the encoding has it.
+      distance: [...] to the target, m.
+      bearing: [...] of the target, rad.
+      own: [..., E] what observations of an extension return; None if there are none.
+    """
+
+    infrared: Array
+    distance: Array
+    bearing: Array
+    own: Array | None = None
+
+
+class Coding(NamedTuple):
+    """How an encoding writes a quantity: (quantity - offset) / scale, both in `unit`."""
+
+    unit: str
+    offset: float = 0.0
+    scale: float = 1.0
+
+
+class Input(NamedTuple):
+    """Entries of an observation that belong together.
+
+    Attributes:
+      names: of the entries.
+      read: takes them [..., len(names)] out of the readings.
+      codings: by encoding.
+    """
+
+    names: tuple[str, ...]
+    read: Callable[[Readings], Array]
+    codings: Mapping[Encoding, Coding]
+
+
+# The paper says ten and names nine; the tenth is the bearing, as in the published example that the
+# task comes from. `webots` scales as deepworlds does, find_and_avoid (commit 60b8fc4a): counts /
+# 1023, not clipped; distance / 1.5 m; (bearing + pi) / (2 pi), so that 0.5 is dead ahead.
+INPUTS = (
+    Input(
+        tuple(f"infrared_{i}" for i in range(SENSORS)),
+        lambda readings: readings.infrared,
+        {"metric": Coding("m"), "webots": Coding("counts", scale=1023.0)},
+    ),
+    Input(
+        ("target_distance",),
+        lambda readings: readings.distance[..., None],
+        {"metric": Coding("m"), "webots": Coding("m", scale=1.5)},
+    ),
+    Input(
+        ("target_bearing",),
+        lambda readings: readings.bearing[..., None],
+        {"metric": Coding("rad"), "webots": Coding("rad", -math.pi, 2.0 * math.pi)},
+    ),
+)
 
 
 class Layout(NamedTuple):
     """What the entries are: (quantity - offset) / scale.
 
     Attributes:
+      names: [O] of the entries.
       units: [O] of the quantities.
       offset: [O] in these units.
       scale: [O] in these units.
     """
 
+    names: tuple[str, ...]
     units: tuple[str, ...]
     offset: tuple[float, ...]
     scale: tuple[float, ...]
 
-
-LAYOUTS = {
-    "metric": Layout((*["m"] * SENSORS, "m", "rad"), (0.0,) * SIZE, (1.0,) * SIZE),
-    # deepworlds, find_and_avoid (commit 60b8fc4a): counts / 1023, not clipped; distance / 1.5 m;
-    # (bearing + pi) / (2 pi), so that 0.5 is dead ahead.
-    "webots": Layout(
-        (*["counts"] * SENSORS, "m", "rad"),
-        (*[0.0] * SENSORS, 0.0, -math.pi),
-        (*[1023.0] * SENSORS, 1.5, 2.0 * math.pi),
-    ),
-}
+    @property
+    def size(self) -> int:
+        """Number of entries, O."""
+        return len(self.names)
 
 
-def describe(encoding: str) -> dict[str, Any]:
+def layout(encoding: Encoding, own: Sequence[Observation] = ()) -> Layout:
+    """Lays an observation out: the built-in inputs, then those of an extension.
+
+    Args:
+      encoding: how built-in quantities are written.
+      own: observations of an extension, in the order in which they follow.
+
+    Returns:
+      The layout.
+    """
+    rows = [(name, *each.codings[encoding]) for each in INPUTS for name in each.names]
+    rows += [(name, each.unit, each.offset, each.scale) for each in own for name in each.names]
+    return Layout(*zip(*rows, strict=True))
+
+
+LAYOUTS = {encoding: layout(encoding) for encoding in ("metric", "webots")}
+NAMES = LAYOUTS["metric"].names
+SIZE = LAYOUTS["metric"].size
+
+
+def describe(encoding: Encoding, own: Sequence[Observation] = ()) -> dict[str, Any]:
     """Describes what a policy observes, as plain data for its file.
 
     Args:
-      encoding: one of `LAYOUTS`.
+      encoding: how built-in quantities are written.
+      own: observations of an extension.
 
     Returns:
       `names`, `encoding`, and the layout's `units`, `offset` and `scale`.
     """
-    layout = {key: list(value) for key, value in LAYOUTS[encoding]._asdict().items()}
-    return {"names": list(NAMES), "encoding": encoding, **layout}
+    found = {key: list(value) for key, value in layout(encoding, own)._asdict().items()}
+    return {"encoding": encoding, **found}
 
 
 def to_target(pose: Array, target: Array, xp: Any) -> tuple[Array, Array]:
@@ -72,22 +151,51 @@ def to_target(pose: Array, target: Array, xp: Any) -> tuple[Array, Array]:
     return xp.sqrt(x * x + y * y), bearing
 
 
-def observe(infrared: Array, distance: Array, bearing: Array, layout: Layout, xp: Any) -> Array:
-    """Puts an observation together in the order of `NAMES`.
+def observe(readings: Readings, layout: Layout, xp: Any) -> Array:
+    """Puts an observation together in the order of the layout.
 
     Args:
-      infrared: [..., K] in the layout's unit.
-      distance: [...] to the target, m.
-      bearing: [...] of the target, rad.
+      readings: what there is.
       layout: what the entries are.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
       [..., O] float32, scaled as the layout says.
     """
-    target = xp.stack([distance, bearing], axis=-1)
-    entries = xp.concatenate([infrared, target], axis=-1).astype(xp.float32)
-    if layout == LAYOUTS["metric"]:
-        return entries
+    parts = [each.read(readings) for each in INPUTS]
+    parts += [] if readings.own is None else [readings.own]
+    entries = xp.concatenate(parts, axis=-1).astype(xp.float32)
     offset, scale = (np.array(x, np.float32) for x in (layout.offset, layout.scale))
+    if not offset.any() and (scale == 1.0).all():
+        return entries
     return (entries - offset) / scale
+
+
+class View(NamedTuple):
+    """One arena as an observation of an extension may look at it: the truth, without noise.
+
+    Attributes:
+      pose: [R, 3] x (m), y (m), yaw (rad).
+      target: [R, 2] x (m), y (m).
+      distance: [R] to the own target, m.
+      bearing: [R] of the own target, rad.
+      infrared: [R, K] length of each ray, m.
+      present: [R] whether the robot takes part, bool.
+      arrived: [R] whether it has arrived, bool.
+      side: [] of the arena, m.
+      obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
+      obstacle_present: [M] bool.
+      clock: [] control steps since the start, int32.
+    """
+
+    pose: Array
+    target: Array
+    distance: Array
+    bearing: Array
+    infrared: Array
+    present: Array
+    arrived: Array
+    side: Array
+    obstacle: Array
+    obstacle_present: Array
+    clock: Array

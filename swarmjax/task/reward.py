@@ -1,16 +1,18 @@
 """The reward: a table of small terms, each times its weight from the config.
 
 Equation 3 of the paper is `progress` with weight 1 and `proximity` with weight -0.001.
-A new term is one function here, one row of `TERMS`, one weight in `RewardConfig`, one test.
+A new term is one function here, one row of `TERMS`, one weight in `RewardConfig`, one test. Terms
+of your own need no change here: `swarmjax.extension.reward_term`.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import chex
 import jax.numpy as jnp
 from jax import Array
 
+from swarmjax.extension import RewardTerm
 from swarmjax.sim.dispatch import least, pieces
 from swarmjax.sim.gaps import KINDS
 from swarmjax.task.config import RewardConfig
@@ -26,6 +28,11 @@ class Step(NamedTuple):
       sensor_range: m.
       arrives: [R] whether the robot arrived in this step.
       contact_begins: [R, 3] whether a contact of each kind began in this step.
+      pose_before: [R, 3] x (m), y (m), yaw (rad); this and what follows for extensions alone.
+      pose: [R, 3] after the step.
+      action: [R, 2] clipped to -1..1, which spans the commands.
+      present: [R] whether the robot takes part, bool.
+      clock: [] control steps since the start, this one included, int32.
     """
 
     distance_before: Array
@@ -34,6 +41,11 @@ class Step(NamedTuple):
     sensor_range: float
     arrives: Array
     contact_begins: Array
+    pose_before: Any = None
+    pose: Any = None
+    action: Any = None
+    present: Any = None
+    clock: Any = None
 
 
 def progress(step: Step) -> Array:
@@ -78,12 +90,13 @@ TERMS: dict[str, Callable[[Step], Array]] = {
 }
 
 
-def total(step: Step, weights: RewardConfig) -> Array:
+def total(step: Step, weights: RewardConfig, own: Sequence[tuple[RewardTerm, float]] = ()) -> Array:
     """Adds the weighted terms up.
 
     Args:
       step: one control step.
       weights: weight of each term; a term of weight 0 is not computed.
+      own: terms of an extension with their weights.
 
     Returns:
       [R] reward.
@@ -94,4 +107,6 @@ def total(step: Step, weights: RewardConfig) -> Array:
         weight = getattr(weights, name)
         if weight:
             reward = reward + weight * term(step)
+    for piece, weight in own:
+        reward = reward + weight * piece.function(step)
     return reward

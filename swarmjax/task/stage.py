@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from swarmjax.config import ConfigError
+from swarmjax.config import ConfigError, show
 from swarmjax.task import fixed_level
-from swarmjax.task.stage_config import StageConfig
+from swarmjax.task.stage_config import BUILT_IN, StageConfig
 
 Array = Any
 
@@ -23,6 +23,7 @@ class Stage(NamedTuple):
       obstacle_size: edge of the boxes of a random level, m.
       fixed: the paper's fixed level instead of a random one, bool.
       fence: the obstacle of a fixed level is the fence instead of boxes, bool.
+      drawing: 1 + index of the extension's way of drawing its levels, 0 for none, int32.
     """
 
     robots: Array
@@ -32,13 +33,18 @@ class Stage(NamedTuple):
     obstacle_size: Array
     fixed: Array
     fence: Array
+    drawing: Array
 
 
-def stack(stages: Sequence[StageConfig]) -> Stage:
+def stack(stages: Sequence[StageConfig], drawings: Sequence[str] = ()) -> Stage:
     """Stacks configured stages into NumPy arrays [S].
 
+    Args:
+      stages: the stages.
+      drawings: names of an extension's ways of drawing levels.
+
     Raises:
-      ConfigError: if a fixed level has no room for its robots.
+      ConfigError: if a fixed level has no room for its robots, or a way of drawing is missing.
     """
     for stage in stages:
         _check_fixed(stage)
@@ -50,6 +56,7 @@ def stack(stages: Sequence[StageConfig]) -> Stage:
         obstacle_size=np.array([s.obstacle_size for s in stages], np.float32),
         fixed=np.array([s.level == "fixed" for s in stages]),
         fence=np.array([s.layout == "fence" for s in stages]),
+        drawing=np.array([_drawing(s, drawings) for s in stages], np.int32),
     )
 
 
@@ -73,6 +80,19 @@ def _check_fixed(stage: StageConfig) -> None:
                 f"stage {stage.name}: {key} is {getattr(stage, key)}, but the fixed level of a "
                 f"{side:g} m arena has room for {limit}: give at most {limit}."
             )
+
+
+def _drawing(stage: StageConfig, drawings: Sequence[str]) -> int:
+    """1 + index of the way in which a stage's levels are drawn; 0 if it is built in."""
+    if stage.level in BUILT_IN:
+        return 0
+    if stage.level not in drawings:
+        known = ", ".join([*BUILT_IN, *drawings])
+        raise ConfigError(
+            f"stage {stage.name}: level is {show(stage.level)}: give one of {known}, or "
+            "extensions=FILE, a file that defines it."
+        )
+    return 1 + list(drawings).index(stage.level)
 
 
 def _half(stage: StageConfig) -> float:

@@ -22,6 +22,10 @@ PASSAGE = 0.10  # m; between obstacles, and between an obstacle and a wall
 FILLING = 0.4  # boxes per square of a grid that random placing surely reaches
 
 
+BUILT_IN = ("random", "fixed")  # ways of drawing levels
+_OR = "or the name of a drawing of extensions"
+
+
 _Cell = tuple[int, int, float | tuple[float, float]]  # robots, obstacles, side
 
 
@@ -38,14 +42,19 @@ class StageConfig(Section):
     obstacle_size: float = field(
         default=0.10, metadata=about("edge of the square boxes of a random level, m", 0.02, 0.3)
     )
-    level: Literal["random", "fixed"] = field(
-        default="random", metadata=about("a new level every episode, or always the same one")
+    level: str = field(
+        default="random",
+        metadata=about(
+            "random: a new one every episode; fixed: always the same; or a drawing of extensions"
+        ),
     )
     layout: Literal["boxes", "fence"] = field(
         default="boxes", metadata=about("obstacles of a fixed level")
     )
 
     def _check(self) -> None:
+        if not re.fullmatch(r"[a-z][a-z0-9_]{0,39}", self.level):
+            raise ConfigError(f"level is {show(self.level)}: give {' or '.join(BUILT_IN)}, {_OR}.")
         if not re.fullmatch(r"[\w-]+", self.name):
             raise ConfigError(f"name is {show(self.name)}: give letters, digits, _ and - only.")
         if self.layout == "fence" and self.level != "fixed":
@@ -83,7 +92,7 @@ def smallest_side(stage: StageConfig) -> float:
     Returns:
         The side, m.
     """
-    random = stage.level == "random"
+    random = stage.level != "fixed"  # a drawing of an extension changes a random level
     return _smallest_side(stage.robots, stage.obstacles, stage.obstacle_size, random=random)
 
 

@@ -2,6 +2,7 @@
 
 import typing
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from swarmjax.config import ConfigError, Section, build, files, section, show, to_dict
@@ -53,7 +54,7 @@ def read_stage(choice: str) -> dict[str, Any]:
     files.check_choice("stage", choice, "stage")
     if _is_sequence(choice) or _is_grid(choice):
         raise ConfigError(f"stage is {choice}, which stands for several: give single stages.")
-    return files.read_file(f"stage/{choice}")
+    return _named(files.read_choice("stage", choice), choice)
 
 
 def load_levels[C: Section](cls: type[C], overrides: Sequence[str]) -> C:
@@ -97,7 +98,8 @@ def _listed(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
     _refuse_others(
         stage, choice, "sequence", f"a curriculum: choose one stage, as in stage={names[-1]}"
     )
-    return [_member(name) for name in names]
+    folder = Path(choice).parent if files.is_path(choice) else Path()
+    return [_member(str(folder / name) if files.is_path(name) else name) for name in names]
 
 
 def _grid(stage: dict[str, Any], choice: str) -> dict[str, Any]:
@@ -108,12 +110,12 @@ def _grid(stage: dict[str, Any], choice: str) -> dict[str, Any]:
 
 def _is_sequence(choice: str) -> bool:
     """Tell whether a file of configs/stage/ names a sequence of others."""
-    return "sequence" in files.read_file(f"stage/{choice}")
+    return "sequence" in files.read_choice("stage", choice)
 
 
 def _is_grid(choice: str) -> bool:
     """Tell whether a file of configs/stage/ is a grid of stages."""
-    return "grid" in files.read_file(f"stage/{choice}")
+    return "grid" in files.read_choice("stage", choice)
 
 
 def _refuse_others(stage: dict[str, Any], choice: str, only: str, advice: str) -> None:
@@ -129,12 +131,18 @@ def _member(name: str) -> dict[str, Any]:
         raise ConfigError(f"stage.sequence names {name}, a curriculum itself: give single stages.")
     if _is_grid(name):
         raise ConfigError(f"stage.sequence names {name}, a grid: give single stages.")
-    return _named(files.read_file(f"stage/{name}"), name)
+    return _named(files.read_choice("stage", name), name)
 
 
-def _named(stage: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return the stage if it bears the name of its file."""
+def name_of(choice: str) -> str:
+    """Return what a choice of the group `stage` is called: its name, or that of its file."""
+    return Path(choice).stem if files.is_path(choice) else choice
+
+
+def _named(stage: dict[str, Any], choice: str) -> dict[str, Any]:
+    """Return the stage under the name of its file, and refuse another name."""
+    name = name_of(choice)
     found = stage.get("name", name)
     if found != name:
         raise ConfigError(f"stage.name is {show(found)} in {name}.yaml: give the file's name.")
-    return stage
+    return {"name": name, **stage}

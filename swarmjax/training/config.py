@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from swarmjax.config import Section, about
-from swarmjax.config.section import MAX_COUNT
+from swarmjax.config.section import MAX_COUNT, ByName
 from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.sim.config import RobotConfig, SimConfig
@@ -46,6 +46,13 @@ class ProgramConfig(Section):
         default=3_000_000, metadata=about("control steps of all arenas together", 1, 10**15)
     )
     realism: RealismConfig = field(default_factory=RealismConfig)
+    extensions: str | None = field(
+        default=None, metadata=about("Python file with pieces of your own; it is run")
+    )
+    pieces: dict[str, dict[str, str]] = field(
+        default_factory=ByName,
+        metadata=about("digest of each piece of extensions, by kind and name", derived=True),
+    )
 
     @property
     def updates(self) -> int:

@@ -17,7 +17,6 @@ from swarmjax.curriculum.engine import Curriculum, Decision, Schedule
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.sim import gaps
-from swarmjax.task import observation
 from swarmjax.task.episode import Ended
 from swarmjax.training import episodes, promotion, rollout
 from swarmjax.training.program import ACTION_SIZE, Program
@@ -68,9 +67,10 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
     starts = rollout.draw_starts(
         program.world, schedule.stages, index, curriculum.cohort, level_key
     )
-    learners = jax.vmap(
-        lambda key: ppo.init(key, config.algo, observation.SIZE, ACTION_SIZE, config.updates)
-    )(jax.random.split(learner_key, config.learners))
+    size = program.world.observation_size
+    learners = jax.vmap(lambda key: ppo.init(key, config.algo, size, ACTION_SIZE, config.updates))(
+        jax.random.split(learner_key, config.learners)
+    )
     return TrainState(
         learners=learners,
         arenas=starts,

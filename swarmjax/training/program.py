@@ -1,16 +1,17 @@
 """The compiled side of a run: what is fixed before anything moves."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 
+from swarmjax import extension
 from swarmjax.curriculum import engine as curricula
 from swarmjax.curriculum.engine import Mode, Schedule
 from swarmjax.curriculum.modes import MODES
-from swarmjax.ppo import dispatch
+from swarmjax.ppo import dispatch, networks
 from swarmjax.ppo.dispatch import Backend
 from swarmjax.provenance import cores
-from swarmjax.task import env, observation
+from swarmjax.task import env
 from swarmjax.task.env import World
 from swarmjax.training import episodes
 from swarmjax.training.config import ProgramConfig
@@ -60,10 +61,14 @@ def load[C: ProgramConfig](config: C, *, by_robot: bool = False) -> tuple[Progra
       The program, and the numbers that are an argument of it.
 
     Raises:
-      ConfigError: if Warp is asked for and not installed, or a gradient that cannot be had.
+      ConfigError: if Warp is asked for and not installed, a gradient that cannot be had, or a
+        piece of an extension does not fit.
     """
-    backend = dispatch.resolve(config.algo, observation.SIZE, ACTION_SIZE)
-    return Program(config, load_world(config), backend, by_robot), schedule(config)
+    world, pieces = load_world(config), extension.load(config.extensions)
+    algo = networks.bind(config.algo, pieces.networks, world.observation_size)
+    config = replace(config, algo=algo)
+    backend = dispatch.resolve(algo, world.observation_size, ACTION_SIZE)
+    return Program(config, world, backend, by_robot), schedule(config)
 
 
 def load_world(config: ProgramConfig) -> World:
@@ -75,6 +80,7 @@ def load_world(config: ProgramConfig) -> World:
         config.realism,
         config.sim,
         arenas=config.arenas * side_by_side(config),
+        extensions=extension.load(config.extensions),
     )
 
 
@@ -86,6 +92,7 @@ def schedule(config: ProgramConfig) -> Schedule:
         updates=config.updates,
         step_limit=config.task.step_limit,
         rollout=config.algo.rollout_length,
+        drawings=[piece.name for piece in extension.load(config.extensions).levels],
     )
 
 

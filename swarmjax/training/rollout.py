@@ -18,7 +18,7 @@ from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.sim import gaps, physics
-from swarmjax.task import env, level
+from swarmjax.task import env, extended, level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
 from swarmjax.task.episode import Ended, Robots
@@ -119,7 +119,8 @@ def draw_starts(world: World, stages: Stage, index: Array, cohort: Array, key: A
     stages = jax.tree.map(jnp.asarray, stages)
 
     def start(uniform: Array, i: Array) -> Arena:
-        drawn = level.sample(uniform, task_stage.select(stages, i), world.spacing, jnp)
+        stage = task_stage.select(stages, i)
+        drawn = extended.draw(uniform, stage, world.spacing, world.drawings)
         begun = vars(env.reset(world, drawn))
         return Arena(**begun, stage=i.astype(jnp.int32), cohort=jnp.asarray(cohort, jnp.int32))
 

@@ -116,7 +116,7 @@ def test_a_grid_is_one_file(own_configs):
     [
         ("name: yours\nrobots: 4\nside: 1\n", "stage.name is 'yours' in mine.yaml"),
         ("name: mine\nside: 1\n", "stage.robots is missing"),
-        ("", "stage.name is missing"),
+        ("", "stage.robots is missing"),
         ("name: mine\nrobot: 4\nside: 1\n", "stage.robot is not a key: did you mean stage.robots?"),
         ("name: [\n", "mine.yaml"),
         ("- a\n", "mine.yaml"),

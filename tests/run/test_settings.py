@@ -69,7 +69,7 @@ def test_train_defaults_to_the_whole_curriculum():
 
 
 def test_defaults_of_the_reward_are_equation_3_and_two_prices():
-    assert dataclasses.astuple(RewardConfig()) == (1.0, 0.0, 0.0, -0.2, 0.0, -0.002)
+    assert dataclasses.astuple(RewardConfig()) == (1.0, 0.0, 0.0, -0.2, 0.0, -0.002, {})
 
 
 def test_robot_defaults_are_the_epuck():
@@ -131,8 +131,8 @@ def test_import_needs_neither_jax_nor_hydra():
          "algo.actor_learning_rate?"),
         (["stage_name=x"], "stage_name is not a key: did you mean stage?"),
         (["hydra.verbose=1"], "hydra is not a key: give one of stage, robot, task, algo, "
-         "curriculum, sim, seed, seeds, seeds_by, arenas, budget, realism, run, resume, init_from, "
-         "init_from_std."),
+         "curriculum, sim, seed, seeds, seeds_by, arenas, budget, realism, extensions, run, "
+         "resume, init_from, init_from_std."),
         # What Hydra's grammar refuses.
         (["algo.hidden_sizes=[64"], "'algo.hidden_sizes=[64' cannot be read: quote a value with "
          "special characters, as in \"algo.hidden_sizes='a=b'\"."),
@@ -141,11 +141,12 @@ def test_import_needs_neither_jax_nor_hydra():
         (["arenas=${nope}"], "the settings cannot be resolved: Interpolation key 'nope' not "
          "found."),
         # Groups.
-        (["stage=s7"], f"stage is 's7': give one of {CHOICES} (nearest: s6)."),
-        (["stage=expand"], f"stage is 'expand': give one of {CHOICES} (nearest: expanded)."),
-        (["stage=../train"], f"stage is '../train': give one of {CHOICES}."),
-        (["stage=[s1,s2]"], f"stage is '[s1,s2]': give one of {CHOICES}."),
-        (["stage=null"], f"stage is 'null': give one of {CHOICES}."),
+        (["stage=s7"], f"stage is 's7': give one of {CHOICES} (nearest: s6), or a file .yaml."),
+        (["stage=expand"], f"stage is 'expand': give one of {CHOICES} (nearest: expanded), or a "
+        "file .yaml."),
+        (["stage=../train"], f"stage is '../train': give one of {CHOICES}, or a file .yaml."),
+        (["stage=[s1,s2]"], f"stage is '[s1,s2]': give one of {CHOICES}, or a file .yaml."),
+        (["stage=null"], f"stage is 'null': give one of {CHOICES}, or a file .yaml."),
         (["robot=legged"], "robot is 'legged': give one of paper, planar, planar_v2, wheeled, "
          "wheeled_v2."),
         # Stages and curricula.

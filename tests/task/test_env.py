@@ -17,6 +17,7 @@ from swarmjax.task import factors as task_factors
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, TimeStep, World
 from swarmjax.task.level import Level
+from swarmjax.task.observation import Readings
 from swarmjax.training import program as programs
 from swarmjax.training import rollout
 from swarmjax.training.rollout import Arena
@@ -234,7 +235,7 @@ def test_observation_is_of_the_state_after_the_step_before_any_reset(episode: Ep
             side, box, target = level.side[0, a], level.obstacle[0, a], level.target[0, a]
             seen = infrared.distances(pose, side, box, HULL, RANGE, np)
             distance, bearing = observation.to_target(pose, target, np)
-            expected = observation.observe(seen, distance, bearing, METRIC, np)
+            expected = observation.observe(Readings(seen, distance, bearing), METRIC, np)
             found = episode.came.observation[t, a]
             # 1e-5 m: float32, where a glancing ray multiplies its rounding.
             np.testing.assert_allclose(found[:, :9], expected[:, :9], atol=1e-5)

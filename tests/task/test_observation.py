@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarmjax.task import observation
+from swarmjax.task.observation import Readings
 
 MODULES = pytest.mark.parametrize("xp", [np, jnp])
 PI = np.pi
@@ -77,9 +78,7 @@ def test_bearing_lies_within_half_a_turn(yaw: float, angle: float, distance: flo
 def test_order(xp: ModuleType) -> None:
     rays = 0.001 * np.arange(16).reshape(2, 8)
     found = observation.observe(
-        xp.asarray(rays),
-        xp.asarray([0.5, 0.6]),
-        xp.asarray([-1.0, 2.0]),
+        Readings(xp.asarray(rays), xp.asarray([0.5, 0.6]), xp.asarray([-1.0, 2.0])),
         observation.LAYOUTS["metric"],
         xp,
     )
@@ -92,15 +91,13 @@ def test_order(xp: ModuleType) -> None:
 def test_scale_of_the_published_example(xp: ModuleType) -> None:
     # Counts / 1023, distance / 1.5 m, and a bearing that is 0.5 dead ahead and 1 at +pi.
     found = observation.observe(
-        xp.asarray([[1023.0] * 7 + [67.19]]),
-        xp.asarray([0.75]),
-        xp.asarray([0.5 * PI]),
+        Readings(xp.asarray([[1023.0] * 7 + [67.19]]), xp.asarray([0.75]), xp.asarray([0.5 * PI])),
         observation.LAYOUTS["webots"],
         xp,
     )
     expected = [[*[1.0] * 7, 67.19 / 1023.0, 0.5, 0.75]]
     np.testing.assert_allclose(found, expected, rtol=1e-6)  # float32
     ahead = observation.observe(
-        xp.zeros(8), xp.zeros(()), xp.zeros(()), observation.LAYOUTS["webots"], xp
+        Readings(xp.zeros(8), xp.zeros(()), xp.zeros(())), observation.LAYOUTS["webots"], xp
     )
     np.testing.assert_allclose(ahead, [0.0] * 9 + [0.5], atol=1e-7)  # likewise

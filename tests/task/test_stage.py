@@ -25,6 +25,7 @@ def test_stack() -> None:
         obstacle_size=np.array([0.1, 0.2, 0.1, 0.1], np.float32),
         fixed=np.array([False, False, True, False]),
         fence=np.array([False, False, True, False]),
+        drawing=np.zeros(4, np.int32),
     )
     for mine, theirs in zip(found, expected, strict=True):
         assert mine.dtype == theirs.dtype

@@ -1,0 +1,405 @@
+"""Your own pieces: reward terms, observations, level drawings and networks, from a file of yours.
+
+A piece is a function (a network is a Flax module) with one of the decorators below. Commands take
+the file as `extensions=FILE`; `make_env` and `train_policy` also take a module or a list of pieces.
+Everything in a file is used unless a key says otherwise; docs/extending.md has an example of each.
+Loading a file runs it. Importing this module imports no JAX.
+"""
+
+import ast
+import hashlib
+import importlib.util
+import inspect
+import re
+import sys
+import textwrap
+import types
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+from swarmjax.config import ConfigError, show
+from swarmjax.config.section import ByName
+
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
+_CONSTANTS = (bool, int, float, str, bytes, tuple, frozenset, type(None))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Piece:
+    """A function of yours, and what it is called.
+
+    Attributes:
+        kind: what it is, as sentences and policy files call it.
+        taken: names of this kind that the package itself uses.
+        name: as keys and policy files call it.
+        function: what it computes.
+    """
+
+    kind: ClassVar[str] = ""
+    taken: ClassVar[tuple[str, ...]] = ()
+
+    name: str
+    function: Callable[..., Any]
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of its code and of what it uses of its own file; comments do not count."""
+        texts = sorted(_sources(self.function, {}).items())
+        return hashlib.sha256(repr(texts).encode()).hexdigest()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RewardTerm(Piece):
+    """A term of the reward: `(swarmjax.task.reward.Step) -> [R]`, times its weight."""
+
+    kind: ClassVar[str] = "reward"
+    taken: ClassVar[tuple[str, ...]] = (
+        "progress",
+        "proximity",
+        "arrival",
+        "contact",
+        "robot_contact",
+        "step_penalty",
+    )
+
+    weight: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Observation(Piece):
+    """More entries of the observation: `(swarmjax.task.observation.View) -> [R]` or `[R, size]`.
+
+    The policy sees (value - offset) / scale.
+    """
+
+    kind: ClassVar[str] = "observation"
+    taken: ClassVar[tuple[str, ...]] = ("infrared", "target_distance", "target_bearing")
+
+    size: int
+    unit: str
+    offset: float
+    scale: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its entries."""
+        return (
+            (self.name,) if self.size == 1 else tuple(f"{self.name}_{i}" for i in range(self.size))
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LevelDrawing(Piece):
+    """A way of drawing levels: `(swarmjax.task.level.Level, key) -> Level`, of one arena."""
+
+    kind: ClassVar[str] = "level"
+    taken: ClassVar[tuple[str, ...]] = ("random", "fixed")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Network(Piece):
+    """A Flax module that takes [..., O] and returns features [..., F], for actor and critic."""
+
+    kind: ClassVar[str] = "network"
+    taken: ClassVar[tuple[str, ...]] = ("mlp",)
+
+
+KINDS = (RewardTerm, Observation, LevelDrawing, Network)
+
+
+def reward_term(weight: float, name: str | None = None) -> Callable[[Callable], RewardTerm]:
+    """Make a function a term of the reward.
+
+    Args:
+        weight: what it is multiplied by; `task.reward.extra.NAME` overrides it.
+        name: of the term; None: the function's.
+    """
+    return lambda function: RewardTerm(
+        name=name or function.__name__, function=function, weight=weight
+    )
+
+
+def observation(
+    size: int = 1,
+    unit: str = "1",
+    offset: float = 0.0,
+    scale: float = 1.0,
+    name: str | None = None,
+) -> Callable[[Callable], Observation]:
+    """Make a function an observation.
+
+    Args:
+        size: how many entries each robot gets.
+        unit: of the values, for the policy file.
+        offset: is subtracted, in that unit.
+        scale: divides, in that unit.
+        name: of the observation; None: the function's.
+    """
+    return lambda function: Observation(
+        name=name or function.__name__,
+        function=function,
+        size=size,
+        unit=unit,
+        offset=offset,
+        scale=scale,
+    )
+
+
+def level_drawing(function: Callable) -> LevelDrawing:
+    """Make a function a way of drawing levels, for stages whose `level` is its name."""
+    return LevelDrawing(name=function.__name__, function=function)
+
+
+def network(module: type) -> Network:
+    """Make a Flax module the network of actor and critic, `algo.network` its name."""
+    return Network(name=_snake(module.__name__), function=module)
+
+
+def _snake(name: str) -> str:
+    """Turn the name of a class into that of a key: ResidualNet into residual_net."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
+
+
+class Extensions(NamedTuple):
+    """The pieces of a file, a module or a list.
+
+    Attributes:
+        rewards: terms of the reward.
+        observations: more entries of the observation.
+        levels: ways of drawing levels.
+        networks: networks of actor and critic.
+    """
+
+    rewards: tuple[RewardTerm, ...] = ()
+    observations: tuple[Observation, ...] = ()
+    levels: tuple[LevelDrawing, ...] = ()
+    networks: tuple[Network, ...] = ()
+
+    def digests(self) -> ByName:
+        """Return the digest of each piece, by kind and name."""
+        kinds = zip(KINDS, self, strict=True)
+        return ByName(
+            {
+                kind.kind: ByName({piece.name: piece.digest for piece in pieces})
+                for kind, pieces in kinds
+                if pieces
+            }
+        )
+
+
+NONE = Extensions()
+
+
+# Loading
+
+_files: dict[tuple[str, str], Extensions] = {}  # by path and SHA-256 of the content
+_handed: dict[str, Extensions] = {}  # pieces that Python handed over, by the word for them
+_HANDED = "python:"  # what such a word begins with; no file can be meant by it
+
+
+def load(source: str | None) -> Extensions:
+    """Return the pieces that the key `extensions` names.
+
+    Args:
+        source: path of a Python file, a word of `hand_over`, or None for no pieces.
+
+    Raises:
+        ConfigError: the file is missing or does not import, or a piece is unsound.
+    """
+    if source is None:
+        return NONE
+    if source.startswith(_HANDED):
+        if source not in _handed:
+            raise ConfigError(
+                f"extensions is {source}, pieces that a Python program handed over and that only "
+                "it has: put them into a file and give extensions=FILE."
+            )
+        return _handed[source]
+    path = Path(source)
+    try:
+        content = path.read_bytes()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ConfigError(
+            f"extensions is {show(source)}, which cannot be read: {reason}."
+        ) from None
+    key = (str(path.resolve()), hashlib.sha256(content).hexdigest())
+    if key not in _files:
+        _files[key] = collect(_pieces(vars(_import(path, key[1]))), source)
+    return _files[key]
+
+
+def hand_over(given: object) -> str | None:
+    """Return what the key `extensions` is to be for pieces that a Python program gives.
+
+    Args:
+        given: None, a path, a module, a piece, or several pieces.
+
+    Raises:
+        ConfigError: it is nothing of the kind, or a piece is unsound.
+    """
+    if given is None or isinstance(given, str):
+        return given
+    if isinstance(given, Path):
+        return str(given)
+    pieces: list[Any]
+    if isinstance(given, types.ModuleType):
+        pieces = _pieces(vars(given))
+    elif isinstance(given, Piece):
+        pieces = [given]
+    else:
+        pieces = list(given) if isinstance(given, Iterable) else [given]
+    for piece in pieces:
+        if not isinstance(piece, Piece):
+            raise ConfigError(
+                f"extensions holds {show(str(piece))}: give a file, a module, or functions with a "
+                "decorator of swarmjax.extension."
+            )
+    found = collect(pieces, "extensions")
+    digest = hashlib.sha256(repr(found.digests()).encode()).hexdigest()
+    word = f"{_HANDED}{digest[:12]}"
+    _handed[word] = found
+    return word
+
+
+def _import(path: Path, digest: str) -> types.ModuleType:
+    """Run a file as a module of its own, so that it cannot stand in the way of another."""
+    name = f"_swarmjax_extension_{digest[:16]}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ConfigError(f"extensions is {show(str(path))}: give a file that ends in .py.")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[name]
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"{path} does not import: {describe(error)}.") from None
+    return module
+
+
+def describe(error: BaseException) -> str:
+    """Put an error of a user's code in part of a sentence: its type and the first line it says."""
+    text = (str(error).strip() or "no reason given").splitlines()[0].rstrip(".")
+    return f"{type(error).__name__}: {text}"
+
+
+def _pieces(names: Mapping[str, object]) -> list[Piece]:
+    """List the pieces among a module's names, each once."""
+    found = {id(value): value for value in names.values() if isinstance(value, Piece)}
+    return list(found.values())
+
+
+def collect(pieces: Iterable[Piece], where: str) -> Extensions:
+    """Check pieces by themselves and sort them by kind.
+
+    Args:
+        pieces: in any order.
+        where: what sentences call their source.
+
+    Raises:
+        ConfigError: a name cannot be one, or is used twice; a number is out of range.
+    """
+    found: dict[str, dict[str, Any]] = {kind.kind: {} for kind in KINDS}
+    for piece in pieces:
+        _check(piece, where)
+        if piece.name in found[piece.kind]:
+            raise ConfigError(f"{where}: {piece.kind} {piece.name} is there twice: rename one.")
+        found[piece.kind][piece.name] = piece
+    if not any(found.values()):
+        raise ConfigError(
+            f"{where} holds no piece: put a decorator of swarmjax.extension before a function."
+        )
+    return Extensions(*(tuple(each.values()) for each in found.values()))
+
+
+def _check(piece: Piece, where: str) -> None:
+    label = f"{where}: {piece.kind} {piece.name}"
+    if not _NAME.fullmatch(piece.name):
+        raise ConfigError(
+            f"{label} cannot be called so: give 1 to 40 lower-case letters, digits and _, a letter "
+            "first."
+        )
+    if piece.name in piece.taken:
+        raise ConfigError(f"{label} is the name of a built-in {piece.kind}: rename it.")
+    if isinstance(piece, Observation):
+        if not isinstance(piece.size, int) or not 1 <= piece.size <= 1000:
+            raise ConfigError(f"{label} has size {show(piece.size)}: give 1 to 1000.")
+        if not piece.scale:
+            raise ConfigError(f"{label} has scale 0: give another number, it divides.")
+    if isinstance(piece, Network) and not isinstance(piece.function, type):
+        raise ConfigError(f"{label} is no class: decorate a flax.linen.Module.")
+
+
+# Digests
+
+
+def _sources(thing: Any, found: dict[str, str]) -> dict[str, str]:
+    """Return the syntax trees of a function or class and of what it uses of its own file."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(thing)))
+    except (OSError, TypeError, SyntaxError):
+        raise ConfigError(
+            f"{getattr(thing, '__name__', thing)} has no source that can be read: define it in a "
+            "file or a notebook."
+        ) from None
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            node.decorator_list = []  # what it says is a setting: keys and layouts hold it
+    found[thing.__name__] = ast.dump(tree)
+    names = vars(sys.modules[thing.__module__]) if thing.__module__ in sys.modules else {}
+    for name in _names(tree):
+        value = names.get(name)
+        value = value.function if isinstance(value, Piece) else value
+        if name in found or value is thing:
+            continue
+        if isinstance(value, _CONSTANTS) and name in names:
+            found[name] = repr(value)
+        elif getattr(value, "__module__", None) == thing.__module__ and hasattr(value, "__name__"):
+            _sources(value, found)
+    return found
+
+
+def _names(tree: ast.AST) -> Iterator[str]:
+    """Yield the names that a tree reads, in alphabetical order."""
+    yield from sorted({node.id for node in ast.walk(tree) if isinstance(node, ast.Name)})
+
+
+# What a policy needs
+
+
+def check_needs(
+    needs: Mapping[str, Mapping[str, str]],
+    pieces: Extensions,
+    where: str,
+    kinds: Iterable[str] = tuple(kind.kind for kind in KINDS),
+) -> None:
+    """Refuse to run a policy without the pieces that it was trained with.
+
+    Args:
+        needs: the digests by kind and name, as the policy's `meta.extensions` holds them.
+        pieces: those that there are.
+        where: what a sentence calls the policy.
+        kinds: of the pieces that matter here.
+
+    Raises:
+        ConfigError: a piece is missing, or has changed.
+    """
+    held = pieces.digests()
+    for kind in kinds:
+        for name, digest in needs.get(kind, {}).items():
+            there = held.get(kind, {}).get(name)
+            if there is None:
+                raise ConfigError(
+                    f"{where} was trained with the {kind} {name}, which is not part of swarmjax: "
+                    "give extensions=FILE, the file that defines it."
+                )
+            if there != digest:
+                raise ConfigError(
+                    f"{where} was trained with the {kind} {name} of digest {digest[:12]}, but that "
+                    f"of extensions has {there[:12]}: give the file as it was then."
+                )

@@ -1,0 +1,177 @@
+"""What pieces of an extension compute in an arena, and whether they fit it."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from swarmjax import epuck
+from swarmjax.config import ConfigError
+from swarmjax.extension import LevelDrawing, Observation, Piece, describe
+from swarmjax.sim.gaps import KINDS
+from swarmjax.task import level
+from swarmjax.task.level import Level, Spacing
+from swarmjax.task.observation import View
+from swarmjax.task.pieces import Chosen
+from swarmjax.task.reward import Step
+from swarmjax.task.stage import Stage
+
+
+def look(own: Sequence[Observation], view: View) -> Array:
+    """Computes the observations of an extension in one arena.
+
+    Args:
+      own: the observations.
+      view: of the arena.
+
+    Returns:
+      [R, E] in their units, one after the other.
+    """
+    robots = len(view.pose)
+    found = [jnp.reshape(each.function(view), (robots, each.size)) for each in own]
+    return jnp.concatenate(found, axis=-1).astype(jnp.float32)
+
+
+def draw(uniforms: Any, stage: Stage, spacing: Spacing, drawings: Sequence[LevelDrawing]) -> Level:
+    """Draws a level of a stage with JAX, by an extension where the stage says so.
+
+    Args:
+      uniforms: as `level.sample` takes them.
+      stage: fields [].
+      spacing: sizes.
+      drawings: ways of drawing, in the order that `stage.drawing` counts.
+
+    Returns:
+      The level; what is absent is parked outside.
+    """
+    drawn = level.sample(uniforms, stage, spacing, jnp)
+    if not drawings:
+        return drawn
+    key, found = jax.random.key(drawn.seed), drawn
+    for number, piece in enumerate(drawings, 1):
+        mine = stage.drawing == number
+        pairs = zip(piece.function(drawn, key), found, strict=True)
+        found = Level(*(jnp.where(mine, own, other) for own, other in pairs))
+    return level.park(found, jnp)
+
+
+def check(chosen: Chosen, robots: int, obstacles: int) -> None:
+    """Refuses pieces that return something of another shape or type; nothing is compiled.
+
+    Args:
+      chosen: the pieces.
+      robots: R.
+      obstacles: M.
+
+    Raises:
+      ConfigError: naming the piece, and what it should return.
+    """
+    for piece in chosen.observations:
+        shapes = [(robots, piece.size)] + ([(robots,)] if piece.size == 1 else [])
+        _check_floats(piece, shapes, _view(robots, obstacles))
+    for piece, _ in chosen.terms:
+        _check_floats(piece, [(robots,)], _step(robots))
+    for piece in chosen.drawings:
+        _check_drawing(piece, _level(robots, obstacles))
+
+
+def _check_floats(piece: Piece, shapes: list[tuple[int, ...]], argument: Any) -> None:
+    """Refuses a piece that returns anything but float numbers of one of these shapes."""
+    found = trace(piece, argument)
+    wanted = f"float numbers of shape {' or '.join(str(list(shape)) for shape in shapes)}"
+    if not hasattr(found, "shape") or not hasattr(found, "dtype"):
+        raise ConfigError(f"{label(piece)} returns {type(found).__name__}: return {wanted}.")
+    if found.shape not in shapes or not jnp.issubdtype(found.dtype, jnp.floating):
+        raise ConfigError(
+            f"{label(piece)} returns {found.dtype} of shape {list(found.shape)}: return {wanted}."
+        )
+
+
+def _check_drawing(piece: LevelDrawing, drawn: Level) -> None:
+    """Refuses a drawing that returns no level."""
+    found = trace(piece, drawn, jax.eval_shape(jax.random.key, 0))
+    if not isinstance(found, Level):
+        raise ConfigError(
+            f"{label(piece)} returns {type(found).__name__}: return level._replace(...)."
+        )
+    for name, before, after in zip(Level._fields, drawn, found, strict=True):
+        if (before.shape, before.dtype) != (after.shape, after.dtype):
+            raise ConfigError(
+                f"{label(piece)} returns {name} as {after.dtype} of shape {list(after.shape)}: "
+                f"return {before.dtype} of shape {list(before.shape)}."
+            )
+
+
+def trace(piece: Piece, *arguments: Any) -> Any:
+    """Returns the shapes that a piece returns, or says in one sentence why it fails.
+
+    Args:
+      piece: the piece.
+      arguments: shapes of what it takes.
+
+    Raises:
+      ConfigError: if it raises anything.
+    """
+    try:
+        return jax.eval_shape(piece.function, *arguments)
+    except Exception as error:
+        raise ConfigError(f"{label(piece)} fails: {describe(error)}.") from None
+
+
+def label(piece: Piece) -> str:
+    """Names a piece and where it stands: the file first."""
+    code = getattr(piece.function, "__code__", None)
+    file = f"{code.co_filename}: " if code is not None else ""
+    return f"{file}{piece.kind} {piece.name}"
+
+
+def _shape(*shape: int, dtype: Any = jnp.float32) -> Any:
+    return jax.ShapeDtypeStruct(shape, dtype)
+
+
+def _view(robots: int, obstacles: int) -> View:
+    drawn, whole = _level(robots, obstacles), _shape(dtype=jnp.int32)
+    return View(
+        pose=drawn.start,
+        target=drawn.target,
+        distance=_shape(robots),
+        bearing=_shape(robots),
+        infrared=_shape(robots, epuck.SENSORS),
+        present=drawn.present,
+        arrived=drawn.present,
+        side=drawn.side,
+        obstacle=drawn.obstacle,
+        obstacle_present=drawn.obstacle_present,
+        clock=whole,
+    )
+
+
+def _step(robots: int) -> Step:
+    there = _shape(robots, dtype=jnp.bool_)
+    return Step(
+        distance_before=_shape(robots),
+        distance=_shape(robots),
+        infrared=_shape(robots, epuck.SENSORS),
+        sensor_range=epuck.SENSOR_RANGE,
+        arrives=there,
+        contact_begins=_shape(robots, len(KINDS), dtype=jnp.bool_),
+        pose_before=_shape(robots, 3),
+        pose=_shape(robots, 3),
+        action=_shape(robots, 2),
+        present=there,
+        clock=_shape(dtype=jnp.int32),
+    )
+
+
+def _level(robots: int, obstacles: int) -> Level:
+    return Level(
+        side=_shape(),
+        present=_shape(robots, dtype=jnp.bool_),
+        start=_shape(robots, 3),
+        target=_shape(robots, 2),
+        obstacle_present=_shape(obstacles, dtype=jnp.bool_),
+        obstacle=_shape(obstacles, 5),
+        seed=_shape(dtype=jnp.uint32),
+    )
