@@ -34,6 +34,7 @@ class Policy(NamedTuple):
     max_turn_rate: float  # rad/s, to either side
     meta: dict[str, Any]
     digest: str  # SHA-256 of all else in the file, in hexadecimal
+    network: Any = None  # of format 3, normalised [..., R, O] to features; the file has no code
 
 
 def load(path: str | Path | IO[bytes]) -> Policy:
@@ -83,6 +84,7 @@ def act(policy: Policy, observation: np.ndarray, normal: Any = 0.0) -> np.ndarra
     mine, limit = slice(robots), policy.meta["observation"]["limit"]
     x = (observation.astype(np.float32) - policy.mean[mine]) / policy.std[mine]
     x = np.clip(x, -limit, limit)
+    x = x if policy.network is None else policy.network(x)
     *hidden, (kernel, bias) = policy.layers
     for weights, offset in hidden:
         x = _ACTIVATIONS[policy.meta["activation"]](np.vecmat(x, weights[mine]) + offset[mine])

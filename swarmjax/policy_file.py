@@ -16,9 +16,10 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-from swarmjax import policy
+from swarmjax import extension, policy
 from swarmjax.atomic_file import replacing
 from swarmjax.policy import FORMAT, MAX_BYTES, Policy, PolicyError
+from swarmjax.policy_network import PolicyNetwork
 
 ACTION_NAMES = ("speed", "turn_rate")
 ACTION_UNITS = ("m/s", "rad/s")
@@ -27,17 +28,20 @@ ACTIVATIONS = ("tanh", "relu", "swish")
 BODIES = ("planar", "wheeled")
 RESPONSES = ("ideal", "webots", "real")
 
+NETWORK_FORMAT = 3  # of a policy whose network is code that its file does not hold
+_NETWORK = "network/"
 _DTYPE = np.dtype("<f4")
 _MOST = float(np.finfo(np.float32).max)  # numbers of `meta` are computed with in float32
 _MOST_LIMIT = 1e6  # standard deviations; beyond, sums of float32 may overflow
 _MEMBER = re.compile(
-    r"(actor/(hidden_\d{1,3}|mean)/(kernel|bias)|actor/log_std|normalizer/(mean|std)|meta|digest)"
-    r"\.npy"
+    r"(actor/(hidden_\d{1,3}|mean)/(kernel|bias)|actor/log_std|normalizer/(mean|std)|meta|digest|"
+    r"network/(\w{1,64}/){0,8}\w{1,64})\.npy",
+    re.ASCII,
 )
 _MAGIC = b"\x93NUMPY\x01\x00"
 _HEADER = re.compile(
     rb"\{'descr': '([<>|][a-zA-Z]\d{0,9})', 'fortran_order': False, "
-    rb"'shape': \((N,|N(?:, N){1,2}|)\), \} *\n".replace(b"N", rb"(?:0|[1-9]\d{0,8})")
+    rb"'shape': \((N,|N(?:, N){1,7}|)\), \} *\n".replace(b"N", rb"(?:0|[1-9]\d{0,8})")
 )
 _MOST_LOG_STD = 20.0  # 5e8 times the range of commands; exp of 89 is more than a float32 holds
 _MOST_HEADER = 10_000  # bytes, of a header and what is before it; NumPy reads no longer ones
@@ -62,26 +66,58 @@ _KINDS = {str: "text", int: "a whole number", dict: "an object"}
 _UNREADABLE = (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile)
 
 
-def read(path: str | Path) -> Policy:
+def read(path: str | Path, extensions: str | None = None) -> Policy:
     """Reads a policy file and checks all of it.
 
     Args:
         path: Of the file.
+        extensions: As the key of that name, for a policy whose network is code of the user's.
 
     Returns:
         The policy.
 
     Raises:
         PolicyError: If it is missing, damaged, of another format or inconsistent.
+        ConfigError: If its network is not in `extensions`.
     """
     path = Path(path)
     content = _read_bytes(path)
-    _refuse_in(path, lambda: _check_file(content))
+    members, meta = _refuse_in(path, lambda: _check_file(content))
+    if "network" in meta:
+        return _with_network(path, members, meta, extensions)
     try:
         return policy.load(io.BytesIO(content))
     except PolicyError as error:  # whose sentence names what it read from
         _, _, reason = str(error).partition(" cannot be read as a policy: ")
         raise PolicyError(f"{path} cannot be read as a policy: {reason}") from None
+
+
+def _with_network(
+    path: Path, members: Mapping[str, np.ndarray], meta: dict[str, Any], extensions: str | None
+) -> Policy:
+    """Makes a policy whose network is code of the user's."""
+    found = extension.load(extensions)
+    extension.check_needs(meta.get("extensions", {}), found, str(path), ["network"])
+    depth = _depth(members, own=True)
+    names = [*(f"hidden_{i}" for i in range(depth)), "mean"]
+    arrays = {
+        name.removeprefix(_NETWORK): array
+        for name, array in members.items()
+        if name.startswith(_NETWORK)
+    }
+    return Policy(
+        layers=[(members[f"actor/{n}/kernel"], members[f"actor/{n}/bias"]) for n in names],
+        log_std=members["actor/log_std"],
+        mean=members["normalizer/mean"],
+        std=members["normalizer/std"],
+        is_shared=meta["policy"] == "shared",
+        encoding=meta["observation"]["encoding"],
+        max_speed=meta["action"]["high"][0],
+        max_turn_rate=meta["action"]["high"][1],
+        meta=meta,
+        digest=_text(members, "digest"),
+        network=PolicyNetwork(str(extensions), meta["network"], arrays),
+    )
 
 
 def write(path: str | Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
@@ -96,7 +132,7 @@ def write(path: str | Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str,
         PolicyError: If `read` would refuse the file, or if it cannot be written.
     """
     path = Path(path)
-    full = {**meta, "format": FORMAT}
+    full = {**meta, "format": NETWORK_FORMAT if "network" in meta else FORMAT}
     _refuse_in(path, lambda: check(arrays, full))
     everything = {**arrays, "meta": np.array(json.dumps(full, sort_keys=True, allow_nan=False))}
     everything["digest"] = np.array(policy.digest(everything))
@@ -117,11 +153,14 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     Raises:
         PolicyError: In one sentence that names the field.
     """
-    if meta.get("format") != FORMAT:
+    own = "network" in meta
+    if meta.get("format") != (NETWORK_FORMAT if own else FORMAT):
         raise PolicyError(
-            f"meta.format is {_show(meta.get('format'))}, but this version reads {FORMAT}: "
-            "export the policy from its run again."
+            f"meta.format is {_show(meta.get('format'))}, but this version reads {FORMAT}, and "
+            f"{NETWORK_FORMAT} with meta.network: export the policy from its run again."
         )
+    if own and not _is_name(meta["network"]):
+        raise PolicyError(f"meta.network is {_show(meta['network'])}: expected a name.")
     for key, kind in _META.items():
         _entry(meta, key, kind)
     _choice(meta, "policy", ("shared", "independent"))
@@ -136,7 +175,7 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     size = _check_observation(meta["observation"])
     _check_action(meta["action"])
     _check_embodiment(meta)
-    _check_arrays(arrays, learners, size)
+    _check_arrays(arrays, learners, size, own=own)
 
 
 def _refuse_in[T](path: Path, make: Callable[[], T]) -> T:
@@ -166,8 +205,8 @@ def _read_bytes(path: Path) -> bytes:
         raise PolicyError(f"{path} cannot be read: {reason}.") from None
 
 
-def _check_file(content: bytes) -> None:
-    """Refuses whatever is no sound policy file."""
+def _check_file(content: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Refuses whatever is no sound policy file; returns its arrays, with the digest, and meta."""
     members = {name: _parse_array(name, data) for name, data in _unpack(content).items()}
     expected, meta = _text(members, "digest"), _parse_meta(_text(members, "meta"))
     del members["digest"]
@@ -179,6 +218,7 @@ def _check_file(content: bytes) -> None:
         )
     del members["meta"]
     check(members, meta)
+    return members | {"digest": np.array(expected)}, meta
 
 
 def _unpack(content: bytes) -> dict[str, bytes]:
@@ -360,8 +400,12 @@ def _check_embodiment(meta: Mapping[str, Any]) -> None:
 
 def _check_preset(mapping: Mapping[str, Any], where: str) -> None:
     value = mapping.get("preset")
-    if not isinstance(value, str) or not _NAME.fullmatch(value):
+    if not _is_name(value):
         raise PolicyError(f"{where}.preset is {_show(value)}: expected the name of a preset.")
+
+
+def _is_name(value: object) -> bool:
+    return isinstance(value, str) and _NAME.fullmatch(value) is not None
 
 
 def _is_number(value: object) -> TypeGuard[float]:
@@ -373,10 +417,15 @@ def _is_number(value: object) -> TypeGuard[float]:
 # Arrays
 
 
-def _check_arrays(arrays: Mapping[str, np.ndarray], learners: int, size: int) -> None:
-    """Checks names, then types, shapes and values; `size` is O."""
-    depth = _depth(arrays)
-    shapes = _shapes(arrays, learners, size, depth)
+def _check_arrays(arrays: Mapping[str, np.ndarray], learners: int, size: int, *, own: bool) -> None:
+    """Checks names, then types, shapes and values; `size` is O, `own` that the network is code."""
+    depth = _depth(arrays, own=own)
+    first = arrays.get(f"actor/{'hidden_0' if depth else 'mean'}/kernel")
+    known = own and first is not None and first.ndim == 3
+    width = first.shape[1] if known and first is not None else size
+    shapes = _shapes(arrays, (learners, size), width, depth)
+    if own:
+        shapes |= _network_shapes(arrays, learners)
     for name in shapes:
         if name not in arrays:
             raise PolicyError(f"{name} is missing: the policy has {depth} hidden layers.")
@@ -404,18 +453,26 @@ def _check_array(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
         raise PolicyError(f"{name} holds a value that is not finite: expected numbers.")
 
 
-def _depth(arrays: Mapping[str, np.ndarray]) -> int:
-    """Counts the hidden layers, at least one."""
+def _network_shapes(arrays: Mapping[str, np.ndarray], learners: int) -> dict[str, tuple[int, ...]]:
+    """Returns the shapes of the arrays of a network that is code: one axis of learners at least."""
+    found = {name: array for name, array in arrays.items() if name.startswith(_NETWORK)}
+    return {name: (learners, *array.shape[1:]) for name, array in found.items()}
+
+
+def _depth(arrays: Mapping[str, np.ndarray], *, own: bool) -> int:
+    """Counts the hidden layers, at least one unless the network is code."""
     found = {match[0] for name in arrays if (match := re.match(r"actor/hidden_\d+/", name))}
-    return max(1, len(found))
+    return len(found) if own else max(1, len(found))
 
 
 def _shapes(
-    arrays: Mapping[str, np.ndarray], learners: int, size: int, depth: int
+    arrays: Mapping[str, np.ndarray], sizes: tuple[int, int], width: int, depth: int
 ) -> dict[str, tuple[int, ...]]:
-    """Returns the shape that each array should have; a bias says how wide its layer is."""
-    shapes = {}
-    width = size
+    """Returns the shape that each array should have; a bias says how wide its layer is.
+
+    `sizes` are L and O, `width` is what the first layer takes.
+    """
+    shapes, (learners, size) = {}, sizes
     for i in range(depth):
         bias = arrays.get(f"actor/hidden_{i}/bias")
         inner = bias.shape[-1] if bias is not None and bias.ndim == 2 else 0

@@ -37,7 +37,8 @@ ALONE: dict[str, set[str]] = {
     "epuck": set(),
     "atomic_file": set(),
     "provenance": set(),
-    "policy_file": {"policy", "atomic_file"},
+    "policy_file": {"policy", "policy_network", "extension", "atomic_file"},
+    "policy_network": {"extension"},
     "command": {"config", "policy"},
 }
 FILES = sorted(ROOT.rglob("*.py"))

@@ -1,10 +1,11 @@
 """From a checkpoint to `policy.npz`: weights, normaliser, layout and what trained them."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 
-from swarmjax import policy_file, provenance
+from swarmjax import epuck, extension, policy_file, provenance
 from swarmjax.config import build, files, to_dict
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import normalizer
@@ -13,14 +14,14 @@ from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import CheckpointError, Leaves
 from swarmjax.run.settings import TrainConfig
 from swarmjax.sim.config import RobotConfig
-from swarmjax.task import observation
+from swarmjax.task import observation, pieces
 from swarmjax.task.config import resolve_encoding
 from swarmjax.training import seeds
 
 POLICY = "policy.npz"
 
 
-_DRIVE = ("wheel_radius", "track", "max_wheel_speed")
+_TASK = ("control_step", "target_radius", "step_limit")
 
 
 def policy_arrays(leaves: Leaves) -> dict[str, np.ndarray]:
@@ -34,13 +35,20 @@ def policy_arrays(leaves: Leaves) -> dict[str, np.ndarray]:
     """
     prefix = "learners/params/actor/"
     actor = {
-        "actor/" + name.removeprefix(prefix).removeprefix("torso/"): leaf
+        _array_name(name.removeprefix(prefix)): leaf
         for name, leaf in leaves.items()
         if name.startswith(prefix)
     }
     mean, variance = (leaves[f"learners/normalizer/{name}"] for name in ("mean", "variance"))
     std = np.maximum(np.sqrt(variance), normalizer.MIN_STD)
     return actor | {"normalizer/mean": mean, "normalizer/std": std}
+
+
+def _array_name(name: str) -> str:
+    """Names an array of the actor as the file does: hidden layers, heads, or somebody's network."""
+    inner = name.removeprefix("torso/")
+    own = inner != name and not re.fullmatch(r"hidden_\d+/(kernel|bias)", inner)
+    return f"network/{inner}" if own else f"actor/{inner}"
 
 
 def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
@@ -56,11 +64,13 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
     """
     robot = trained.robot
     encoding = resolve_encoding(trained.task, trained.realism)
-    return {
+    chosen = pieces.choose(extension.load(trained.extensions), trained.task, trained.stage)
+    described = observation.describe(encoding, chosen.observations)
+    return _own_network(trained.algo) | {
         "policy": trained.algo.policy,
         "learners": trained.learners,
         "activation": trained.algo.activation,
-        "observation": observation.describe(encoding) | {"limit": ppo.OBSERVATION_LIMIT},
+        "observation": described | {"limit": ppo.OBSERVATION_LIMIT},
         "action": {
             "names": list(policy_file.ACTION_NAMES),
             "units": list(policy_file.ACTION_UNITS),
@@ -69,19 +79,30 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
         },
         "robot": {
             "preset": _robot_preset(robot),
-            **{key: getattr(robot, key) for key in ("body", *_DRIVE)},
+            **to_dict(robot),
         },
         "sensors": {
             "preset": trained.realism.name,
             "response": trained.realism.infrared,
             "range": trained.task.sensor_range,
+            "poses": [list(pose) for pose in epuck.SENSOR_POSES],
+            "height": epuck.SENSOR_HEIGHT,
+            "tilt": epuck.SENSOR_TILT,
         },
-        "task": {key: getattr(trained.task, key) for key in ("control_step", "target_radius")},
+        "task": {key: getattr(trained.task, key) for key in _TASK},
+        "realism": to_dict(trained.realism),
+        "stages": [to_dict(stage) for stage in trained.stage],
+        "extensions": trained.pieces,
         "config": to_dict(trained),
         "versions": provenance.versions(),
         "update": update,
         "seed": seed,
     }
+
+
+def _own_network(algo: AlgoConfig) -> dict[str, str]:
+    """Names the network of an extension, if the policy has one."""
+    return {} if algo.network in (None, "mlp") else {"network": algo.network}
 
 
 def _robot_preset(robot: RobotConfig) -> str:
@@ -110,8 +131,8 @@ def _squashed(arrays: dict[str, np.ndarray], algo: AlgoConfig) -> dict[str, np.n
     """Writes an output of tanh as one more hidden layer, before a last one that changes nothing."""
     if algo.mean_activation == "linear":
         return arrays
-    parts = ("kernel", "bias")
-    last = {f"actor/hidden_{len(algo.hidden_sizes)}/{p}": arrays[f"actor/mean/{p}"] for p in parts}
+    parts, count = ("kernel", "bias"), 0 if _own_network(algo) else len(algo.hidden_sizes)
+    last = {f"actor/hidden_{count}/{p}": arrays[f"actor/mean/{p}"] for p in parts}
     learners, actions = arrays["actor/mean/bias"].shape
     mean = np.tile(np.eye(actions, dtype=np.float32), (learners, 1, 1))
     zero = np.zeros((learners, actions), np.float32)
@@ -133,14 +154,13 @@ def write_policy(path: Path, leaves: Leaves, trained: TrainConfig, update: int, 
     """
     lane = seeds.numbers(trained).index(seed)
     arrays = policy_arrays(checkpoint.of_seed(leaves, lane, trained.seeds))
-    widths = tuple(
-        arrays[f"actor/hidden_{i}/bias"].shape[1]
-        for i in range(sum(name.endswith("/bias") for name in arrays) - 1)
-    )
+    hidden = sorted(name for name in arrays if re.fullmatch(r"actor/hidden_\d+/bias", name))
+    widths = tuple(arrays[f"actor/hidden_{i}/bias"].shape[1] for i in range(len(hidden)))
+    expected = () if _own_network(trained.algo) else trained.algo.hidden_sizes
     found = (len(arrays["actor/log_std"]), widths)
-    if found != (trained.learners, trained.algo.hidden_sizes):
+    if found != (trained.learners, expected):
         raise CheckpointError(
             f"the checkpoint holds {found[0]} learners of layers {list(widths)}, but the config "
-            f"says {trained.learners} of {list(trained.algo.hidden_sizes)}: it is of another run."
+            f"says {trained.learners} of {list(expected)}: it is of another run."
         )
     policy_file.write(path, _squashed(arrays, trained.algo), policy_meta(trained, update, seed))

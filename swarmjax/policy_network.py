@@ -1,0 +1,76 @@
+"""The network of an extension in a policy: code from a file of the user's, weights from the policy.
+
+Imports JAX when it is first called, so that policies that need none run without.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from swarmjax import extension
+
+
+class PolicyNetwork:
+    """What comes before the last layer of a policy: normalised [..., R, O] to features [..., R, F].
+
+    It can be sent to another process, which loads the extension again.
+    """
+
+    def __init__(self, source: str, name: str, arrays: Mapping[str, np.ndarray]) -> None:
+        """Keeps the weights.
+
+        Args:
+            source: as the key `extensions`.
+            name: of the network.
+            arrays: [L, ...] of its parameters, by their paths.
+        """
+        self._source, self._name, self._arrays = source, name, dict(arrays)
+        self._apply: Callable[[np.ndarray], Any] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_apply": None}
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Computes features [..., R, F] of normalised observations [..., R, O]."""
+        if self._apply is None:
+            self._apply = self._compile()
+        flat = x.reshape(-1, *x.shape[-2:])
+        found = np.asarray(self._apply(flat))
+        return found.reshape(*x.shape[:-1], found.shape[-1])
+
+    @property
+    def params(self) -> dict[str, Any]:
+        """Parameters [L, ...] as the Flax module nests them."""
+        nested: dict[str, Any] = {}
+        for path, array in self._arrays.items():
+            *parts, last = path.split("/")
+            inner = nested
+            for part in parts:
+                inner = inner.setdefault(part, {})
+            inner[last] = array
+        return nested
+
+    @property
+    def module(self) -> Any:
+        """The Flax module."""
+        networks = extension.load(self._source).networks
+        return next(piece for piece in networks if piece.name == self._name).function()
+
+    def _compile(self) -> Callable[[np.ndarray], Any]:
+        import jax
+
+        module, params = self.module, self.params
+        learners = len(next(iter(self._arrays.values())))
+
+        def one(mine: Any, x: Any) -> Any:
+            return module.apply({"params": mine}, x)
+
+        def shared(x: Any) -> Any:
+            return one(jax.tree.map(lambda leaf: leaf[0], params), x)
+
+        def independent(x: Any) -> Any:
+            mine = jax.tree.map(lambda leaf: leaf[: x.shape[-2]], params)
+            return jax.vmap(one, in_axes=(0, 1), out_axes=1)(mine, x)
+
+        return jax.jit(shared if learners == 1 else independent)
