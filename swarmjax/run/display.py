@@ -1,12 +1,14 @@
 """What a run shows while it trains: a live table on a terminal, plain lines elsewhere."""
 
+import contextlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from rich import box
 from rich.console import Console, Group
 from rich.live import Live
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 Row = Mapping[str, Any]
@@ -104,6 +106,23 @@ def _stage(last: Sequence[Row], index: int, name: str) -> StageState:
     return StageState(name, arenas, _spread([row["success_by_stage"][index] for row in last]))
 
 
+@contextlib.contextmanager
+def working(what: str, console: Console | None = None) -> Iterator[None]:
+    """Shows on a terminal that something is under way and for how long; elsewhere nothing.
+
+    Args:
+      what: is under way, `compiling` say.
+      console: where to show it; None for standard error, which scripts do not read.
+    """
+    console = console or Console(stderr=True)
+    columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        bar.add_task(what, total=None)
+        yield
+
+
 class Display:
     """Shows the run on a console. Use it with `with`."""
 
@@ -118,9 +137,18 @@ class Display:
         """Prints a sentence that stays."""
         self._console.print(sentence, highlight=False, markup=False, soft_wrap=True)
 
+    @contextlib.contextmanager
+    def working(self, what: str) -> Iterator[None]:
+        """Shows that something is under way: on a terminal for how long, elsewhere in a line."""
+        if not self._console.is_terminal:
+            self.say(f"{what} ...")
+        with working(what, self._console):
+            yield
+
     def show(self, summary: Row, speeds: Row, seconds_left: float) -> None:
         """Shows where the run stands."""
         if self._console.is_terminal:
+            self._live.start()  # not before there is a table: what is `working` stands there
             self._live.update(_table(summary, speeds, self._updates, seconds_left), refresh=True)
             return
         now = time.monotonic()
@@ -129,15 +157,12 @@ class Display:
             self.say(_line(summary, speeds, self._updates, seconds_left))
 
     def __enter__(self) -> "Display":
-        """Starts the live table on a terminal."""
-        if self._console.is_terminal:
-            self._live.start()
+        """Returns itself; a terminal's table begins when there is one to show."""
         return self
 
     def __exit__(self, *_: object) -> None:
         """Leaves the last table standing."""
-        if self._console.is_terminal:
-            self._live.stop()
+        self._live.stop()
 
 
 def _table(summary: Row, speeds: Row, updates: int, seconds_left: float) -> Group:

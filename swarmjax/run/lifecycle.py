@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,7 +17,7 @@ from swarmjax.config import ConfigError, to_dict
 from swarmjax.curriculum import engine as curriculum
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.run import checkpoint, memory, warm_start
-from swarmjax.run.display import Display
+from swarmjax.run.display import Display, working
 from swarmjax.run.policy_export import POLICY, seed_path, write_policy
 from swarmjax.run.settings import TrainConfig
 from swarmjax.run.trainer import Built, Stop, Tally, compile_chunk, prepare, train
@@ -47,17 +46,20 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
       CheckpointError: if what it goes on with is damaged.
       TrainingError: if a loss is no longer finite.
     """
-    source = warm_start.read(settings)
-    program, schedule, init, template = _load(settings)
-    state, skipped = _first_state(program, lambda: init(schedule), template, source)
-    display.say(f"{_opening(program)}; into {run}; compiling")
+    with working("building the arenas"):
+        source = warm_start.read(settings)
+        program, schedule, init, template = _load(settings)
+        state, skipped = _first_state(program, lambda: init(schedule), template, source)
+    display.say(f"{_opening(program)}; into {run}")
     for sentence in skipped:
         display.say(f"{sentence}: it was passed over.")
     if source is not None:
         display.say(f"starting with what {source.run} had learned after {source.update} updates")
     for sentence in _short_budget(settings, schedule):
         display.say(sentence)
-    compiled, state = prepare(program, schedule, state, memory.limit())
+    with display.working("compiling"):
+        compiled, state = prepare(program, schedule, state, memory.limit())
+    display.say(f"compiled in {compiled.seconds:.1f} s")
     _open_run(run, settings)
     state, tally = train(run, program, schedule, compiled, state, display, stop)
     _write_results(run, program, state, tally)
@@ -132,17 +134,20 @@ def _unwritable(run: Path, error: OSError) -> ConfigError:
     return ConfigError(f"run.dir is {run}, which cannot be written: {error.strerror or error}.")
 
 
-def dry_run(settings: TrainConfig) -> int:
+def dry_run(settings: TrainConfig, display: Display) -> int:
     """Compiles, says what it took and what a run needs, and stops."""
-    warm_start.read(settings)
-    program, schedule, _, template = _load(settings)
-    compiled = compile_chunk(program, schedule, template)
-    memory.check(settings, compiled.total_bytes, memory.limit())
+    with working("building the arenas"):
+        warm_start.read(settings)
+        program, schedule, _, template = _load(settings)
+    for sentence in (_opening(program), *_short_budget(settings, schedule)):
+        display.say(sentence)
+    with display.working("compiling"):
+        compiled = compile_chunk(program, schedule, template)
+        memory.check(settings, compiled.total_bytes, memory.limit())
     state, work = compiled.state_bytes / 2**20, compiled.work_bytes / 2**20
-    sys.stdout.write(
-        f"{'\n'.join([_opening(program), *_short_budget(settings, schedule)])}\n"
+    display.say(
         f"compiled in {compiled.seconds:.1f} s; memory: {state:.1f} MiB of state, "
-        f"{work:.1f} MiB to work with; nothing was trained (run.dry).\n"
+        f"{work:.1f} MiB to work with; nothing was trained (run.dry)."
     )
     return 0
 

@@ -4,7 +4,7 @@ import io
 
 from rich.console import Console
 
-from swarmjax.run.display import Display, StageState, summarize
+from swarmjax.run.display import Display, StageState, summarize, working
 
 NAMES = ["s1", "s2", "s3"]
 ROW = {
@@ -122,6 +122,30 @@ def test_of_many_stages_the_best_and_the_worst_are_shown() -> None:
     assert "56 %" in _line_of(shown, " most arenas: n7")  # 9 of 16
     assert "4 of 9 stages above 90 %" in shown
     assert "n3" not in shown
+
+
+def _worked(terminal: bool) -> str:
+    console = Console(file=io.StringIO(), force_terminal=terminal, width=100)
+    with Display(100, console) as display, display.working("compiling"):
+        pass
+    file = console.file
+    assert isinstance(file, io.StringIO)
+    return file.getvalue()
+
+
+def test_a_terminal_shows_for_how_long_something_is_under_way() -> None:
+    assert "compiling" in _worked(True)
+    assert "0:00:00" in _worked(True)
+
+
+def test_a_plain_line_says_what_is_under_way() -> None:
+    assert _worked(False) == "compiling ...\n"
+
+
+def test_scripts_that_read_standard_error_see_no_sign_of_life(capsys) -> None:
+    with working("starting"):
+        pass
+    assert capsys.readouterr() == ("", "")
 
 
 def test_a_single_stage_has_no_table_of_stages() -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from swarmjax import command, policy, train
 from swarmjax.config import build, to_dict
 from swarmjax.export import __main__ as export
 from swarmjax.export.config import ExportConfig
-from swarmjax.run import checkpoint, lifecycle
+from swarmjax.run import checkpoint, execute, lifecycle
 from swarmjax.run.checkpoint import CheckpointError, Checkpoints, digest
 from swarmjax.run.settings import TrainConfig, load_train
 from swarmjax.training import program as programs
@@ -99,6 +100,21 @@ def test_a_run_directory_holds_what_it_promises(whole: Path) -> None:
     assert summary["transitions"] == [sum(row["transitions"] for row in rows)]
     stored = json.loads((whole / "config.json").read_text())
     assert build(TrainConfig, stored).algo.hidden_sizes == (8,)
+
+
+def test_jax_is_not_loaded_before_the_settings_are_read() -> None:
+    code = "import sys, swarmjax.train; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_run_says_what_steps_the_robots_and_then_that_it_compiles(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert _train(f"run.dir={tmp_path}", "run.stop_after=1") == 0
+    first, second, third, *_ = capsys.readouterr().out.splitlines()
+    assert "planar robots stepped by discs" in first
+    assert second == "compiling ..."
+    assert re.fullmatch(r"compiled in \S+ s", third)
 
 
 @pytest.mark.parametrize("chunk", ["7", "all", "auto"])
@@ -236,7 +252,7 @@ def test_a_seed_that_breaks_stops_the_run_and_is_named(
     with Checkpoints(tmp_path, keep=1) as checkpoints:
         checkpoints.save(leaves, 4)
     capsys.readouterr()
-    assert train.main([f"resume={tmp_path}"]) == train.FAILED
+    assert train.main([f"resume={tmp_path}"]) == execute.FAILED
     assert "_loss is no longer finite at update 4 of seed 4: try lower" in capsys.readouterr().out
     assert checkpoint.restore(tmp_path)[1] == 4
 
