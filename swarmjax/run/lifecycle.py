@@ -8,7 +8,7 @@ from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
@@ -17,23 +17,34 @@ from swarmjax.config import ConfigError, to_dict
 from swarmjax.curriculum import engine as curriculum
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.run import checkpoint, memory, warm_start
+from swarmjax.run.checkpoint import Checkpoints, Leaves
 from swarmjax.run.display import Display, working
 from swarmjax.run.policy_export import POLICY, seed_path, write_policy
 from swarmjax.run.settings import TrainConfig
-from swarmjax.run.trainer import Built, Stop, Tally, compile_chunk, prepare, train
+from swarmjax.run.trainer import Built, Stop, Tally, begin_tally, compile_chunk, prepare, train
 from swarmjax.run.warm_start import Source
 from swarmjax.training import program as programs
 from swarmjax.training import seeds
 from swarmjax.training.loop import TrainState
 
+SUMMARY = "summary.json"
 _PRICE = "learners/price/"  # of checkpoints written while algo.contact_limit was a key
+
+
+class Kept(NamedTuple):
+    """The newest sound checkpoint of a run that is resumed, as `checkpoint.restore` returns it."""
+
+    leaves: Leaves
+    update: int
+    skipped: list[str]
 
 
 def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) -> Tally:
     """Trains as a config says, and writes what a run directory holds.
 
     Args:
-      settings: the config; with `resume` it goes on.
+      settings: the config; with `resume` it goes on. A run whose budget is spent is not compiled:
+        what its directory lacks is written.
       run: the run directory, in which there is no other run.
       stop: notices signals.
       display: shows the run.
@@ -47,9 +58,12 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
       TrainingError: if a loss is no longer finite.
     """
     with working("building the arenas"):
-        source = warm_start.read(settings)
+        source, kept = warm_start.read(settings), _read_kept(settings)
+    if kept is not None and kept.update == settings.updates:
+        return _complete(run, settings, kept, display)
+    with working("building the arenas"):
         program, schedule, init, template = _load(settings)
-        state, skipped = _first_state(program, lambda: init(schedule), template, source)
+        state, skipped = _first_state(program, lambda: init(schedule), template, source, kept)
     display.say(f"{_opening(program)}; into {run}")
     for sentence in skipped:
         display.say(f"{sentence}: it was passed over.")
@@ -62,8 +76,59 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
     display.say(f"compiled in {compiled.seconds:.1f} s")
     _open_run(run, settings)
     state, tally = train(run, program, schedule, compiled, state, display, stop)
-    _write_results(run, program, state, tally)
+    leaves = checkpoint.to_leaves(state)
+    _write_policies(run, settings, leaves, tally.update)
+    _write_summary(run, program, tally)
     return tally
+
+
+def _read_kept(settings: TrainConfig) -> Kept | None:
+    """Reads the newest sound checkpoint of the run that is resumed, if one is."""
+    if settings.resume is None:
+        return None
+    kept = Kept(*checkpoint.restore(Path(settings.resume)))
+    if kept.update > settings.updates:
+        spent = kept.update * settings.arenas * settings.algo.rollout_length
+        raise ConfigError(
+            f"budget is {settings.budget}, but {settings.resume} has spent {spent} already: give "
+            "at least that."
+        )
+    return kept
+
+
+def _complete(run: Path, settings: TrainConfig, kept: Kept, display: Display) -> Tally:
+    """Writes what the directory of a run lacks whose budget is spent; trains nothing."""
+    current = _is_summed_up(run, kept.update)
+    if not current:
+        _open_run(run, settings)
+        with Checkpoints(run, settings.run.keep_checkpoints) as checkpoints:
+            checkpoints.save(kept.leaves, kept.update)
+    _write_policies(run, settings, kept.leaves, kept.update, only_missing=current)
+    steps = kept.update * settings.arenas * settings.algo.rollout_length
+    for sentence in kept.skipped:
+        display.say(f"{sentence}: it was passed over.")
+    display.say(
+        f"nothing left to train: {settings.resume} has spent its budget of {steps:,} arena control "
+        f"steps ({kept.update:,} updates); for more, give a larger budget"
+    )
+    tally = begin_tally(settings, kept.update, compile_s=0.0)
+    if not current:
+        with working("building the arenas"):
+            program, *_ = _load(settings)
+        _write_summary(run, program, tally)
+    return tally
+
+
+def _is_summed_up(run: Path, update: int) -> bool:
+    """Tells whether a summary says that the budget was spent with this update.
+
+    It is the last file that is written, so the others are then as new.
+    """
+    try:
+        found = json.loads((run / SUMMARY).read_text())
+        return found["budget_spent"] is True and found["updates"] == update
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
 def _load(settings: TrainConfig) -> tuple[Built, Schedule, Any, TrainState]:
@@ -76,28 +141,26 @@ def _load(settings: TrainConfig) -> tuple[Built, Schedule, Any, TrainState]:
 
 
 def _first_state(
-    program: Built, init: Callable[[], TrainState], template: TrainState, source: Source | None
+    program: Built,
+    init: Callable[[], TrainState],
+    template: TrainState,
+    source: Source | None,
+    kept: Kept | None,
 ) -> tuple[TrainState, list[str]]:
-    """Starts from the seed, or from the newest sound checkpoint of the run that is resumed.
+    """Starts from the seed, or from the checkpoint of the run that is resumed.
 
     A start from the seed takes the networks and normalisers of `source`, if there is one.
     """
     settings = program.config
-    if settings.resume is None:
+    if kept is None:
         state = init()
         if source is None:
             return state, []
         return warm_start.carry(source, state, settings), source.skipped
-    leaves, update, skipped = checkpoint.restore(Path(settings.resume))
-    if update > settings.updates:
-        raise ConfigError(
-            f"budget is {settings.budget}, but {settings.resume} has spent "
-            f"{update * settings.arenas * settings.algo.rollout_length} already: give at least "
-            "that."
-        )
-    if any(name.startswith(_PRICE) for name in leaves):
+    skipped = kept.skipped
+    if any(name.startswith(_PRICE) for name in kept.leaves):
         skipped = [*skipped, f"a price on contacts (algo.contact_limit) in {settings.resume}"]
-    return checkpoint.from_leaves(leaves, template), skipped
+    return checkpoint.from_leaves(kept.leaves, template), skipped
 
 
 def find_run(settings: TrainConfig) -> Path:
@@ -186,14 +249,20 @@ def _short_budget(settings: TrainConfig, schedule: Schedule) -> list[str]:
     ]
 
 
-def _write_results(run: Path, program: Built, state: TrainState, tally: Tally) -> None:
-    """Writes the policies and `summary.json`."""
+def _write_policies(
+    run: Path, settings: TrainConfig, leaves: Leaves, update: int, *, only_missing: bool = False
+) -> None:
+    """Writes the policy of every seed, or of those alone that have none."""
+    for seed in seeds.numbers(settings):
+        file = seed_path(run / POLICY, settings, seed)
+        if not (only_missing and file.exists()):
+            write_policy(file, leaves, settings, update, seed)
+
+
+def _write_summary(run: Path, program: Built, tally: Tally) -> None:
+    """Writes `summary.json`."""
     settings, every = program.config, seeds.numbers(program.config)
     engine = program.world.physics.engine
-    leaves = checkpoint.to_leaves(state)
-    for seed in every:
-        file = seed_path(run / POLICY, settings, seed)
-        write_policy(file, leaves, settings, tally.update, seed)
     steps = tally.update * settings.arenas * settings.algo.rollout_length
     train_s, transitions = tally.earlier_s + tally.seconds, tally.transitions
     summary = {
@@ -220,4 +289,4 @@ def _write_results(run: Path, program: Built, state: TrainState, tally: Tally) -
         "versions": provenance.versions(),
         "commit": provenance.commit(),
     }
-    (run / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    (run / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n")
