@@ -47,7 +47,11 @@ class StageState(NamedTuple):
 
 
 def summarize(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
-    """Sums the rows of a call up: over the episodes that ended on the newest stage of each seed.
+    """Sums the rows of a call up, on the newest stage of each seed.
+
+    Episodes that end in an update are not like those that begin in it: the short ones end first.
+    How good the swarm is, the newest whole cohort says: all episodes that began within one step
+    limit.
 
     Args:
       rows: of all seeds, as `recorder.rows` makes them, those of a seed in their order.
@@ -55,19 +59,20 @@ def summarize(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
 
     Returns:
       `stage`, the newest one, or the range of them over seeds; `update`; `episodes`; as `Spread`
-      over seeds `targets_reached`, `all_reached`, `contacts_per_robot`, `return`, `stage_success`,
-      `value_loss`, `policy_loss` and `std`, None where no episode ended; and `stages`, the
-      `StageState` of each.
+      over seeds `cohort_targets` and `cohort_complete`, shares of targets and of episodes in which
+      all arrived, over the newest cohort, None before there is one; `ended_targets`,
+      `contacts_per_robot` and `return`, over the episodes that ended, None where none did;
+      `value_loss` and `policy_loss`; and `stages`, the `StageState` of each.
     """
     by_seed: dict[int, list[Row]] = {}
     for row in rows:
         by_seed.setdefault(row["seed"], []).append(row)
-    each = [_of_seed(mine) for mine in by_seed.values()]
+    each = [_of_seed(mine, names) for mine in by_seed.values()]
     last = [mine[-1] for mine in by_seed.values()]
     newest = sorted({names.index(row["stage"]) for row in last})
     first, final = names[newest[0]], names[newest[-1]]
-    spread = {key: _spread([one[key] for one in each]) for key in each[0].keys() - {"episodes"}}
-    return spread | {
+    over_seeds = {key: spread([one[key] for one in each]) for key in each[0].keys() - {"episodes"}}
+    return over_seeds | {
         "stage": first if first == final else f"{first} to {final}",
         "update": rows[-1]["update"] + 1,
         "episodes": sum(one["episodes"] for one in each),
@@ -75,9 +80,10 @@ def summarize(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _of_seed(rows: Sequence[Row]) -> dict[str, Any]:
+def _of_seed(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
     """Sums the rows of one seed up."""
     newest = rows[-1]
+    stage = names.index(newest["stage"])
     mine = [row for row in rows if row["stage"] == newest["stage"]]
 
     def share(part: str, whole: str) -> float | None:
@@ -86,16 +92,17 @@ def _of_seed(rows: Sequence[Row]) -> dict[str, Any]:
 
     return {
         "episodes": sum(row["episodes"] for row in mine),
-        "targets_reached": share("reached", "targets"),
-        "all_reached": share("complete", "episodes"),
+        "cohort_targets": newest["success_by_stage"][stage],
+        "cohort_complete": newest["complete_by_stage"][stage],
+        "ended_targets": share("reached", "targets"),
         "return": share("reward", "targets"),
         "contacts_per_robot": share("contacts", "targets"),
-        **{key: newest[key] for key in ("stage_success", "value_loss", "policy_loss", "std")},
+        **{key: newest[key] for key in ("value_loss", "policy_loss")},
     }
 
 
-def _spread(values: Sequence[float | None]) -> Spread | None:
-    """Spread of those values that are there."""
+def spread(values: Sequence[float | None]) -> Spread | None:
+    """Spread of those values that are there, or None if none is."""
     there = [value for value in values if value is not None]
     return Spread(sum(there) / len(there), min(there), max(there)) if there else None
 
@@ -103,7 +110,7 @@ def _spread(values: Sequence[float | None]) -> Spread | None:
 def _stage(last: Sequence[Row], index: int, name: str) -> StageState:
     """How a stage stands by the last row of each seed."""
     arenas = sum(row["mix"][index] / sum(row["mix"]) for row in last) / len(last)
-    return StageState(name, arenas, _spread([row["success_by_stage"][index] for row in last]))
+    return StageState(name, arenas, spread([row["success_by_stage"][index] for row in last]))
 
 
 @contextlib.contextmanager
@@ -172,9 +179,9 @@ def _table(summary: Row, speeds: Row, updates: int, seconds_left: float) -> Grou
         table.add_column(heading)
         table.add_column(justify="right")
     left = [
-        ("targets reached", _percent(summary["targets_reached"])),
-        ("all robots reached", _percent(summary["all_reached"])),
-        ("stage success", _percent(summary["stage_success"])),
+        ("targets reached", measured(summary["cohort_targets"])),
+        ("- in episodes just ended", _percent(summary["ended_targets"])),
+        ("all robots reached", measured(summary["cohort_complete"])),
         ("contacts per robot", _number(summary["contacts_per_robot"])),
         ("return", _number(summary["return"])),
         ("policy loss", _number(summary["policy_loss"])),
@@ -226,8 +233,8 @@ def _line(summary: Row, speeds: Row, updates: int, seconds_left: float) -> str:
     """Says in one line what the table shows."""
     return (
         f"update {summary['update']}/{updates}  stage {summary['stage']}  "
-        f"targets {_percent(summary['targets_reached'])}  "
-        f"success {_percent(summary['stage_success'])}  "
+        f"targets reached {measured(summary['cohort_targets'])} "
+        f"({_percent(summary['ended_targets'])} in episodes just ended)  "
         f"{_stages_in_line(summary['stages'])}"
         f"contacts {_number(summary['contacts_per_robot'])}  "
         f"return {_number(summary['return'])}  "
@@ -248,6 +255,11 @@ def _stages_in_line(stages: Sequence[StageState]) -> str:
     return f"{_counted(stages)}{worst}  "
 
 
+def measured(share: Spread | None) -> str:
+    """Writes a share over a whole cohort, or that there is none yet."""
+    return "not measured yet" if share is None else _percent(share)
+
+
 def _percent(share: Spread | None) -> str:
     return _with_range(share, lambda value, digits: f"{100 * value:.{digits}f}", " %")
 
@@ -256,14 +268,14 @@ def _number(value: Spread | None) -> str:
     return _with_range(value, lambda number, digits: f"{number:.{2 + digits}g}", "")
 
 
-def _with_range(spread: Spread | None, write: Callable[[float, int], str], unit: str) -> str:
+def _with_range(found: Spread | None, write: Callable[[float, int], str], unit: str) -> str:
     """Writes a mean, with the range of several seeds a digit shorter."""
-    if spread is None:
+    if found is None:
         return "-"
-    text = f"{write(spread.mean, 1)}{unit}"
-    if spread.low == spread.high:
+    text = f"{write(found.mean, 1)}{unit}"
+    if found.low == found.high:
         return text
-    return f"{text} ({write(spread.low, 0)} to {write(spread.high, 0)})"
+    return f"{text} ({write(found.low, 0)} to {write(found.high, 0)})"
 
 
 def _clock(seconds: float) -> str:

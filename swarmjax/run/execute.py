@@ -1,5 +1,6 @@
 """From the checked settings of a run to its exit code: caches, memory, and the closing lines."""
 
+import math
 import sys
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import jax
 
 from swarmjax import command
 from swarmjax.run import compile_cache, memory
-from swarmjax.run.display import Display, working
+from swarmjax.run.display import Display, measured, spread, working
 from swarmjax.run.lifecycle import carry_out, dry_run, find_run
 from swarmjax.run.policy_export import POLICY, seed_path
 from swarmjax.run.settings import TrainConfig
@@ -54,8 +55,26 @@ def _run(settings: TrainConfig) -> int:
         except TrainingError as error:
             display.say(f"swarmjax.train: error: {error} What was saved before is in {run}.")
             return FAILED
-    sys.stdout.write(_closing(run, settings, tally) + "\n")
+    sys.stdout.write(f"{_success(settings, tally)}\n{_closing(run, settings, tally)}\n")
     return command.INTERRUPTED if stop.asked else 0
+
+
+def _success(settings: TrainConfig, tally: Tally) -> str:
+    """Says how good the swarm is on the furthest stage that was measured."""
+    last = settings.stage[-1].name
+    for stage in reversed(settings.stage):
+        found = spread([of_seed.get(stage.name) for of_seed in tally.targets_reached.values()])
+        if found is not None:
+            more = "" if stage.name == last else f"; {last} was not measured yet"
+            return (
+                f"targets reached on {stage.name}: {measured(found)}, over all episodes that began "
+                f"within one step limit{more}"
+            )
+    updates = math.ceil(settings.task.step_limit / settings.algo.rollout_length)
+    return (
+        f"targets reached: not measured yet, since no whole cohort ended: its episodes begin "
+        f"within one step limit ({updates:,} updates) and end within another"
+    )
 
 
 def _closing(run: Path, settings: TrainConfig, tally: Tally) -> str:
