@@ -11,6 +11,8 @@ from rich.live import Live
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from swarmjax import words
+
 Row = Mapping[str, Any]
 
 LINE_SECONDS = 2.0  # least time between two plain lines
@@ -190,8 +192,8 @@ def _table(summary: Row, speeds: Row, updates: int, seconds_left: float) -> Grou
     right = [
         ("update", f"{summary['update']:,} of {updates:,}"),
         *((name, f"{speeds[key]:,.0f}") for name, key in _SPEEDS),
-        ("compile time", f"{speeds['compile_s']:.1f} s"),
-        ("time left", _clock(seconds_left)),
+        ("compile time", words.duration(speeds["compile_s"])),
+        ("time left", words.duration(seconds_left)),
     ]
     for a, b in zip(left, right, strict=True):
         table.add_row(*a, *b)
@@ -226,7 +228,7 @@ def _measured(stages: Sequence[StageState]) -> list[StageState]:
 def _counted(stages: Sequence[StageState]) -> str:
     """Says of how many stages the swarm reaches nearly all targets."""
     good = sum(stage.success is not None and stage.success.mean > GOOD for stage in stages)
-    return f"{good} of {len(stages)} stages above {100 * GOOD:.0f} %"
+    return f"{good} of {words.count(len(stages), 'stage')} above {100 * GOOD:.0f} %"
 
 
 def _line(summary: Row, speeds: Row, updates: int, seconds_left: float) -> str:
@@ -241,7 +243,7 @@ def _line(summary: Row, speeds: Row, updates: int, seconds_left: float) -> str:
         f"arena steps/s {speeds['arena_steps_per_s']:,.0f}  "
         f"robot steps/s {speeds['robot_steps_per_s']:,.0f}  "
         f"physics steps/s {speeds['physics_steps_per_s']:,.0f}  "
-        f"transitions/s {speeds['transitions_per_s']:,.0f}  left {_clock(seconds_left)}"
+        f"transitions/s {speeds['transitions_per_s']:,.0f}  left {words.duration(seconds_left)}"
     )
 
 
@@ -276,8 +278,3 @@ def _with_range(found: Spread | None, write: Callable[[float, int], str], unit: 
     if found.low == found.high:
         return text
     return f"{text} ({write(found.low, 0)} to {write(found.high, 0)})"
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"

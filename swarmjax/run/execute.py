@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax
 
-from swarmjax import command
+from swarmjax import command, words
 from swarmjax.run import compile_cache, memory
 from swarmjax.run.display import Display, measured, spread, working
 from swarmjax.run.lifecycle import carry_out, dry_run, find_run
@@ -70,10 +70,12 @@ def _success(settings: TrainConfig, tally: Tally) -> str:
                 f"targets reached on {stage.name}: {measured(found)}, over all episodes that began "
                 f"within one step limit{more}"
             )
-    updates = math.ceil(settings.task.step_limit / settings.algo.rollout_length)
+    updates = words.count(
+        math.ceil(settings.task.step_limit / settings.algo.rollout_length), "update"
+    )
     return (
         f"targets reached: not measured yet, since no whole cohort ended: its episodes begin "
-        f"within one step limit ({updates:,} updates) and end within another"
+        f"within one step limit ({updates}) and end within another"
     )
 
 

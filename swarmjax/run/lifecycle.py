@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from swarmjax import provenance
+from swarmjax import provenance, words
 from swarmjax.config import ConfigError, to_dict
 from swarmjax.curriculum import engine as curriculum
 from swarmjax.curriculum.engine import Schedule
@@ -68,12 +68,13 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
     for sentence in skipped:
         display.say(f"{sentence}: it was passed over.")
     if source is not None:
-        display.say(f"starting with what {source.run} had learned after {source.update} updates")
+        updates = words.count(source.update, "update")
+        display.say(f"starting with what {source.run} had learned after {updates}")
     for sentence in _short_budget(settings, schedule):
         display.say(sentence)
     with display.working("compiling"):
         compiled, state = prepare(program, schedule, state, memory.limit())
-    display.say(f"compiled in {compiled.seconds:.1f} s")
+    display.say(f"compiled in {words.duration(compiled.seconds)}")
     _open_run(run, settings)
     state, tally = train(run, program, schedule, compiled, state, display, stop)
     leaves = checkpoint.to_leaves(state)
@@ -104,12 +105,14 @@ def _complete(run: Path, settings: TrainConfig, kept: Kept, display: Display) ->
         with Checkpoints(run, settings.run.keep_checkpoints) as checkpoints:
             checkpoints.save(kept.leaves, kept.update)
     _write_policies(run, settings, kept.leaves, kept.update, only_missing=current)
-    steps = kept.update * settings.arenas * settings.algo.rollout_length
+    steps = words.count(
+        kept.update * settings.arenas * settings.algo.rollout_length, "arena control step"
+    )
     for sentence in kept.skipped:
         display.say(f"{sentence}: it was passed over.")
     display.say(
-        f"nothing left to train: {settings.resume} has spent its budget of {steps:,} arena control "
-        f"steps ({kept.update:,} updates); for more, give a larger budget"
+        f"nothing left to train: {settings.resume} has spent its budget of {steps} "
+        f"({words.count(kept.update, 'update')}); for more, give a larger budget"
     )
     tally = begin_tally(settings, kept.update, compile_s=0.0)
     if not current:
@@ -209,7 +212,7 @@ def dry_run(settings: TrainConfig, display: Display) -> int:
         memory.check(settings, compiled.total_bytes, memory.limit())
     state, work = compiled.state_bytes / 2**20, compiled.work_bytes / 2**20
     display.say(
-        f"compiled in {compiled.seconds:.1f} s; memory: {state:.1f} MiB of state, "
+        f"compiled in {words.duration(compiled.seconds)}; memory: {state:.1f} MiB of state, "
         f"{work:.1f} MiB to work with; nothing was trained (run.dry)."
     )
     return 0
@@ -225,8 +228,9 @@ def _opening(program: Built) -> str:
     ]
     several = f", seeds {every[0]} to {every[-1]} {how}" if len(every) > 1 else ""
     return (
-        f"swarmjax: {settings.stage_name} ({names}), {settings.updates:,} updates of {steps:,} "
-        f"arena control steps ({settings.arenas:,} arenas){several} on {provenance.device()}; "
+        f"swarmjax: {settings.stage_name} ({names}), {words.count(settings.updates, 'update')} "
+        f"of {words.count(steps, 'arena control step')} "
+        f"({words.count(settings.arenas, 'arena')}){several} on {provenance.device()}; "
         f"{settings.robot.body} robots stepped by {engine.label}, "
         f"sim.solver={engine.solver} sim.impl={engine.impl}"
     )
@@ -241,11 +245,12 @@ def _short_budget(settings: TrainConfig, schedule: Schedule) -> list[str]:
     if begins <= latest:
         return []
     when = f"begin as late as update {begins:,}" if begins < settings.updates else "never begin"
+    least = words.count(int(schedule.cohort_updates), "update")
     return [
-        f"the budget is short: a stage takes at least {schedule.cohort_updates} updates (one step "
-        f"limit), so that {settings.stage[-1].name}, the last, may {when}, where "
-        f"curriculum.budget_share={share} asks for {latest:,} at the "
-        "latest: give more budget, fewer arenas or fewer stages."
+        f"the budget is short: a stage takes at least {least} (one step limit), so that "
+        f"{settings.stage[-1].name}, the last, may {when}, where "
+        f"curriculum.budget_share={share} asks for {latest:,} at the latest: give more budget, "
+        "fewer arenas or fewer stages."
     ]
 
 

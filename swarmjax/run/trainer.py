@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from swarmjax import provenance
+from swarmjax import provenance, words
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.curriculum.log import log
 from swarmjax.run import memory, recorder
@@ -378,8 +378,8 @@ def _log_episodes(
     record.write_episodes(rows)
     if lost:
         display.say(
-            f"{lost:,} episodes up to update {updates[-1]:,} were too short for their number to "
-            f"be foreseen, and are missing from {recorder.EPISODES}."
+            f"{recorder.EPISODES} lacks {words.count(lost, 'episode')} up to update "
+            f"{updates[-1]:,}: more ended than there was room for."
         )
 
 
