@@ -1,6 +1,6 @@
 """`python -m swarmjax.train stage=... key=value`: trains a swarm, from the command line.
 
-With no argument it trains the default curriculum. `--help` lists every key. JAX takes seconds to
+With no argument it trains the default curriculum. `--help` gives examples. JAX takes seconds to
 load, so it is imported only when the settings are known to be sound.
 """
 
