@@ -1,5 +1,6 @@
 """What all commands share: `--help`, and errors of the user's in one sentence with exit code 2."""
 
+import inspect
 import sys
 from collections.abc import Callable, Sequence
 
@@ -9,6 +10,60 @@ from swarmjax.policy import PolicyError
 
 USER_ERROR = 2
 INTERRUPTED = 130  # 128 + SIGINT, as a shell gives it
+_HELP = {"-h", "--help"}
+_ALL = "all"  # topic of the help that is every key
+# By the command's module, what to type after `python -m` and it, and what that does.
+EXAMPLES: dict[str, dict[str, str]] = {
+    "swarmjax.train": {
+        "": "the default curriculum, into a new folder of runs/",
+        "stage=s6 robot=wheeled budget=8e6 arenas=512": "one stage, on wheels",
+        "run.dir=runs/first seeds=4": "four seeds at once, into a folder of your choice",
+        "stage=curriculum 'stage.sequence=[s1,s3,s6]'": "a curriculum of three stages",
+        "init_from=runs/first realism=real": "from what a run learned, on realistic robots",
+        "resume=runs/first": "go on with a run that was stopped",
+        "stage=s6 run.dry=true": "compile, say what the run needs, and train nothing",
+    },
+    "swarmjax.evaluate": {
+        "policy=runs/first/policy.npz": "1,000 levels of stage s6, on wheels",
+        "policy=runs/first/policy.npz stage=s3 robot=planar": "the body that it was trained on",
+        "policy=runs/first/policy.npz suite=headline out=judged": "a suite, with tables and plots",
+        "policy='runs/first/policy-seed*.npz'": "all seeds of a run together",
+        "compare=a.npz,b.npz": "two policies, level by level",
+        "policy=runs/first/policy.npz realism=real episodes=200": "with noise and latency",
+    },
+    "swarmjax.export": {
+        "run=runs/first": "write the policy of the newest checkpoint again",
+        "run=runs/first step=100": "the policy of an older checkpoint",
+        "run=runs/first seed=3": "one seed of several",
+        "policy=policy.npz format=onnx": "for ONNX Runtime",
+        "policy=policy.npz format=c out=firmware/policy_c": "C99 for a robot's firmware",
+        "policy=policy.npz format=webots": "a controller for Webots",
+    },
+    "swarmjax.report": {
+        "run=runs/first": "into runs/first/report",
+        "run=runs/first out=reports/first": "into a folder of your choice",
+    },
+    "swarmjax.replay": {
+        "policy=runs/first/policy.npz": "level 0 of stage s6, into replay.html",
+        "policy=runs/first/policy.npz level=0,7,12": "several levels",
+        "policy=runs/first/policy.npz worst=5": "the five of 1,000 that it does worst in",
+        "policy=a.npz,b.npz worst=3": "two policies side by side",
+        "policy=runs/first/policy.npz stage=s3 robot=planar": "another stage and body",
+        "policy=runs/first/policy.npz video=replay.mp4": "a video as well",
+    },
+    "swarmjax.reproduce": {
+        "": "all arms, ten seeds each: hours",
+        "seeds=3 budget=100000": "a first look, in minutes",
+        "'arms=[curriculum,baseline]' device=cpu": "two arms, without the GPU",
+        "minutes=55 out=runs/paper": "stop in time, with all saved",
+        "resume=runs/paper": "go on with a reproduction that was stopped",
+    },
+    "swarmjax.suite": {
+        "suite=headline": "draw the levels and hold them to the digests in the suite's file",
+        "suite=headline out=headline.npz": "write all levels to a file that evaluate reads",
+        "suite=my_suite.yaml write=true": "put the digests into a suite of your own",
+    },
+}
 
 
 def run(
@@ -31,8 +86,9 @@ def run(
     arguments = sys.argv[1:]
     module = _module(name)
     try:
-        if {"-h", "--help"} & set(arguments):
-            sys.stdout.write(help_text(settings, module) + "\n")
+        if _HELP & set(arguments):
+            topics = [word for word in arguments if word not in _HELP and "=" not in word]
+            sys.stdout.write(help_text(settings, module, topics) + "\n")
             return 0
         return main(arguments)
     except KeyboardInterrupt:
@@ -49,18 +105,57 @@ def _module(name: str) -> str:
     return found if found.rpartition(".")[2] == name else f"swarmjax.{name}"
 
 
-def help_text(cls: type[Section], module: str) -> str:
-    """Describe a command's settings: groups with their choices, then every key.
+def help_text(cls: type[Section], module: str, topics: Sequence[str] = ()) -> str:
+    """Describe a command's settings.
 
     Args:
         cls: the command's dataclass.
         module: the command as `python -m` names it, such as `swarmjax.train`.
+        topics: sections or keys to list, or `all`; none for usage, examples, groups and the keys
+            that are in no section.
 
     Returns:
         Lines for a terminal, without a newline at the end.
+
+    Raises:
+        ConfigError: there is no such topic.
     """
-    lines = [f"usage: python -m {module} key=value ..."]
+    return "\n".join(_listed(cls, topics) if topics else _overview(cls, module))
+
+
+def _listed(cls: type[Section], topics: Sequence[str]) -> list[str]:
+    """List the keys that topics name."""
+    known = section.keys(cls)
+    chosen: set[str] = set()
+    for topic in topics:
+        name = topic.removesuffix(".*")
+        found = {key for key in known if key == name or key.startswith(f"{name}.")}
+        if topic != _ALL and not found:
+            names = ", ".join([*section.sections(cls), _ALL])
+            raise ConfigError(f"--help {topic} is no topic: give a key, or one of {names}.")
+        chosen |= set(known) if topic == _ALL else found
+    return section.describe_keys(cls, chosen)
+
+
+def _overview(cls: type[Section], module: str) -> list[str]:
+    """Say how a command is used, without the keys of its sections."""
+    command = f"python -m {module}"
+    lines = [f"usage: {command} key=value ..."]
+    examples = EXAMPLES.get(module, {})
+    if examples:
+        lines += ["", "Examples:"]
+    for words, meaning in examples.items():
+        lines += [f"  # {meaning}", f"  {command} {words}".rstrip()]
     groups = files.describe_groups(cls.command) if cls.command else []
     if groups:
         lines += ["", "Groups, each a folder of configs/:", *groups]
-    return "\n".join([*lines, "", "Keys, with their defaults:", *section.describe_keys(cls)])
+    top = [key for key in section.keys(cls) if "." not in key]
+    if top:
+        lines += ["", "Keys, with their defaults:", *section.describe_keys(cls, top)]
+    inner = section.sections(cls)
+    if inner:
+        lines += ["", f"Sections of keys; {command} --help all lists them all:"]
+    for name, each in inner.items():
+        meaning = (inspect.getdoc(each) or "").partition("\n")[0].rstrip(".:;")
+        lines.append(f"  {f'--help {name}':<38}  {name}.*: {meaning}")
+    return lines

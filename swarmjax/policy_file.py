@@ -92,6 +92,23 @@ def read(path: str | Path, extensions: str | None = None) -> Policy:
         raise PolicyError(f"{path} cannot be read as a policy: {reason}") from None
 
 
+def read_meta(path: str | Path) -> dict[str, Any]:
+    """Reads what a policy file says of itself, all of the file checked.
+
+    Args:
+        path: Of the file.
+
+    Returns:
+        Its `meta`.
+
+    Raises:
+        PolicyError: If it is missing, damaged, of another format or inconsistent.
+    """
+    path = Path(path)
+    content = _read_bytes(path)
+    return _refuse_in(path, lambda: _check_file(content))[1]
+
+
 def _with_network(
     path: Path, members: Mapping[str, np.ndarray], meta: dict[str, Any], extensions: str | None
 ) -> Policy:

@@ -6,6 +6,8 @@ import platform
 import subprocess
 from pathlib import Path
 
+from swarmjax import words
+
 _PACKAGES = (
     "swarmjax",
     "jax",
@@ -55,7 +57,7 @@ def device() -> str:
     found = jax.devices()[0]
     if found.platform != "cpu":
         return f"{len(jax.devices())} x {found.device_kind}"
-    return f"CPU {platform.machine()}, {cores()} cores"
+    return f"CPU {platform.machine()}, {words.count(cores(), 'core')}"
 
 
 def cores() -> int:

@@ -10,7 +10,7 @@ import swarmjax
 ROOT = Path(swarmjax.__file__).parent
 # What every room may import, and what each may import of the others.
 SHARED = {"config", "epuck", "extension", "policy", "policy_file", "atomic_file"}
-SHARED |= {"provenance", "command"}
+SHARED |= {"provenance", "command", "words"}
 ROOMS = {
     "config": set(),
     "sim": {"config", "epuck"},
@@ -36,7 +36,8 @@ ALONE: dict[str, set[str]] = {
     "policy": set(),
     "epuck": set(),
     "atomic_file": set(),
-    "provenance": set(),
+    "provenance": {"words"},
+    "words": set(),
     "policy_file": {"policy", "policy_network", "extension", "atomic_file"},
     "policy_network": {"extension"},
     "command": {"config", "policy"},

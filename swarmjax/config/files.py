@@ -41,9 +41,7 @@ def compose(
         ConfigError: a word, a choice or a file is unsound.
     """
     words = split_words(cls, overrides)
-    groups = {
-        key: word.partition("=")[2].strip("'\"") for key, word in words.items() if choices(key)
-    }
+    groups = {key: choice_of(word) for key, word in words.items() if choices(key)}
     own = {key: choice for key, choice in groups.items() if is_path(choice)}
     for key, choice in groups.items():
         check_choice(key, choice, key)
@@ -59,6 +57,11 @@ def compose(
         mine = {key: word for key, word in words.items() if key.startswith(f"{group}.")}
         mapping[group] = _merge(read_choice(group, path), values(mine).get(group, {}))
     return mapping, chosen | own
+
+
+def choice_of(word: str) -> str:
+    """Return the choice that a word makes for a group."""
+    return word.partition("=")[2].strip("'\"")
 
 
 def is_path(choice: str) -> bool:

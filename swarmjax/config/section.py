@@ -10,7 +10,7 @@ import difflib
 import math
 import types
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -266,13 +266,28 @@ def keys(
     return found
 
 
-def describe_keys(cls: type[Section]) -> list[str]:
-    """Return a line for each key: its default, its meaning and what it takes."""
+def sections(cls: type[Section]) -> dict[str, type[Section]]:
+    """Return the sections within a section, by their names."""
+    found = {item.name: _section(item.type) for item in dataclasses.fields(cls)}
+    return {name: inner for name, inner in found.items() if inner is not None}
+
+
+def describe_keys(cls: type[Section], chosen: Collection[str] | None = None) -> list[str]:
+    """Return a line for each key: its default, its meaning and what it takes.
+
+    Args:
+        cls: the section that they are of.
+        chosen: the keys to describe; None for all.
+    """
     lines = []
     for key, item in keys(cls).items():
+        if chosen is not None and key not in chosen:
+            continue
         section = key.partition(".")[0]
         default = f"<{'required' if section == key else f'the {section}'}>"
-        if not _is_required(item):
+        if item.default_factory is not dataclasses.MISSING:
+            default = show(item.default_factory(), quote="")
+        elif item.default is not dataclasses.MISSING:
             default = show(item.default, quote="")
         bounds = item.metadata["bounds"]
         allowed = _describe(item.type, "" if bounds == Bounds() else f" {bounds}")

@@ -16,15 +16,17 @@ from rich.progress import Progress
 from swarmjax import command
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import table as evaluate_table
+from swarmjax.evaluate import witness
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import Evaluation, evaluate
 from swarmjax.evaluate.table import PLAIN_WIDTH
-from swarmjax.task.stage_files import load_levels
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    settings = load_levels(EvaluateConfig, arguments)
+    settings, said = witness.load(EvaluateConfig, arguments)
+    sys.stdout.write(f"swarmjax.evaluate: {said}\n")
+    sys.stdout.flush()
     out = None if settings.out is None else Path(settings.out)
     if out is not None:
         _check_out(out)

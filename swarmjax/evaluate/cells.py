@@ -13,12 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from swarmjax import epuck, policy
+from swarmjax import epuck, extension, policy
 from swarmjax.atomic_file import replacing
 from swarmjax.config import ConfigError, build, show, to_dict
 from swarmjax.evaluate import judge
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.suite_config import CellConfig, read_suite
+from swarmjax.extension import LevelDrawing
 from swarmjax.task import level, shapes
 from swarmjax.task import stage as task_stage
 from swarmjax.task.config import TaskConfig
@@ -145,7 +146,8 @@ def draw_stage(config: EvaluateConfig, numbers: Sequence[int]) -> Cell:
     """
     stage, shape = config.stage, config.shape
     radii = (config.robot.hull_radius, config.task.target_radius)
-    levels = _draw(stage, shape, config.seed, numbers, radii)
+    drawings = extension.load(config.extensions).levels
+    levels = _draw(stage, shape, config.seed, numbers, radii, drawings)
     return Cell(stage.name, stage, shape, None, config.seed, np.array(numbers), levels)
 
 
@@ -163,12 +165,14 @@ def _draw(
     seed: int,
     numbers: Sequence[int],
     radii: tuple[float, float],
+    drawings: Sequence[LevelDrawing] = (),
 ) -> Level:
     """Draws levels of these numbers, for hulls and targets of these radii, m."""
-    one = task_stage.select(task_stage.stack([stage]), np.intp(0))
+    names = [each.name for each in drawings]
+    one = task_stage.select(task_stage.stack([stage], names), np.intp(0))
     spacing = level.Spacing(stage.robots, stage.obstacles, *radii)
     draw = judge.draw_level
-    drawn = [shapes.expand(draw(one, spacing, seed, each), shape) for each in numbers]
+    drawn = [shapes.expand(draw(one, spacing, seed, each, drawings), shape) for each in numbers]
     return Level(*(np.stack(fields) for fields in zip(*drawn, strict=True)))
 
 

@@ -57,6 +57,10 @@ class EvaluateConfig(Section):
         default=None,
         metadata=about("physics steps per control step; null: those of the body", 1, 1000),
     )
+    extensions: str | None = field(
+        default=None,
+        metadata=about("Python file with the pieces that the policies need; it is run"),
+    )
     out: str | None = field(
         default=None,
         metadata=about("folder for result.json, levels.csv and plots, or a file .json alone"),

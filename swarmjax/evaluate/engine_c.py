@@ -31,6 +31,7 @@ from swarmjax.task import electronics, level, observation
 from swarmjax.task import factors as task_factors
 from swarmjax.task.electronics import Memory, Sight
 from swarmjax.task.factors import Factors
+from swarmjax.task.observation import View
 
 
 class Arenas(NamedTuple):
@@ -43,6 +44,8 @@ class Arenas(NamedTuple):
         memory: [A] of the robots' electronics.
         target: [A, R, 2] x (m), y (m).
         obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+        obstacle_present: [A, M] whether the obstacle is there.
+        side: [A] of the arenas, m.
         seed: [A] uint32 of the levels.
         pose: [A, R, 3] x (m), y (m), yaw (rad).
         observation: [A, R, O].
@@ -57,6 +60,8 @@ class Arenas(NamedTuple):
     memory: Memory
     target: np.ndarray
     obstacle: np.ndarray
+    obstacle_present: np.ndarray
+    side: np.ndarray
     seed: np.ndarray
     pose: np.ndarray
     observation: np.ndarray
@@ -111,9 +116,9 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     Returns:
         The arenas at rest, observed.
     """
-    pose, target, obstacle, seed, side = (
+    pose, target, obstacle, there, seed, side = (
         np.stack([getattr(each, name) for each in levels])
-        for name in ("start", "target", "obstacle", "seed", "side")
+        for name in ("start", "target", "obstacle", "obstacle_present", "seed", "side")
     )
     pose, target, obstacle = (x.astype(np.float64) for x in (pose, target, obstacle))
     realism, robot, boxes = judge.config.realism, judge.config.robot, obstacle.shape[1]
@@ -123,6 +128,8 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     data[:] = [place(judge, *each) for each in zip(model, pose, obstacle, side, strict=True)]
     outcome = _no_outcome(len(levels), judge.spacing.robots)
     sight = look(judge, data, factors, pose, target, obstacle)
+    fixtures = _Fixtures(target, obstacle, there, side)
+    sight = _look_by_extension(judge, sight, pose, fixtures, outcome.arrived, outcome.clock)
     memory, seen = electronics.begin(judge.electronics, factors, sight, outcome.clock, np)
     return Arenas(
         model=model,
@@ -131,6 +138,8 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
         memory=memory,
         target=target,
         obstacle=obstacle,
+        obstacle_present=there,
+        side=side,
         seed=seed,
         pose=pose,
         observation=seen,
@@ -226,12 +235,55 @@ def step(judge: Judge, arenas: Arenas) -> Arenas:
     gap = np.where(touches, 0.0, np.inf)
     begins, apart = gaps.count_contacts(gap, arenas.apart, task.control_step, np)
     clock = arenas.outcome.clock + 1
+    arrived = arenas.outcome.arrived | arrives
+    fixtures = _Fixtures(arenas.target, arenas.obstacle, arenas.obstacle_present, arenas.side)
+    sight = _look_by_extension(judge, sight, pose, fixtures, arrived, clock)
     memory, seen = electronics.sense(judge.electronics, memory, arenas.factors, sight, clock, np)
     step = _Step(active, arrives, begins, touches, impulse, sight.ray < task.sensor_range)
     anchor, outcome = _tally(arenas, pose, step)
     return arenas._replace(
         memory=memory, pose=pose, observation=seen, apart=apart, anchor=anchor, outcome=outcome
     )
+
+
+class _Fixtures(NamedTuple):
+    """What stands still: targets [A, R, 2], obstacles [A, M, 5] and presence [A, M], sides [A]."""
+
+    target: np.ndarray
+    obstacle: np.ndarray
+    obstacle_present: np.ndarray
+    side: np.ndarray
+
+
+def _look_by_extension(
+    judge: Judge,
+    sight: Sight,
+    pose: np.ndarray,
+    fixtures: _Fixtures,
+    arrived: np.ndarray,
+    clock: np.ndarray,
+) -> Sight:
+    """Adds what the observations of an extension see."""
+    if judge.own is None:
+        return sight
+    shown = (pose, *fixtures, sight.distance, sight.bearing, sight.ray)
+    place, target, obstacle, there, side, distance, bearing, ray = (
+        x.astype(bool if x.dtype == bool else np.float32) for x in shown
+    )
+    view = View(
+        pose=place,
+        target=target,
+        distance=distance,
+        bearing=bearing,
+        infrared=ray,
+        present=np.ones_like(arrived),
+        arrived=arrived,
+        side=side,
+        obstacle=obstacle,
+        obstacle_present=there,
+        clock=clock.astype(np.int32),
+    )
+    return sight._replace(own=judge.own(view))
 
 
 class _Step(NamedTuple):

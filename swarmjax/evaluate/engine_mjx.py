@@ -19,6 +19,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from swarmjax import extension
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import judge, measures
 from swarmjax.evaluate.config import EvaluateConfig
@@ -127,7 +128,15 @@ def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
     sim = SimConfig(
         max_robots=stage.robots, max_obstacles=len(half), substeps=judge.substeps(config)
     )
-    return env.load((stage,), config.robot, config.task, config.realism, sim, arenas=arenas)
+    return env.load(
+        (stage,),
+        config.robot,
+        config.task,
+        config.realism,
+        sim,
+        arenas=arenas,
+        extensions=extension.load(config.extensions),
+    )
 
 
 def _largest(stage: StageConfig, half: np.ndarray) -> StageConfig:
@@ -167,8 +176,10 @@ def play(
         trained.meta["activation"],
         trained.meta["observation"]["limit"],
         sampled,
+        None if trained.network is None else trained.network.module,
     )
-    weights = trained.layers, trained.mean, trained.std
+    network = None if trained.network is None else trained.network.params
+    weights = trained.layers, trained.mean, trained.std, network
     outcome, broken = run(weights, trained.log_std, levels)
     if np.any(broken):
         raise ConfigError(
@@ -187,17 +198,18 @@ def _program(
     activation: str,
     limit: float,
     sampled: bool,
+    network: Any,
 ) -> Callable[[Any, ArrayLike, Level], tuple[dict[str, Array], Array]]:
     """The compiled program of policies that differ in their weights alone."""
     speed, turn_rate = limits
     mine = replace(
         world,
         drive=world.drive._replace(max_speed=speed, max_turn_rate=turn_rate),
-        electronics=electronics.load(world.task, world.realism, encoding),
+        electronics=replace(world.electronics, encoding=encoding),
     )
 
     def play(weights: Any, log_std: Array, levels: Level) -> tuple[dict[str, Array], Array]:
-        mean = partial(_mean_action, activation, limit, weights)
+        mean = partial(_mean_action, activation, limit, weights, network)
         act = partial(_act, mean, log_std if sampled else None)
         arenas, counts, broken = _run(mine, act, levels, steps)
         return _outcome(arenas, counts), broken
@@ -215,15 +227,30 @@ def _act(mean: Callable[[Array], Array], log_std: Array | None, arenas: EnvState
     return action + jnp.exp(log_std[: len(action[0])]) * normal
 
 
-def _mean_action(activation: str, limit: float, weights: Any, observation: Array) -> Array:
+def _mean_action(
+    activation: str, limit: float, weights: Any, network: Any, observation: Array
+) -> Array:
     """What `policy.act` says without noise, [E, R, U]: in full precision, where a GPU has less."""
-    layers, mean, std = weights
+    layers, mean, std, params = weights
     robots = slice(observation.shape[-2])
     x = jnp.clip((observation - mean[robots]) / std[robots], -limit, limit)
+    if network is not None:
+        x = _own_features(network, params, x)
     *hidden, last = layers
     for layer in hidden:
         x = _ACTIVATIONS[activation](_dense(x, layer, robots))
     return _dense(x, last, robots)
+
+
+def _own_features(network: Any, params: Any, x: Array) -> Array:
+    """Features [E, R, F] of an extension's network: of one learner, or of one for each robot."""
+    robots = x.shape[-2]
+    learners = jax.tree.leaves(params)[0].shape[0]
+    mine = jax.tree.map(lambda leaf: jnp.asarray(leaf)[: min(robots, learners)], params)
+    if learners == 1:
+        return network.apply({"params": jax.tree.map(lambda leaf: leaf[0], mine)}, x)
+    apply = partial(jax.vmap, in_axes=(0, 1), out_axes=1)
+    return apply(lambda own, seen: network.apply({"params": own}, seen))(mine, x)
 
 
 def _dense(x: Array, layer: tuple[ArrayLike, ArrayLike], robots: slice) -> Array:

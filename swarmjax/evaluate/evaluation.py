@@ -43,11 +43,11 @@ def evaluate(settings: EvaluateConfig, progress: Progress | None = None) -> Eval
         PolicyError: If a policy is unsound, or does not fit the levels.
         ConfigError: If a file is missing, a suite unsound, or the physics breaks down.
     """
-    sides = [evaluate_trials.read_policies(each) for each in _sides(settings)]
+    sides = [evaluate_trials.read_policies(each, settings.extensions) for each in _sides(settings)]
     entrants = [each for side in sides for each in side]
     for stage in cells.stages(settings):  # before levels are drawn, which takes a while
         for path, trained in entrants:
-            judge.check_policy(stage, path, trained)
+            judge.check_policy(settings, stage, path, trained)
     suite = cells.load(settings)
     total = len(entrants) * sum(len(cell.episodes) for cell in suite.cells)
     progress = progress or Progress(disable=True)

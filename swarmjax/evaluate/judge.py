@@ -1,13 +1,17 @@
 """The judge: what all arenas of an evaluation in MuJoCo's C engine share. No JAX."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from swarmjax import extension
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.rays import RayScene
+from swarmjax.extension import Extensions, LevelDrawing, Observation
 from swarmjax.policy import Policy, PolicyError
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps
@@ -18,6 +22,7 @@ from swarmjax.task import factors as task_factors
 from swarmjax.task import level, observation, shapes
 from swarmjax.task import stage as task_stage
 from swarmjax.task.electronics import Electronics
+from swarmjax.task.observation import View
 from swarmjax.task.stage_config import StageConfig
 
 SOLVER_ITERATIONS = 100  # MuJoCo's own default: until its tolerance of 1e-8 is met
@@ -40,6 +45,7 @@ class Judge:
         geom_robot: Of each of its geoms the robot whose contact geom it is, else -1.
         geom_kind: Of each of its geoms the index in `gaps.KINDS` of what it belongs to.
         substeps: Physics steps of a control step.
+        own: Observations of an extension, [A, R, E] of a view [A]; None without any.
     """
 
     config: EvaluateConfig
@@ -54,6 +60,7 @@ class Judge:
     geom_robot: np.ndarray
     geom_kind: np.ndarray
     substeps: int
+    own: Callable[[View], np.ndarray] | None = None
 
 
 def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None) -> Judge:
@@ -71,14 +78,17 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
     Raises:
         PolicyError: If the policy observes something else, or has too few learners.
     """
-    check_policy(config.stage, config.policy, trained)
-    stage = task_stage.select(task_stage.stack([config.stage]), np.intp(0))
+    check_policy(config, config.stage, config.policy, trained)
+    extensions = extension.load(config.extensions)
+    own = _observations(extensions, trained)
+    stage = task_stage.select(_stack(config.stage, extensions.levels), np.intp(0))
     robots, obstacles = config.stage.robots, config.stage.obstacles
     spacing = level.Spacing(robots, obstacles, config.robot.hull_radius, config.task.target_radius)
-    example = shapes.expand(draw_level(stage, spacing, config.seed, 0), config.shape)
+    example = draw_level(stage, spacing, config.seed, 0, extensions.levels)
+    example = shapes.expand(example, config.shape)
     compiled, ids = _compile(config, example.obstacle[:, 3:] if half is None else half)
     geom_robot, geom_kind = _geoms(compiled, ids)
-    electronics = task_electronics.load(config.task, config.realism, trained.encoding)
+    electronics = task_electronics.load(config.task, config.realism, trained.encoding, own)
     return Judge(
         config=config,
         policy=trained,
@@ -100,6 +110,7 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
         geom_robot=geom_robot,
         geom_kind=geom_kind,
         substeps=substeps(config),
+        own=_look_by(own),
     )
 
 
@@ -141,19 +152,51 @@ def _geoms(compiled: mujoco.MjModel, ids: sim_model.Ids) -> tuple[np.ndarray, np
     return robot, kind
 
 
-def check_policy(stage: StageConfig, path: str | None, trained: Policy) -> None:
+def _stack(stage: StageConfig, drawings: Sequence[LevelDrawing]) -> task_stage.Stage:
+    """Stacks one stage [1]."""
+    return task_stage.stack([stage], [each.name for each in drawings])
+
+
+def _observations(extensions: Extensions, trained: Policy) -> tuple[Observation, ...]:
+    """Finds the observations of an extension that a policy sees, in its order."""
+    names = trained.meta["task"].get("observations", [])
+    return tuple(each for name in names for each in extensions.observations if each.name == name)
+
+
+def _look_by(own: tuple[Observation, ...]) -> Callable[[View], np.ndarray] | None:
+    """Compiles observations of an extension, for arenas side by side."""
+    if not own:
+        return None
+    import jax  # for extensions alone
+
+    from swarmjax.task import extended
+
+    look = jax.jit(jax.vmap(partial(extended.look, own)))
+    return lambda view: np.asarray(look(view))
+
+
+def check_policy(
+    config: EvaluateConfig, stage: StageConfig, path: str | None, trained: Policy
+) -> None:
     """Refuses a policy that does not fit a stage.
 
     Args:
+        config: Of the evaluation.
         stage: The stage.
         path: Of the policy.
         trained: The policy.
 
     Raises:
         PolicyError: If it observes something else, or has too few learners.
+        ConfigError: If it needs a piece of an extension that is missing.
     """
+    extensions, needs = extension.load(config.extensions), trained.meta.get("extensions", {})
+    extension.check_needs(needs, extensions, str(path), ["observation", "network"])
+    if stage.level in needs.get("level", {}):
+        extension.check_needs(needs, extensions, str(path), ["level"])
     layout = trained.meta["observation"]
-    for key, expected in observation.describe(trained.encoding).items():
+    own = _observations(extensions, trained)
+    for key, expected in observation.describe(trained.encoding, own).items():
         found = layout[key]
         if found != expected:
             raise PolicyError(
@@ -174,7 +217,11 @@ def _list(values: Any) -> str:
 
 
 def draw_level(
-    stage: task_stage.Stage, spacing: level.Spacing, seed: int, episode: int
+    stage: task_stage.Stage,
+    spacing: level.Spacing,
+    seed: int,
+    episode: int,
+    drawings: Sequence[LevelDrawing] = (),
 ) -> level.Level:
     """Draws the level that an episode starts from.
 
@@ -183,10 +230,16 @@ def draw_level(
         spacing: Sizes.
         seed: Of the evaluation.
         episode: Its number.
+        drawings: Ways of drawing levels of an extension, as `stage.drawing` counts them.
 
     Returns:
         The level, as NumPy arrays.
     """
     count = level.uniform_count(spacing)
     uniforms = np.random.default_rng([seed, episode]).random(count, dtype=np.float32)
-    return level.sample(uniforms, stage, spacing, np)
+    drawn = level.sample(uniforms, stage, spacing, np)
+    if not stage.drawing:
+        return drawn
+    from swarmjax.task import extended  # JAX, for extensions alone
+
+    return extended.redraw(drawings[int(stage.drawing) - 1], drawn)

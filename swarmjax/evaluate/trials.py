@@ -1,6 +1,7 @@
 """Runs evaluations: cells times policies, split over processes, or by the engine that trains."""
 
 import math
+import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -57,13 +58,17 @@ class _Job(NamedTuple):
     find_ways: bool
 
 
-def read_policies(files: Sequence[str]) -> list[Entrant]:
+def read_policies(files: Sequence[str], extensions: str | None = None) -> list[Entrant]:
     """Reads policy files.
+
+    Args:
+        files: Their paths.
+        extensions: As the key of that name.
 
     Raises:
         PolicyError: If one of them is unsound.
     """
-    return [Entrant(file, policy_file.read(file)) for file in files]
+    return [Entrant(file, policy_file.read(file, extensions)) for file in files]
 
 
 def run(
@@ -89,7 +94,7 @@ def run(
     """
     for cell in cells:
         for each in entrants:
-            evaluate_judge.check_policy(cell.stage, *each)
+            evaluate_judge.check_policy(config, cell.stage, *each)
     play = _by_mjx if config.engine == "mjx" else _by_c
     results = play(config, cells, entrants, report)
     return [_try(config, cell, *result) for cell, result in zip(cells, results, strict=True)]
@@ -211,10 +216,16 @@ def work[Job, Result](
     if workers == 1:
         yield from map(function, jobs)
         return
-    # Ctrl-C ends the others at once and without a word; this process says what happened.
-    end = (signal.SIGINT, signal.SIG_DFL)
-    with ProcessPoolExecutor(workers, get_context("spawn"), signal.signal, end) as pool:
+    with ProcessPoolExecutor(workers, get_context("spawn"), _begin_worker) as pool:
         yield from pool.map(function, jobs)
+
+
+def _begin_worker() -> None:
+    """Prepares a process that judges."""
+    # Ctrl-C ends it at once and without a word; its parent says what happened.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    # Pieces of extensions run on JAX; on a GPU each process would take most of its memory.
+    os.environ["JAX_PLATFORMS"] = "cpu"
 
 
 def _simulate(job: _Job) -> tuple[Outcome, np.ndarray | None]:

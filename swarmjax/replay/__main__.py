@@ -19,7 +19,7 @@ from rich.progress import Progress
 
 from swarmjax import command
 from swarmjax.config import ConfigError, show
-from swarmjax.evaluate import cells
+from swarmjax.evaluate import cells, witness
 from swarmjax.evaluate import judge as evaluate_judge
 from swarmjax.evaluate import trials as evaluate_trials
 from swarmjax.evaluate.cells import Cell
@@ -30,7 +30,6 @@ from swarmjax.replay import record
 from swarmjax.replay import video as replay_video
 from swarmjax.replay.config import ReplayConfig
 from swarmjax.replay.record import ReplayEpisode
-from swarmjax.task.stage_files import load_levels
 
 
 class Pick(NamedTuple):
@@ -61,7 +60,7 @@ def replay(
     _check_worst(settings, sum(len(cell.episodes) for cell in chosen))
     for cell in chosen:
         for each in entrants:
-            evaluate_judge.check_policy(cell.stage, *each)
+            evaluate_judge.check_policy(settings.evaluation, cell.stage, *each)
     picks = _named(settings, chosen)
     if settings.worst is not None:
         bar = progress.add_task("episodes", total=sum(len(cell.episodes) for cell in chosen))
@@ -159,8 +158,10 @@ def _record(
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    settings = load_levels(ReplayConfig, arguments)
-    entrants = evaluate_trials.read_policies(settings.policies)
+    settings, said = witness.load(ReplayConfig, arguments)
+    entrants = evaluate_trials.read_policies(settings.policies, settings.extensions)
+    sys.stdout.write(f"swarmjax.replay: {said}\n")
+    sys.stdout.flush()
     out, video = Path(settings.out), settings.video and Path(settings.video)
     _check_out(out, [*settings.policies, settings.suite, settings.video])
     if video:

@@ -62,6 +62,10 @@ class ReplayConfig(Section):
         default=None,
         metadata=about("physics steps per control step; null: those of the body", 1, 1000),
     )
+    extensions: str | None = field(
+        default=None,
+        metadata=about("Python file with the pieces that the policies need; it is run"),
+    )
     out: str = field(default="replay.html", metadata=about("HTML file of the replay"))
     video: str | None = field(default=None, metadata=about("MP4 file of the scene in 3-D"))
     video_speed: float = field(
@@ -130,4 +134,5 @@ class ReplayConfig(Section):
             seed=self.seed,
             workers=self.workers,
             substeps=self.substeps,
+            extensions=self.extensions,
         )

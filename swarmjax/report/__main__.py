@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from swarmjax import command
+from swarmjax import command, words
 from swarmjax.config import ConfigError, files
 from swarmjax.report import page as report_page
 from swarmjax.report import rows
@@ -19,13 +19,13 @@ from swarmjax.report.config import ReportConfig
 PAGE = "report.html"
 
 
-def write(run: Path, out: Path, words: str) -> list[Path]:
+def write(run: Path, out: Path, made_by: str) -> list[Path]:
     """Writes the report of a run.
 
     Args:
       run: the run directory.
       out: directory of the report, which is made.
-      words: the command that makes it, for the page.
+      made_by: the command that makes it, for the page.
 
     Returns:
       The files.
@@ -39,7 +39,7 @@ def write(run: Path, out: Path, words: str) -> list[Path]:
     )  # Matplotlib takes a second, which no refusal should
 
     figures = report_figures.draw(history)
-    page = report_page.page(f"Report of {run}", words, history, figures)
+    page = report_page.page(f"Report of {run}", made_by, history, figures)
     files = {f"{name}.png": png for name, png in figures.items()} | {PAGE: page.encode()}
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -55,9 +55,10 @@ def main(arguments: Sequence[str]) -> int:
     settings = files.load(ReportConfig, arguments)
     run = Path(settings.run)
     out = Path(settings.out) if settings.out else run / "report"
-    words = shlex.join(["python", "-m", "swarmjax.report", *arguments])
-    written = write(run, out, words)
-    sys.stdout.write(f"{written[-1]}: the report of {run}, with {len(written) - 1} figures.\n")
+    made_by = shlex.join(["python", "-m", "swarmjax.report", *arguments])
+    written = write(run, out, made_by)
+    figures = words.count(len(written) - 1, "figure")
+    sys.stdout.write(f"{written[-1]}: the report of {run}, with {figures}.\n")
     return 0
 
 

@@ -7,6 +7,7 @@ from html import escape
 
 import numpy as np
 
+from swarmjax import words
 from swarmjax.config import to_dict
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History, Row
@@ -72,8 +73,8 @@ def _facts(history: History) -> list[tuple[str, str]]:
     trained, names = history.config, history.names
     options = to_dict(trained.curriculum).items()
     seeds = f"{history.seeds[0]}" + (f" to {history.seeds[-1]}" if len(history.seeds) > 1 else "")
-    spent = f"{history.updates[-1] + 1:,} of {trained.updates:,} updates"
-    time = "" if history.seconds is None else f", {history.seconds / 60.0:.1f} minutes"
+    spent = f"{history.updates[-1] + 1:,} of {words.count(trained.updates, 'update')}"
+    time = "" if history.seconds is None else f", {words.duration(history.seconds)}"
     stages = f"{len(names)}: {names[0]} to {names[-1]}" if len(names) > 1 else f"1: {names[0]}"
     return [
         ("stages", stages),
@@ -85,7 +86,7 @@ def _facts(history: History) -> list[tuple[str, str]]:
         (
             "trained",
             f"{spent}, {history.arena_steps[-1]:,} arena control steps of a seed, "
-            f"{trained.arenas:,} arenas{time}",
+            f"{words.count(trained.arenas, 'arena')}{time}",
         ),
         ("last stage", _last_stage(history)),
         ("all stages", _all_stages(history)),

@@ -18,16 +18,13 @@ import numpy as np
 from absl import logging as absl_logging
 
 from swarmjax.policy import digest
+from swarmjax.run.errors import CheckpointError
 
 # Orbax takes half a second to import, which a run spends while it compiles (`trainer`).
 if TYPE_CHECKING:
     import orbax.checkpoint as ocp
 
 Leaves = dict[str, np.ndarray]
-
-
-class CheckpointError(ValueError):
-    """A checkpoint that is missing, damaged or of another run, in one sentence."""
 
 
 class Checkpoints:

@@ -1,13 +1,17 @@
 """What a run shows while it trains: a live table on a terminal, plain lines elsewhere."""
 
+import contextlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from rich import box
 from rich.console import Console, Group
 from rich.live import Live
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
+
+from swarmjax import words
 
 Row = Mapping[str, Any]
 
@@ -45,7 +49,11 @@ class StageState(NamedTuple):
 
 
 def summarize(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
-    """Sums the rows of a call up: over the episodes that ended on the newest stage of each seed.
+    """Sums the rows of a call up, on the newest stage of each seed.
+
+    Episodes that end in an update are not like those that begin in it: the short ones end first.
+    How good the swarm is, the newest whole cohort says: all episodes that began within one step
+    limit.
 
     Args:
       rows: of all seeds, as `recorder.rows` makes them, those of a seed in their order.
@@ -53,19 +61,20 @@ def summarize(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
 
     Returns:
       `stage`, the newest one, or the range of them over seeds; `update`; `episodes`; as `Spread`
-      over seeds `targets_reached`, `all_reached`, `contacts_per_robot`, `return`, `stage_success`,
-      `value_loss`, `policy_loss` and `std`, None where no episode ended; and `stages`, the
-      `StageState` of each.
+      over seeds `cohort_targets` and `cohort_complete`, shares of targets and of episodes in which
+      all arrived, over the newest cohort, None before there is one; `ended_targets`,
+      `contacts_per_robot` and `return`, over the episodes that ended, None where none did;
+      `value_loss` and `policy_loss`; and `stages`, the `StageState` of each.
     """
     by_seed: dict[int, list[Row]] = {}
     for row in rows:
         by_seed.setdefault(row["seed"], []).append(row)
-    each = [_of_seed(mine) for mine in by_seed.values()]
+    each = [_of_seed(mine, names) for mine in by_seed.values()]
     last = [mine[-1] for mine in by_seed.values()]
     newest = sorted({names.index(row["stage"]) for row in last})
     first, final = names[newest[0]], names[newest[-1]]
-    spread = {key: _spread([one[key] for one in each]) for key in each[0].keys() - {"episodes"}}
-    return spread | {
+    over_seeds = {key: spread([one[key] for one in each]) for key in each[0].keys() - {"episodes"}}
+    return over_seeds | {
         "stage": first if first == final else f"{first} to {final}",
         "update": rows[-1]["update"] + 1,
         "episodes": sum(one["episodes"] for one in each),
@@ -73,9 +82,10 @@ def summarize(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _of_seed(rows: Sequence[Row]) -> dict[str, Any]:
+def _of_seed(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
     """Sums the rows of one seed up."""
     newest = rows[-1]
+    stage = names.index(newest["stage"])
     mine = [row for row in rows if row["stage"] == newest["stage"]]
 
     def share(part: str, whole: str) -> float | None:
@@ -84,16 +94,17 @@ def _of_seed(rows: Sequence[Row]) -> dict[str, Any]:
 
     return {
         "episodes": sum(row["episodes"] for row in mine),
-        "targets_reached": share("reached", "targets"),
-        "all_reached": share("complete", "episodes"),
+        "cohort_targets": newest["success_by_stage"][stage],
+        "cohort_complete": newest["complete_by_stage"][stage],
+        "ended_targets": share("reached", "targets"),
         "return": share("reward", "targets"),
         "contacts_per_robot": share("contacts", "targets"),
-        **{key: newest[key] for key in ("stage_success", "value_loss", "policy_loss", "std")},
+        **{key: newest[key] for key in ("value_loss", "policy_loss")},
     }
 
 
-def _spread(values: Sequence[float | None]) -> Spread | None:
-    """Spread of those values that are there."""
+def spread(values: Sequence[float | None]) -> Spread | None:
+    """Spread of those values that are there, or None if none is."""
     there = [value for value in values if value is not None]
     return Spread(sum(there) / len(there), min(there), max(there)) if there else None
 
@@ -101,7 +112,24 @@ def _spread(values: Sequence[float | None]) -> Spread | None:
 def _stage(last: Sequence[Row], index: int, name: str) -> StageState:
     """How a stage stands by the last row of each seed."""
     arenas = sum(row["mix"][index] / sum(row["mix"]) for row in last) / len(last)
-    return StageState(name, arenas, _spread([row["success_by_stage"][index] for row in last]))
+    return StageState(name, arenas, spread([row["success_by_stage"][index] for row in last]))
+
+
+@contextlib.contextmanager
+def working(what: str, console: Console | None = None) -> Iterator[None]:
+    """Shows on a terminal that something is under way and for how long; elsewhere nothing.
+
+    Args:
+      what: is under way, `compiling` say.
+      console: where to show it; None for standard error, which scripts do not read.
+    """
+    console = console or Console(stderr=True)
+    columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        bar.add_task(what, total=None)
+        yield
 
 
 class Display:
@@ -118,9 +146,18 @@ class Display:
         """Prints a sentence that stays."""
         self._console.print(sentence, highlight=False, markup=False, soft_wrap=True)
 
+    @contextlib.contextmanager
+    def working(self, what: str) -> Iterator[None]:
+        """Shows that something is under way: on a terminal for how long, elsewhere in a line."""
+        if not self._console.is_terminal:
+            self.say(f"{what} ...")
+        with working(what, self._console):
+            yield
+
     def show(self, summary: Row, speeds: Row, seconds_left: float) -> None:
         """Shows where the run stands."""
         if self._console.is_terminal:
+            self._live.start()  # not before there is a table: what is `working` stands there
             self._live.update(_table(summary, speeds, self._updates, seconds_left), refresh=True)
             return
         now = time.monotonic()
@@ -129,15 +166,12 @@ class Display:
             self.say(_line(summary, speeds, self._updates, seconds_left))
 
     def __enter__(self) -> "Display":
-        """Starts the live table on a terminal."""
-        if self._console.is_terminal:
-            self._live.start()
+        """Returns itself; a terminal's table begins when there is one to show."""
         return self
 
     def __exit__(self, *_: object) -> None:
         """Leaves the last table standing."""
-        if self._console.is_terminal:
-            self._live.stop()
+        self._live.stop()
 
 
 def _table(summary: Row, speeds: Row, updates: int, seconds_left: float) -> Group:
@@ -147,9 +181,9 @@ def _table(summary: Row, speeds: Row, updates: int, seconds_left: float) -> Grou
         table.add_column(heading)
         table.add_column(justify="right")
     left = [
-        ("targets reached", _percent(summary["targets_reached"])),
-        ("all robots reached", _percent(summary["all_reached"])),
-        ("stage success", _percent(summary["stage_success"])),
+        ("targets reached", measured(summary["cohort_targets"])),
+        ("- in episodes just ended", _percent(summary["ended_targets"])),
+        ("all robots reached", measured(summary["cohort_complete"])),
         ("contacts per robot", _number(summary["contacts_per_robot"])),
         ("return", _number(summary["return"])),
         ("policy loss", _number(summary["policy_loss"])),
@@ -158,8 +192,8 @@ def _table(summary: Row, speeds: Row, updates: int, seconds_left: float) -> Grou
     right = [
         ("update", f"{summary['update']:,} of {updates:,}"),
         *((name, f"{speeds[key]:,.0f}") for name, key in _SPEEDS),
-        ("compile time", f"{speeds['compile_s']:.1f} s"),
-        ("time left", _clock(seconds_left)),
+        ("compile time", words.duration(speeds["compile_s"])),
+        ("time left", words.duration(seconds_left)),
     ]
     for a, b in zip(left, right, strict=True):
         table.add_row(*a, *b)
@@ -194,22 +228,22 @@ def _measured(stages: Sequence[StageState]) -> list[StageState]:
 def _counted(stages: Sequence[StageState]) -> str:
     """Says of how many stages the swarm reaches nearly all targets."""
     good = sum(stage.success is not None and stage.success.mean > GOOD for stage in stages)
-    return f"{good} of {len(stages)} stages above {100 * GOOD:.0f} %"
+    return f"{good} of {words.count(len(stages), 'stage')} above {100 * GOOD:.0f} %"
 
 
 def _line(summary: Row, speeds: Row, updates: int, seconds_left: float) -> str:
     """Says in one line what the table shows."""
     return (
         f"update {summary['update']}/{updates}  stage {summary['stage']}  "
-        f"targets {_percent(summary['targets_reached'])}  "
-        f"success {_percent(summary['stage_success'])}  "
+        f"targets reached {measured(summary['cohort_targets'])} "
+        f"({_percent(summary['ended_targets'])} in episodes just ended)  "
         f"{_stages_in_line(summary['stages'])}"
         f"contacts {_number(summary['contacts_per_robot'])}  "
         f"return {_number(summary['return'])}  "
         f"arena steps/s {speeds['arena_steps_per_s']:,.0f}  "
         f"robot steps/s {speeds['robot_steps_per_s']:,.0f}  "
         f"physics steps/s {speeds['physics_steps_per_s']:,.0f}  "
-        f"transitions/s {speeds['transitions_per_s']:,.0f}  left {_clock(seconds_left)}"
+        f"transitions/s {speeds['transitions_per_s']:,.0f}  left {words.duration(seconds_left)}"
     )
 
 
@@ -223,6 +257,11 @@ def _stages_in_line(stages: Sequence[StageState]) -> str:
     return f"{_counted(stages)}{worst}  "
 
 
+def measured(share: Spread | None) -> str:
+    """Writes a share over a whole cohort, or that there is none yet."""
+    return "not measured yet" if share is None else _percent(share)
+
+
 def _percent(share: Spread | None) -> str:
     return _with_range(share, lambda value, digits: f"{100 * value:.{digits}f}", " %")
 
@@ -231,16 +270,11 @@ def _number(value: Spread | None) -> str:
     return _with_range(value, lambda number, digits: f"{number:.{2 + digits}g}", "")
 
 
-def _with_range(spread: Spread | None, write: Callable[[float, int], str], unit: str) -> str:
+def _with_range(found: Spread | None, write: Callable[[float, int], str], unit: str) -> str:
     """Writes a mean, with the range of several seeds a digit shorter."""
-    if spread is None:
+    if found is None:
         return "-"
-    text = f"{write(spread.mean, 1)}{unit}"
-    if spread.low == spread.high:
+    text = f"{write(found.mean, 1)}{unit}"
+    if found.low == found.high:
         return text
-    return f"{text} ({write(spread.low, 0)} to {write(spread.high, 0)})"
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+    return f"{text} ({write(found.low, 0)} to {write(found.high, 0)})"

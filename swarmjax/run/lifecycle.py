@@ -2,39 +2,49 @@
 
 import json
 import math
-import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
-from swarmjax import provenance
+from swarmjax import provenance, words
 from swarmjax.config import ConfigError, to_dict
 from swarmjax.curriculum import engine as curriculum
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.run import checkpoint, memory, warm_start
-from swarmjax.run.display import Display
+from swarmjax.run.checkpoint import Checkpoints, Leaves
+from swarmjax.run.display import Display, working
 from swarmjax.run.policy_export import POLICY, seed_path, write_policy
 from swarmjax.run.settings import TrainConfig
-from swarmjax.run.trainer import Built, Stop, Tally, compile_chunk, prepare, train
+from swarmjax.run.trainer import Built, Stop, Tally, begin_tally, compile_chunk, prepare, train
 from swarmjax.run.warm_start import Source
 from swarmjax.training import program as programs
 from swarmjax.training import seeds
 from swarmjax.training.loop import TrainState
 
+SUMMARY = "summary.json"
 _PRICE = "learners/price/"  # of checkpoints written while algo.contact_limit was a key
+
+
+class Kept(NamedTuple):
+    """The newest sound checkpoint of a run that is resumed, as `checkpoint.restore` returns it."""
+
+    leaves: Leaves
+    update: int
+    skipped: list[str]
 
 
 def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) -> Tally:
     """Trains as a config says, and writes what a run directory holds.
 
     Args:
-      settings: the config; with `resume` it goes on.
+      settings: the config; with `resume` it goes on. A run whose budget is spent is not compiled:
+        what its directory lacks is written.
       run: the run directory, in which there is no other run.
       stop: notices signals.
       display: shows the run.
@@ -47,21 +57,81 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
       CheckpointError: if what it goes on with is damaged.
       TrainingError: if a loss is no longer finite.
     """
-    source = warm_start.read(settings)
-    program, schedule, init, template = _load(settings)
-    state, skipped = _first_state(program, lambda: init(schedule), template, source)
-    display.say(f"{_opening(program)}; into {run}; compiling")
+    with working("building the arenas"):
+        source, kept = warm_start.read(settings), _read_kept(settings)
+    if kept is not None and kept.update == settings.updates:
+        return _complete(run, settings, kept, display)
+    with working("building the arenas"):
+        program, schedule, init, template = _load(settings)
+        state, skipped = _first_state(program, lambda: init(schedule), template, source, kept)
+    display.say(f"{_opening(program)}; into {run}")
     for sentence in skipped:
         display.say(f"{sentence}: it was passed over.")
     if source is not None:
-        display.say(f"starting with what {source.run} had learned after {source.update} updates")
+        updates = words.count(source.update, "update")
+        display.say(f"starting with what {source.run} had learned after {updates}")
     for sentence in _short_budget(settings, schedule):
         display.say(sentence)
-    compiled, state = prepare(program, schedule, state, memory.limit())
+    with display.working("compiling"):
+        compiled, state = prepare(program, schedule, state, memory.limit())
+    display.say(f"compiled in {words.duration(compiled.seconds)}")
     _open_run(run, settings)
     state, tally = train(run, program, schedule, compiled, state, display, stop)
-    _write_results(run, program, state, tally)
+    leaves = checkpoint.to_leaves(state)
+    _write_policies(run, settings, leaves, tally.update)
+    _write_summary(run, program, tally)
     return tally
+
+
+def _read_kept(settings: TrainConfig) -> Kept | None:
+    """Reads the newest sound checkpoint of the run that is resumed, if one is."""
+    if settings.resume is None:
+        return None
+    kept = Kept(*checkpoint.restore(Path(settings.resume)))
+    if kept.update > settings.updates:
+        spent = kept.update * settings.arenas * settings.algo.rollout_length
+        raise ConfigError(
+            f"budget is {settings.budget}, but {settings.resume} has spent {spent} already: give "
+            "at least that."
+        )
+    return kept
+
+
+def _complete(run: Path, settings: TrainConfig, kept: Kept, display: Display) -> Tally:
+    """Writes what the directory of a run lacks whose budget is spent; trains nothing."""
+    current = _is_summed_up(run, kept.update)
+    if not current:
+        _open_run(run, settings)
+        with Checkpoints(run, settings.run.keep_checkpoints) as checkpoints:
+            checkpoints.save(kept.leaves, kept.update)
+    _write_policies(run, settings, kept.leaves, kept.update, only_missing=current)
+    steps = words.count(
+        kept.update * settings.arenas * settings.algo.rollout_length, "arena control step"
+    )
+    for sentence in kept.skipped:
+        display.say(f"{sentence}: it was passed over.")
+    display.say(
+        f"nothing left to train: {settings.resume} has spent its budget of {steps} "
+        f"({words.count(kept.update, 'update')}); for more, give a larger budget"
+    )
+    tally = begin_tally(settings, kept.update, compile_s=0.0)
+    if not current:
+        with working("building the arenas"):
+            program, *_ = _load(settings)
+        _write_summary(run, program, tally)
+    return tally
+
+
+def _is_summed_up(run: Path, update: int) -> bool:
+    """Tells whether a summary says that the budget was spent with this update.
+
+    It is the last file that is written, so the others are then as new.
+    """
+    try:
+        found = json.loads((run / SUMMARY).read_text())
+        return found["budget_spent"] is True and found["updates"] == update
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
 def _load(settings: TrainConfig) -> tuple[Built, Schedule, Any, TrainState]:
@@ -74,28 +144,26 @@ def _load(settings: TrainConfig) -> tuple[Built, Schedule, Any, TrainState]:
 
 
 def _first_state(
-    program: Built, init: Callable[[], TrainState], template: TrainState, source: Source | None
+    program: Built,
+    init: Callable[[], TrainState],
+    template: TrainState,
+    source: Source | None,
+    kept: Kept | None,
 ) -> tuple[TrainState, list[str]]:
-    """Starts from the seed, or from the newest sound checkpoint of the run that is resumed.
+    """Starts from the seed, or from the checkpoint of the run that is resumed.
 
     A start from the seed takes the networks and normalisers of `source`, if there is one.
     """
     settings = program.config
-    if settings.resume is None:
+    if kept is None:
         state = init()
         if source is None:
             return state, []
         return warm_start.carry(source, state, settings), source.skipped
-    leaves, update, skipped = checkpoint.restore(Path(settings.resume))
-    if update > settings.updates:
-        raise ConfigError(
-            f"budget is {settings.budget}, but {settings.resume} has spent "
-            f"{update * settings.arenas * settings.algo.rollout_length} already: give at least "
-            "that."
-        )
-    if any(name.startswith(_PRICE) for name in leaves):
+    skipped = kept.skipped
+    if any(name.startswith(_PRICE) for name in kept.leaves):
         skipped = [*skipped, f"a price on contacts (algo.contact_limit) in {settings.resume}"]
-    return checkpoint.from_leaves(leaves, template), skipped
+    return checkpoint.from_leaves(kept.leaves, template), skipped
 
 
 def find_run(settings: TrainConfig) -> Path:
@@ -132,17 +200,20 @@ def _unwritable(run: Path, error: OSError) -> ConfigError:
     return ConfigError(f"run.dir is {run}, which cannot be written: {error.strerror or error}.")
 
 
-def dry_run(settings: TrainConfig) -> int:
+def dry_run(settings: TrainConfig, display: Display) -> int:
     """Compiles, says what it took and what a run needs, and stops."""
-    warm_start.read(settings)
-    program, schedule, _, template = _load(settings)
-    compiled = compile_chunk(program, schedule, template)
-    memory.check(settings, compiled.total_bytes, memory.limit())
+    with working("building the arenas"):
+        warm_start.read(settings)
+        program, schedule, _, template = _load(settings)
+    for sentence in (_opening(program), *_short_budget(settings, schedule)):
+        display.say(sentence)
+    with display.working("compiling"):
+        compiled = compile_chunk(program, schedule, template)
+        memory.check(settings, compiled.total_bytes, memory.limit())
     state, work = compiled.state_bytes / 2**20, compiled.work_bytes / 2**20
-    sys.stdout.write(
-        f"{'\n'.join([_opening(program), *_short_budget(settings, schedule)])}\n"
-        f"compiled in {compiled.seconds:.1f} s; memory: {state:.1f} MiB of state, "
-        f"{work:.1f} MiB to work with; nothing was trained (run.dry).\n"
+    display.say(
+        f"compiled in {words.duration(compiled.seconds)}; memory: {state:.1f} MiB of state, "
+        f"{work:.1f} MiB to work with; nothing was trained (run.dry)."
     )
     return 0
 
@@ -157,8 +228,9 @@ def _opening(program: Built) -> str:
     ]
     several = f", seeds {every[0]} to {every[-1]} {how}" if len(every) > 1 else ""
     return (
-        f"swarmjax: {settings.stage_name} ({names}), {settings.updates:,} updates of {steps:,} "
-        f"arena control steps ({settings.arenas:,} arenas){several} on {provenance.device()}; "
+        f"swarmjax: {settings.stage_name} ({names}), {words.count(settings.updates, 'update')} "
+        f"of {words.count(steps, 'arena control step')} "
+        f"({words.count(settings.arenas, 'arena')}){several} on {provenance.device()}; "
         f"{settings.robot.body} robots stepped by {engine.label}, "
         f"sim.solver={engine.solver} sim.impl={engine.impl}"
     )
@@ -173,22 +245,29 @@ def _short_budget(settings: TrainConfig, schedule: Schedule) -> list[str]:
     if begins <= latest:
         return []
     when = f"begin as late as update {begins:,}" if begins < settings.updates else "never begin"
+    least = words.count(int(schedule.cohort_updates), "update")
     return [
-        f"the budget is short: a stage takes at least {schedule.cohort_updates} updates (one step "
-        f"limit), so that {settings.stage[-1].name}, the last, may {when}, where "
-        f"curriculum.budget_share={share} asks for {latest:,} at the "
-        "latest: give more budget, fewer arenas or fewer stages."
+        f"the budget is short: a stage takes at least {least} (one step limit), so that "
+        f"{settings.stage[-1].name}, the last, may {when}, where "
+        f"curriculum.budget_share={share} asks for {latest:,} at the latest: give more budget, "
+        "fewer arenas or fewer stages."
     ]
 
 
-def _write_results(run: Path, program: Built, state: TrainState, tally: Tally) -> None:
-    """Writes the policies and `summary.json`."""
+def _write_policies(
+    run: Path, settings: TrainConfig, leaves: Leaves, update: int, *, only_missing: bool = False
+) -> None:
+    """Writes the policy of every seed, or of those alone that have none."""
+    for seed in seeds.numbers(settings):
+        file = seed_path(run / POLICY, settings, seed)
+        if not (only_missing and file.exists()):
+            write_policy(file, leaves, settings, update, seed)
+
+
+def _write_summary(run: Path, program: Built, tally: Tally) -> None:
+    """Writes `summary.json`."""
     settings, every = program.config, seeds.numbers(program.config)
     engine = program.world.physics.engine
-    leaves = checkpoint.to_leaves(state)
-    for seed in every:
-        file = seed_path(run / POLICY, settings, seed)
-        write_policy(file, leaves, settings, tally.update, seed)
     steps = tally.update * settings.arenas * settings.algo.rollout_length
     train_s, transitions = tally.earlier_s + tally.seconds, tally.transitions
     summary = {
@@ -215,4 +294,4 @@ def _write_results(run: Path, program: Built, state: TrainState, tally: Tally) -
         "versions": provenance.versions(),
         "commit": provenance.commit(),
     }
-    (run / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    (run / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n")

@@ -18,7 +18,6 @@ import jax
 from swarmjax.config import ConfigError
 from swarmjax.run.settings import TrainConfig
 
-AUTO = "auto"  # what `arenas` may be instead of a number
 ON_CPU = 128  # the default: more leave fewer updates of a budget, and gain little there
 PROBE = 4096  # arenas of the larger small program: every accelerator holds them
 MARGIN = 0.95  # of what fits by proportion: a program also has what does not grow with its arenas

@@ -89,7 +89,8 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
             "height": epuck.SENSOR_HEIGHT,
             "tilt": epuck.SENSOR_TILT,
         },
-        "task": {key: getattr(trained.task, key) for key in _TASK},
+        "task": {key: getattr(trained.task, key) for key in _TASK}
+        | {"observations": [piece.name for piece in chosen.observations]},
         "realism": to_dict(trained.realism),
         "stages": [to_dict(stage) for stage in trained.stage],
         "extensions": trained.pieces,

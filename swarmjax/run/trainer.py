@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from swarmjax import provenance
+from swarmjax import provenance, words
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.curriculum.log import log
 from swarmjax.run import memory, recorder
@@ -235,7 +235,7 @@ def train(
     """
     settings, resumed = program.config.run, program.config.resume is not None
     done = int(state.update[0])
-    tally = _tally(program, done, compiled.seconds)
+    tally = begin_tally(program.config, done, compiled.seconds)
     saved_at = time.monotonic()
     with (
         _recorder(run, program, done) as record,
@@ -256,9 +256,18 @@ def train(
     return state, tally
 
 
-def _tally(program: Built, done: int, compile_s: float) -> Tally:
-    """Begins to add up, from what a resumed run had come to."""
-    numbers = seeds.numbers(program.config)
+def begin_tally(settings: TrainConfig, done: int, compile_s: float) -> Tally:
+    """Begins to add up, from what a resumed run had come to.
+
+    Args:
+      settings: of the run.
+      done: updates of every seed that are done.
+      compile_s: that compiling took.
+
+    Returns:
+      The tally before the first update of this process.
+    """
+    numbers = seeds.numbers(settings)
     tally = Tally(
         update=done,
         first=done,
@@ -266,20 +275,20 @@ def _tally(program: Built, done: int, compile_s: float) -> Tally:
         transitions=dict.fromkeys(numbers, 0),
         targets_reached={seed: {} for seed in numbers},
     )
-    if program.config.resume is None:
+    if settings.resume is None:
         return tally
-    rows, decisions = recorder.history(Path(program.config.resume), done)
-    _add(program, tally, rows, decisions)
+    rows, decisions = recorder.history(Path(settings.resume), done)
+    _add(settings, tally, rows, decisions)
     tally.earlier_s = rows[-1]["train_s"] if rows else 0.0
     return tally
 
 
-def _add(program: Built, tally: Tally, rows: list[Row], decisions: list[Row]) -> None:
+def _add(settings: TrainConfig, tally: Tally, rows: list[Row], decisions: list[Row]) -> None:
     """Adds rows and decisions to the tally."""
-    names = [stage.name for stage in program.config.stage]
+    names = [stage.name for stage in settings.stage]
     for row in rows:
         tally.transitions[row["seed"]] += row["transitions"]
-    for row in rows[-program.config.seeds :]:
+    for row in rows[-settings.seeds :]:
         shares = zip(names, row["success_by_stage"], strict=True)
         tally.targets_reached[row["seed"]] = {k: share for k, share in shares if share is not None}
     tally.decisions += [entry for entry in decisions if "to" in entry]
@@ -346,7 +355,7 @@ def _report(
     _check_finite(settings, rows)
     decisions = _decisions(settings, rows)
     speeds = _speeds(program, rows, seconds) | {"compile_s": tally.compile_s}
-    _add(program, tally, rows, decisions)
+    _add(settings, tally, rows, decisions)
     record.write(rows, decisions, speeds)
     for entry in decisions:
         if "to" in entry:  # the rest is many, and stands in the log
@@ -369,8 +378,8 @@ def _log_episodes(
     record.write_episodes(rows)
     if lost:
         display.say(
-            f"{lost:,} episodes up to update {updates[-1]:,} were too short for their number to "
-            f"be foreseen, and are missing from {recorder.EPISODES}."
+            f"{recorder.EPISODES} lacks {words.count(lost, 'episode')} up to update "
+            f"{updates[-1]:,}: more ended than there was room for."
         )
 
 

@@ -1,10 +1,12 @@
 """What pieces of an extension compute in an arena, and whether they fit it."""
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from swarmjax import epuck
@@ -55,6 +57,34 @@ def draw(uniforms: Any, stage: Stage, spacing: Spacing, drawings: Sequence[Level
         pairs = zip(piece.function(drawn, key), found, strict=True)
         found = Level(*(jnp.where(mine, own, other) for own, other in pairs))
     return level.park(found, jnp)
+
+
+def redraw(piece: LevelDrawing, drawn: Level) -> Level:
+    """Draws a level of one arena by an extension, for a judge that has it in NumPy.
+
+    Args:
+      piece: the way of drawing.
+      drawn: the level as drawn without it.
+
+    Returns:
+      The level, as NumPy arrays; what is absent is parked outside.
+
+    Raises:
+      ConfigError: if obstacles have changed their sizes, for which a judge is compiled.
+    """
+    own = _compiled(piece)(drawn)
+    found = level.park(Level(*(np.asarray(field) for field in own)), np)
+    if not np.array_equal(found.obstacle[:, 3:], drawn.obstacle[:, 3:]):
+        raise ConfigError(
+            f"{label(piece)} changes the half edges of obstacles: leave obstacle[:, 3:] as it is, "
+            "and give the stage's obstacle_size."
+        )
+    return found
+
+
+@functools.lru_cache(maxsize=16)
+def _compiled(piece: LevelDrawing) -> Callable[[Level], Level]:
+    return jax.jit(lambda drawn: piece.function(drawn, jax.random.key(drawn.seed)))
 
 
 def check(chosen: Chosen, robots: int, obstacles: int) -> None:

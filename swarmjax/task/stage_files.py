@@ -57,12 +57,15 @@ def read_stage(choice: str) -> dict[str, Any]:
     return _named(files.read_choice("stage", choice), choice)
 
 
-def load_levels[C: Section](cls: type[C], overrides: Sequence[str]) -> C:
+def load_levels[C: Section](
+    cls: type[C], overrides: Sequence[str], stage: dict[str, Any] | None = None
+) -> C:
     """Make the settings of a command that plays levels of one stage, or of a suite instead.
 
     Args:
         cls: the command's dataclass, with `stage` and `suite`.
         overrides: `key=value` words.
+        stage: plain data of the stage where no word names one; None: that of the command's file.
 
     Raises:
         ConfigError: a word is unsound, or a suite is given beside what it says itself.
@@ -70,7 +73,11 @@ def load_levels[C: Section](cls: type[C], overrides: Sequence[str]) -> C:
 
     def complete(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:
         _check_suite_alone(cls, mapping.get("suite"), overrides)
-        return mapping | {"stage": pick_one(mapping.get("stage", {}), chosen["stage"])}
+        words = files.split_words(cls, overrides)
+        if stage is None or "stage" in words:
+            return mapping | {"stage": pick_one(mapping.get("stage", {}), chosen["stage"])}
+        mine = {key: word for key, word in words.items() if key.startswith("stage.")}
+        return mapping | {"stage": {**stage, **files.values(mine).get("stage", {})}}
 
     return files.load(cls, overrides, complete)
 

@@ -46,7 +46,7 @@ def test_every_row_of_table_1_is_in_the_preset_by_its_name(row: str) -> None:
 
 
 def test_the_help_names_the_rows_of_the_algorithm() -> None:
-    text = help_text(TrainConfig, "swarmjax.train")
+    text = help_text(TrainConfig, "swarmjax.train", ["algo"])
     algorithm = list(TABLE_1)[4:]
     assert [row for row in algorithm if f"'{row}'" not in text] == []
 

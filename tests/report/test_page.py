@@ -61,7 +61,7 @@ def test_the_summary_says_where_the_run_stands(tmp_path: Path) -> None:
     assert page.fact("seeds") == "0 to 2"
     # 20 updates of 64 steps in all; 30 s an update.
     assert page.fact("trained") == (
-        "4 of 20 updates, 256 arena control steps of a seed, 8 arenas, 2.0 minutes"
+        "4 of 20 updates, 256 arena control steps of a seed, 8 arenas, 2 min 00 s"
     )
     # Three values or fewer are not trimmed: the mean of 0.5 and 0.625 is 0.5625.
     assert page.fact("last stage") == (
@@ -82,7 +82,7 @@ def test_a_run_that_measured_nothing_has_a_page(tmp_path: Path) -> None:
     assert page.fact("all stages") == "0 of 2 at 90.0 % or more"
     assert page.fact("decisions") == "none"
     assert page.fact("Decisions of the curriculum") == "None."
-    assert "minutes" not in page.fact("trained")
+    assert "min" not in page.fact("trained")
     assert ["pair", "2", "0", "0.5", "100.0 %", "-", "-", "-", "-", "0 of 1"] in page.rows
 
 

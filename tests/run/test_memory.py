@@ -12,7 +12,7 @@ import pytest
 from swarmjax import train
 from swarmjax.config import ConfigError
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.run import lifecycle, memory, trainer
+from swarmjax.run import execute, lifecycle, memory, trainer
 from swarmjax.run.settings import RunConfig, TrainConfig, load_train
 from swarmjax.task.stage_config import StageConfig
 
@@ -126,8 +126,8 @@ def test_training_begins_with_the_choice(
 ) -> None:
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     monkeypatch.setattr(memory, "limit", lambda: available)
-    monkeypatch.setattr(train, "measure", _linear(10**6, 1000))
-    monkeypatch.setattr(train, "_run", lambda settings: settings.arenas)
+    monkeypatch.setattr(execute, "measure", _linear(10**6, 1000))
+    monkeypatch.setattr(execute, "_run", lambda settings: settings.arenas)
     assert train.main([*WORDS, "arenas=auto"]) == arenas
     assert capsys.readouterr().out.startswith(f"arenas=auto: {arenas:,}, ")
 

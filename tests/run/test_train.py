@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,7 +17,7 @@ from swarmjax import command, policy, train
 from swarmjax.config import build, to_dict
 from swarmjax.export import __main__ as export
 from swarmjax.export.config import ExportConfig
-from swarmjax.run import checkpoint, lifecycle
+from swarmjax.run import checkpoint, execute, lifecycle
 from swarmjax.run.checkpoint import CheckpointError, Checkpoints, digest
 from swarmjax.run.settings import TrainConfig, load_train
 from swarmjax.training import program as programs
@@ -101,6 +103,21 @@ def test_a_run_directory_holds_what_it_promises(whole: Path) -> None:
     assert build(TrainConfig, stored).algo.hidden_sizes == (8,)
 
 
+def test_jax_is_not_loaded_before_the_settings_are_read() -> None:
+    code = "import sys, swarmjax.train; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_run_says_what_steps_the_robots_and_then_that_it_compiles(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert _train(f"run.dir={tmp_path}", "run.stop_after=1") == 0
+    first, second, third, *_ = capsys.readouterr().out.splitlines()
+    assert "planar robots stepped by discs" in first
+    assert second == "compiling ..."
+    assert re.fullmatch(r"compiled in \S+ s", third)
+
+
 @pytest.mark.parametrize("chunk", ["7", "all", "auto"])
 def test_chunks_of_any_size_train_the_same_parameters(
     chunk: str, whole: Path, tmp_path: Path
@@ -119,6 +136,75 @@ def test_a_resumed_run_ends_where_an_uninterrupted_one_does(whole: Path, tmp_pat
     kept = json.loads((whole / "summary.json").read_text())
     for name in ("arena_steps", "transitions", "targets_reached", "decisions"):
         assert summary[name] == kept[name], name
+
+
+@pytest.fixture
+def copied(whole: Path, tmp_path: Path) -> Path:
+    """A copy of a run whose budget is spent."""
+    return Path(shutil.copytree(whole, tmp_path / "copied"))
+
+
+def _forbid_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lifecycle, "prepare", lambda *_: pytest.fail("nothing to compile"))
+
+
+def _contents(run: Path) -> dict[Path, tuple[bytes, int]]:
+    """What every file of a run holds, and when it was written."""
+    files = [path for path in run.rglob("*") if path.is_file()]
+    return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
+
+
+def test_a_run_that_is_done_says_so_and_stays_as_it_is(
+    copied: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _forbid_compiling(monkeypatch)
+    monkeypatch.setattr(lifecycle, "_load", lambda *_: pytest.fail("nothing to load"))
+    before = _contents(copied)
+    assert train.main([f"resume={copied}"]) == 0
+    first, *_, last = capsys.readouterr().out.splitlines()
+    assert first.startswith(f"nothing left to train: {copied} has spent its budget of 144 arena")
+    assert last.startswith("done; judge the policy with: ")
+    assert _contents(copied) == before
+
+
+def test_a_run_that_is_done_gets_the_policy_that_it_lacks(
+    copied: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _forbid_compiling(monkeypatch)
+    (copied / "policy.npz").unlink()
+    assert train.main([f"resume={copied}"]) == 0
+    found, kept = (policy.load(run / "policy.npz") for run in (copied, whole))
+    np.testing.assert_array_equal(found.layers[-1][0], kept.layers[-1][0])
+    assert found.meta["update"] == 9
+
+
+def test_a_run_that_is_done_gets_the_summary_that_it_lacks(
+    copied: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _forbid_compiling(monkeypatch)
+    (copied / "summary.json").unlink()
+    assert train.main([f"resume={copied}"]) == 0
+    found, kept = (json.loads((run / "summary.json").read_text()) for run in (copied, whole))
+    assert found == kept | {"compile_s": 0.0}
+
+
+def test_a_summary_of_a_smaller_budget_is_written_anew(
+    copied: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _forbid_compiling(monkeypatch)
+    summary = json.loads((copied / "summary.json").read_text())
+    (copied / "summary.json").write_text(json.dumps(summary | {"updates": 4}))
+    assert train.main([f"resume={copied}"]) == 0
+    assert json.loads((copied / "summary.json").read_text())["updates"] == 9
+
+
+def test_a_run_that_is_done_can_be_written_elsewhere(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _forbid_compiling(monkeypatch)
+    assert train.main([f"resume={whole}", f"run.dir={tmp_path}"]) == 0
+    assert _digest(tmp_path) == _digest(whole)
+    assert {"config.json", "policy.npz", "summary.json"} <= {p.name for p in tmp_path.iterdir()}
 
 
 def test_a_run_with_a_price_of_contacts_goes_on_without_it(
@@ -236,7 +322,7 @@ def test_a_seed_that_breaks_stops_the_run_and_is_named(
     with Checkpoints(tmp_path, keep=1) as checkpoints:
         checkpoints.save(leaves, 4)
     capsys.readouterr()
-    assert train.main([f"resume={tmp_path}"]) == train.FAILED
+    assert train.main([f"resume={tmp_path}"]) == execute.FAILED
     assert "_loss is no longer finite at update 4 of seed 4: try lower" in capsys.readouterr().out
     assert checkpoint.restore(tmp_path)[1] == 4
 
@@ -328,8 +414,9 @@ def test_a_checkpoint_of_another_shape_is_refused(
     stored["algo"]["hidden_sizes"] = [16]
     (tmp_path / "config.json").write_text(json.dumps(stored))
     (tmp_path / "checkpoints").symlink_to(whole / "checkpoints")
-    sentence = _refusal(capsys, "train", f"resume={tmp_path}")
+    sentence = _refusal(capsys, "train", f"resume={tmp_path}", "budget=160")
     assert "this run's config needs" in sentence
+    assert "it is of another run" in _refusal(capsys, "train", f"resume={tmp_path}")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,81 @@
+"""What a command takes from a run or a policy, as words that come before those that were typed.
+
+Of a key that is given twice the last word counts, so that whatever is typed wins.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+from swarmjax.config import files, section
+from swarmjax.config.section import Section
+
+
+def group_words(
+    cls: type[Section], group: str, held: Section, typed: Sequence[str], skip: Iterable[str] = ()
+) -> list[str]:
+    """Write the values of a section as words, but for what a chosen file says otherwise.
+
+    Args:
+        cls: the command's dataclass.
+        group: the section's name there, such as `robot`.
+        held: the section of the run or policy.
+        typed: the words of the command line.
+        skip: keys of the section that are not taken.
+
+    Returns:
+        A word for each value that is not the default.
+    """
+    words = files.split_words(cls, typed)
+    own = files.read_choice(group, files.choice_of(words[group])) if group in words else {}
+    left = {*skip, *own}
+    default = section.to_dict(_default(type(held)))
+    derived = section.keys(type(held), derived=True)
+    return [
+        f"{group}.{key}={write(value)}"
+        for key, value in _differences(section.to_dict(held), default)
+        if key not in derived and key.partition(".")[0] not in left
+    ]
+
+
+def preset_words(cls: type[Section], group: str, held: Any, typed: Sequence[str]) -> list[str]:
+    """Write a section that a preset stands for whole: none of it if another preset is typed.
+
+    Args:
+        cls: the command's dataclass.
+        group: the section's name there, such as `realism`.
+        held: the section of the run or policy; its `name` is that of the preset.
+        typed: the words of the command line.
+
+    Returns:
+        The choice of the preset, and a word for each value that is not the preset's.
+    """
+    if group in files.split_words(cls, typed):
+        return []
+    preset = section.build(type(held), files.read_preset(group, held.name))
+    found = _differences(section.to_dict(held), section.to_dict(preset))
+    return [f"{group}={held.name}", *(f"{group}.{key}={write(value)}" for key, value in found)]
+
+
+def write(value: object) -> str:
+    """Write plain data so that Hydra's grammar reads the same value."""
+    if isinstance(value, str):
+        return "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(write, value))}]"
+    return repr(value)
+
+
+def _default(cls: type[Section]) -> Section:
+    return cls()
+
+
+def _differences(held: Mapping[str, Any], other: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield dotted keys and values that are not those of another section."""
+    for key, value in held.items():
+        if isinstance(value, Mapping):
+            inner = _differences(value, other.get(key, {}))
+            yield from ((f"{key}.{name}", each) for name, each in inner)
+        elif key not in other or value != other[key]:
+            yield key, value

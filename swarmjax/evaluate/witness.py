@@ -1,0 +1,149 @@
+"""What a policy says of the robot and the task that it was trained with.
+
+Commands that run a policy take hull, sensors, speeds, task, realism and stage from its file unless
+their words say otherwise. The judge's body stays what the command says: wheels.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any, NamedTuple
+
+from swarmjax import policy_file
+from swarmjax.config import ConfigError, Section, build, files, inherit
+from swarmjax.config.section import modernise
+from swarmjax.evaluate.evaluation import list_files
+from swarmjax.sim.config import RobotConfig
+from swarmjax.sim.realism_config import RealismConfig
+from swarmjax.task import stage_files
+from swarmjax.task.config import TaskConfig
+
+# Of the task, what a judge asks for too; rewards and step limit are those of training.
+_TASK = ("control_step", "target_radius", "observations")
+
+
+class Trained(NamedTuple):
+    """What a policy was trained with.
+
+    Attributes:
+        robot: Its numbers.
+        task: What a judge asks for too.
+        realism: Of sensors and bodies.
+        stages: Plain data of its stages, the last one last; none if the file names none.
+    """
+
+    robot: RobotConfig
+    task: TaskConfig
+    realism: RealismConfig
+    stages: list[dict[str, Any]]
+
+
+def trained(meta: Mapping[str, Any], path: str) -> Trained:
+    """Reads what a policy file says of its training; of a file of an older version what it has.
+
+    Args:
+        meta: Of the file.
+        path: Of the file.
+
+    Raises:
+        ConfigError: A number is unsound.
+    """
+    config = {key: value for key, value in meta["config"].items() if isinstance(value, Mapping)}
+    low, high = meta["action"]["low"], meta["action"]["high"]
+    robot = {
+        "max_speed": high[0],
+        "max_turn_rate": -low[1],
+        **modernise(RobotConfig, config.get("robot", {})),
+        **_known(RobotConfig, meta["robot"]),
+    }
+    task = {key: meta["task"][key] for key in _TASK if key in meta["task"]}
+    task["sensor_range"] = meta["sensors"]["range"]
+    sensors = {"infrared": meta["sensors"]["response"], "name": meta["sensors"]["preset"]}
+    realism = meta.get("realism") or config.get("realism") or sensors
+    stages = meta.get("stages") or meta["config"].get("stage") or []
+    return Trained(
+        robot=build(RobotConfig, robot, f"{path}: meta.robot."),
+        task=build(TaskConfig, task, f"{path}: meta.task."),
+        realism=build(RealismConfig, modernise(RealismConfig, realism), f"{path}: meta.realism."),
+        stages=[stages] if isinstance(stages, dict) else list(stages),
+    )
+
+
+def _known(cls: type[Section], mapping: Mapping[str, Any]) -> dict[str, Any]:
+    """Keeps the keys that a section has."""
+    names = {item.name for item in fields(cls)}
+    return {key: value for key, value in mapping.items() if key in names}
+
+
+def load[C: Section](cls: type[C], typed: Sequence[str]) -> tuple[C, str]:
+    """Makes the settings of a command that runs policies: as they were trained, unless it is told.
+
+    Args:
+        cls: The command's dataclass, with `policy` and perhaps `compare`.
+        typed: `key=value` words.
+
+    Returns:
+        The settings, and one line that says what was taken from the policies.
+
+    Raises:
+        ConfigError: A word is unsound, or policies were trained differently and no word decides.
+        PolicyError: A policy is unsound.
+    """
+    given = files.values(files.split_words(cls, typed))
+    paths = [
+        path
+        for key in ("policy", "compare")
+        if isinstance(given.get(key), str) and given[key]
+        for path in list_files(key, given[key])
+    ]
+    found = [trained(policy_file.read_meta(path), path) for path in paths]
+    words = [_words(cls, each, typed) for each in found]
+    _check_alike(cls, paths, words, typed)
+    stage = found[0].stages[-1] if found and found[0].stages else None
+    settings = stage_files.load_levels(cls, [*(words[0] if words else ()), *typed], stage)
+    return settings, _say(settings, typed)
+
+
+def _words(cls: type[Section], found: Trained, typed: Sequence[str]) -> list[str]:
+    return [
+        *inherit.group_words(cls, "robot", found.robot, typed, skip=["body"]),
+        *inherit.group_words(cls, "task", found.task, typed),
+        *inherit.preset_words(cls, "realism", found.realism, typed),
+    ]
+
+
+def _check_alike(
+    cls: type[Section], paths: list[str], words: list[list[str]], typed: Sequence[str]
+) -> None:
+    """Refuses policies that were trained differently where no word says what counts."""
+    told = files.split_words(cls, typed)
+    for path, mine in zip(paths[1:], words[1:], strict=True):
+        for word in sorted(set(mine) ^ set(words[0])):
+            key = word.partition("=")[0]
+            if key not in told:
+                first, other = (_value(each, key) for each in (words[0], mine))
+                raise ConfigError(
+                    f"{paths[0]} and {path} were trained differently, with {key} {first} and "
+                    f"{other}: say by which to judge them, as in {word}."
+                )
+
+
+def _value(words: list[str], key: str) -> str:
+    """Finds the value that words give a key."""
+    found = [word.partition("=")[2] for word in words if word.partition("=")[0] == key]
+    return found[0] if found else "its default"
+
+
+def _say(settings: Any, typed: Sequence[str]) -> str:
+    """Says in one line what robot and task the policies are run with."""
+    robot, task = settings.robot, settings.task
+    told = [word for word in typed if word.partition("=")[0].partition(".")[0] in _TOLD]
+    levels = f"suite {settings.suite}" if settings.suite else f"stage {settings.stage.name}"
+    return (
+        f"as trained{f' but for {" ".join(told)}' if told else ''}: hull {robot.hull_radius:g} m, "
+        f"infrared to {task.sensor_range:g} m, at most {robot.max_speed:g} m/s and "
+        f"{robot.max_turn_rate:g} rad/s, control step {task.control_step:g} s, "
+        f"realism {settings.realism.name}; {robot.body} body, {levels}"
+    )
+
+
+_TOLD = ("robot", "task", "realism")

@@ -1,0 +1,5 @@
+"""Errors that are the user's to mend, where a command can name them without loading JAX."""
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that is missing, damaged or of another run, in one sentence."""

@@ -1,0 +1,92 @@
+"""From the checked settings of a run to its exit code: caches, memory, and the closing lines."""
+
+import math
+import sys
+from pathlib import Path
+
+import jax
+
+from swarmjax import command, words
+from swarmjax.run import compile_cache, memory
+from swarmjax.run.display import Display, measured, spread, working
+from swarmjax.run.lifecycle import carry_out, dry_run, find_run
+from swarmjax.run.policy_export import POLICY, seed_path
+from swarmjax.run.settings import TrainConfig
+from swarmjax.run.trainer import Stop, Tally, TrainingError, measure
+
+FAILED = 1
+
+
+def execute(settings: TrainConfig, *, auto: bool) -> int:
+    """Trains as the settings say.
+
+    Args:
+      settings: of the run.
+      auto: whether its number of arenas is still to be chosen.
+
+    Returns:
+      The exit code of the command.
+    """
+    with compile_cache.use(settings.run.compile_cache):
+        if auto:
+            settings = _fill(settings)
+        with memory.refusal(settings):
+            return _run(settings)
+
+
+def _fill(settings: TrainConfig) -> TrainConfig:
+    """Chooses the number of arenas, and says why it is that."""
+    available = None if jax.default_backend() == "cpu" else memory.limit()
+    with memory.refusal(settings), working("finding out how many arenas fit"):
+        settings, why = memory.fill(settings, measure, available)
+    sys.stdout.write(f"{why}\n")
+    return settings
+
+
+def _run(settings: TrainConfig) -> int:
+    """Does what the config says; returns the exit code."""
+    if settings.run.dry:
+        with Display(settings.updates) as display:
+            return dry_run(settings, display)
+    run = find_run(settings)
+    with Stop() as stop, Display(settings.updates) as display:
+        try:
+            tally = carry_out(settings, run, stop, display)
+        except TrainingError as error:
+            display.say(f"swarmjax.train: error: {error} What was saved before is in {run}.")
+            return FAILED
+    sys.stdout.write(f"{_success(settings, tally)}\n{_closing(run, settings, tally)}\n")
+    return command.INTERRUPTED if stop.asked else 0
+
+
+def _success(settings: TrainConfig, tally: Tally) -> str:
+    """Says how good the swarm is on the furthest stage that was measured."""
+    last = settings.stage[-1].name
+    for stage in reversed(settings.stage):
+        found = spread([of_seed.get(stage.name) for of_seed in tally.targets_reached.values()])
+        if found is not None:
+            more = "" if stage.name == last else f"; {last} was not measured yet"
+            return (
+                f"targets reached on {stage.name}: {measured(found)}, over all episodes that began "
+                f"within one step limit{more}"
+            )
+    updates = words.count(
+        math.ceil(settings.task.step_limit / settings.algo.rollout_length), "update"
+    )
+    return (
+        f"targets reached: not measured yet, since no whole cohort ended: its episodes begin "
+        f"within one step limit ({updates}) and end within another"
+    )
+
+
+def _closing(run: Path, settings: TrainConfig, tally: Tally) -> str:
+    """Says what to do next."""
+    if tally.update < settings.updates:
+        return (
+            f"stopped after update {tally.update:,} of {settings.updates:,}, saved; go on with: "
+            f"python -m swarmjax.train resume={run}"
+        )
+    policy = seed_path(run / POLICY, settings, settings.seed)
+    stage = settings.stage[-1].name
+    what = "the policy" if settings.seeds == 1 else f"each of {settings.seeds} policies"
+    return f"done; judge {what} with: python -m swarmjax.evaluate policy={policy} stage={stage}"

@@ -1,0 +1,86 @@
+"""What `--help` says, for every command."""
+
+import json
+import shlex
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from swarmjax import command, train
+from swarmjax.config import ConfigError, files, section, to_dict
+from swarmjax.config.section import Section
+from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.export.config import ExportConfig
+from swarmjax.replay.config import ReplayConfig
+from swarmjax.report.config import ReportConfig
+from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.suite import SuiteConfig
+from swarmjax.task.stage_files import load_levels
+
+# The loader of each command and its settings.
+COMMANDS: dict[str, tuple[Callable[[Sequence[str]], object], type[Section]]] = {
+    "swarmjax.train": (train._settings, TrainConfig),
+    "swarmjax.evaluate": (partial(load_levels, EvaluateConfig), EvaluateConfig),
+    "swarmjax.export": (partial(files.load, ExportConfig), ExportConfig),
+    "swarmjax.report": (partial(files.load, ReportConfig), ReportConfig),
+    "swarmjax.replay": (partial(load_levels, ReplayConfig), ReplayConfig),
+    "swarmjax.reproduce": (load_reproduce, ReproduceConfig),
+    "swarmjax.suite": (partial(files.load, SuiteConfig), SuiteConfig),
+}
+EVERY_EXAMPLE = [(name, words) for name, of in command.EXAMPLES.items() for words in of]
+
+
+@pytest.mark.parametrize(("name", "words"), EVERY_EXAMPLE)
+def test_an_example_is_taken_by_its_command(
+    name: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "runs" / "first").mkdir(parents=True)
+    (tmp_path / "runs" / "first" / "config.json").write_text(json.dumps(to_dict(load_train([]))))
+    monkeypatch.chdir(tmp_path)
+    load, _ = COMMANDS[name]
+    load(shlex.split(words))
+
+
+def test_every_command_has_examples() -> None:
+    assert command.EXAMPLES.keys() == COMMANDS.keys()
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_first_help_fits_a_screen(name: str) -> None:
+    text = command.help_text(COMMANDS[name][1], name)
+    assert text.startswith(f"usage: python -m {name} key=value ...\n")
+    assert text.count("\n") < 50
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_all_keys_are_listed_once(name: str) -> None:
+    cls = COMMANDS[name][1]
+    listed = command.help_text(cls, name, ["all"]).splitlines()
+    assert [line.split("=")[0].strip() for line in listed] == list(section.keys(cls))
+
+
+def test_a_section_is_listed_alone() -> None:
+    lines = command.help_text(TrainConfig, "swarmjax.train", ["task.reward"]).splitlines()
+    assert lines
+    assert all(line.startswith("  task.reward.") for line in lines)
+
+
+def test_a_key_is_listed_alone() -> None:
+    (line,) = command.help_text(TrainConfig, "swarmjax.train", ["algo.discount"]).splitlines()
+    assert line.startswith("  algo.discount=0.99 ")
+
+
+def test_every_section_says_how_it_is_listed() -> None:
+    text = command.help_text(TrainConfig, "swarmjax.train")
+    for name in section.sections(TrainConfig):
+        assert f"\n  --help {name} " in text
+
+
+def test_a_topic_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(
+        ConfigError, match=r"^--help algos is no topic: give a key, or one of .*all"
+    ):
+        command.help_text(TrainConfig, "swarmjax.train", ["algos"])
