@@ -152,7 +152,7 @@ def brax_settings(race: RaceConfig, trained: TrainConfig) -> dict[str, Any]:
     Returns:
       Plain data.
     """
-    robots = trained.arenas * trained.sim.max_robots
+    robots = trained.arenas * trained.sim.robots
     given = {"ours": _our_settings(trained), "playground": PLAYGROUND}[race.settings]
     if race.learning_rate is not None:
         given = given | {"learning_rate": race.learning_rate}
@@ -271,7 +271,7 @@ def run_brax(race: RaceConfig, trained: TrainConfig) -> Course:
         train_s=np.cumsum(calls),
         share=np.array(shares[1:]),
         transitions=transitions,
-        arena_steps=transitions / trained.sim.max_robots,
+        arena_steps=transitions / trained.sim.robots,
         compile_s=float(compile_s),
     )
 
@@ -345,9 +345,9 @@ def _check(race: RaceConfig, trained: TrainConfig) -> None:
     *others, stage = trained.stage
     if others:
         raise ConfigError(f"stage is {trained.stage_name}: give one stage, as in stage=s6.")
-    if stage.robots < trained.sim.max_robots:
+    if stage.robots < trained.sim.robots:
         raise ConfigError(
-            f"sim.max_robots is {trained.sim.max_robots}, but stage {stage.name} has "
+            f"sim.max_robots is {trained.sim.robots}, but stage {stage.name} has "
             f"{stage.robots} robots, and Brax has no place for absent ones: give "
             f"sim.max_robots={stage.robots}."
         )
@@ -362,7 +362,7 @@ def _check(race: RaceConfig, trained: TrainConfig) -> None:
 
 
 def _check_playground(trained: TrainConfig) -> None:
-    robots, parts = trained.arenas * trained.sim.max_robots, PLAYGROUND["num_minibatches"]
+    robots, parts = trained.arenas * trained.sim.robots, PLAYGROUND["num_minibatches"]
     if robots % parts:
         raise ConfigError(
             f"arenas is {trained.arenas}: settings=playground takes a number of robots, {robots} "

@@ -1,6 +1,7 @@
 """What all commands share: `--help`, and errors of the user's in one sentence with exit code 2."""
 
 import inspect
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 
@@ -96,6 +97,21 @@ def run(
     except (ConfigError, PolicyError, *also) as error:
         sys.stderr.write(f"{module}: error: {error}\n")
         return USER_ERROR
+
+
+def line(name: str, *arguments: str) -> str:
+    """Write a command that can be pasted into a shell.
+
+    Args:
+        name: of the command, `evaluate` say.
+        arguments: its words, as `word` writes them.
+    """
+    return shlex.join(["python", "-m", f"swarmjax.{name}", *arguments])
+
+
+def word(key: str, value: str) -> str:
+    """Write a text as a word of a command line, quoted where Hydra's grammar needs it."""
+    return f"{key}={value}"
 
 
 def _module(name: str) -> str:

@@ -54,7 +54,7 @@ def load(path: str | Path | IO[bytes]) -> Policy:
         layers = [(arrays[f"actor/{n}/kernel"], arrays[f"actor/{n}/bias"]) for n in names]
         rest = [arrays[name] for name in ("actor/log_std", "normalizer/mean", "normalizer/std")]
         shared, encoding = meta["policy"] == "shared", meta["observation"]["encoding"]
-        return Policy._make([layers, *rest, shared, encoding, *meta["action"]["high"], meta, found])
+        return Policy(*[layers, *rest, shared, encoding, *meta["action"]["high"], meta, found])
     except Exception as error:  # whatever a damaged file makes zipfile, NumPy and json raise
         reason = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
         raise PolicyError(f"{path} cannot be read as a policy: {reason}.") from None

@@ -27,7 +27,7 @@ def group_words(
     """
     words = files.split_words(cls, typed)
     own = files.read_choice(group, files.choice_of(words[group])) if group in words else {}
-    left = {*skip, *own}
+    left = {*skip, *own.get(group, own)}  # a file for the whole config nests its groups
     default = section.to_dict(_default(type(held)))
     derived = section.keys(type(held), derived=True)
     return [

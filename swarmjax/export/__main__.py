@@ -10,17 +10,18 @@ import re
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from swarmjax import command, policy_file
 from swarmjax.config import ConfigError, files
-from swarmjax.export import c, onnx, webots
+from swarmjax.export import c, check, onnx, webots
 from swarmjax.export import folder as export_folder
 from swarmjax.export.config import ExportConfig
 from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import CheckpointError
 from swarmjax.run.policy_export import POLICY, seed_path, write_policy
-from swarmjax.run.settings import TrainConfig, from_stored, read_config
+from swarmjax.run.settings import TrainConfig, from_stored, read_config, settle
 
 # What each format is called where `out` does not say.
 _NAMES = {"npz": POLICY, "onnx": "policy.onnx", "c": "policy_c", "webots": "swarmjax_epuck"}
@@ -38,6 +39,9 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     run = Path(settings.run or "")
     trained = from_stored(read_config(run))
+    if settings.extensions is not None:
+        trained = replace(trained, extensions=settings.extensions)
+    trained = settle(trained)
     targets = _targets(settings, trained)
     leaves, update, skipped = checkpoint.restore(run, settings.step)
     for sentence in skipped:
@@ -101,11 +105,13 @@ def _check_controller(out: Path) -> None:
 
 def _convert(settings: ExportConfig, source: Path, out: Path) -> None:
     """Writes a policy file in another form."""
-    trained = policy_file.read(source)
-    content = source.read_bytes()
+    meta, content = policy_file.read_meta(source), source.read_bytes()
     if settings.format == "npz":
         export_folder.write_file(out, content)
-    elif settings.format == "onnx":
+        return
+    check.expressible(meta, settings.format, settings.sensors)
+    trained = policy_file.read(source)
+    if settings.format == "onnx":
         export_folder.write_file(out, onnx.render(trained))
     elif settings.format == "c":
         export_folder.write_folder(out, c.render(trained))

@@ -29,6 +29,10 @@ class ExportConfig(Section):
         default=None,
         metadata=about("file or folder; null: in run or beside policy, by format and step"),
     )
+    extensions: str | None = field(
+        default=None,
+        metadata=about("Python file with the pieces that the policy needs; it is run"),
+    )
     sensors: Literal["webots", "real"] = field(
         default="webots",
         metadata=about("what answers the webots controller: simulated e-pucks, or real ones"),

@@ -54,9 +54,10 @@ def trained_as(policy: Policy) -> str:
         Part of a sentence.
     """
     robot, sensors = policy.meta["robot"], policy.meta["sensors"]
+    hull = f", hull {short(robot['hull_radius'])} m" if "hull_radius" in robot else ""
     return (
-        f"robot {robot['preset']} (body {robot['body']}), "
-        f"sensors {sensors['preset']} (response {sensors['response']})"
+        f"robot {robot['preset']} (body {robot['body']}{hull}), sensors {sensors['preset']} "
+        f"(response {sensors['response']}, range {short(sensors['range'])} m)"
     )
 
 

@@ -21,6 +21,8 @@ from swarmjax import policy
 from swarmjax.policy import Policy
 
 INFRARED = tuple(f"ps{i}" for i in range(8))
+# What it can put into an observation, in any order.
+QUANTITIES = (*(f"infrared_{i}" for i in range(8)), "target_distance", "target_bearing")
 MOTORS = ("left wheel motor", "right wheel motor")
 
 
@@ -93,7 +95,8 @@ def observe(
             seen = np.minimum(seen, trained.meta["sensors"]["range"])
         else:
             seen = np.interp(seen, sensors["distance"], sensors["counts"])
-    quantity = np.array([*seen, distance, bearing], np.float32)
+    measured = dict(zip(QUANTITIES, [*seen, distance, bearing], strict=True))
+    quantity = np.array([measured[name] for name in layout["names"]], np.float32)
     offset, scale = (np.array(layout[key], np.float32) for key in ("offset", "scale"))
     return (quantity - offset) / scale
 

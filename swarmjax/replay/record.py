@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarmjax.config import build, show
+from swarmjax.config.section import modernise
 from swarmjax.evaluate import engine_c
 from swarmjax.evaluate.engine_c import Arenas, Judge
 from swarmjax.policy import Policy, PolicyError
@@ -129,7 +130,7 @@ def terms(steps: Steps, weights: RewardConfig) -> dict[str, np.ndarray]:
         "arrival": steps.arrives,
         "contact": steps.contact_begins.sum(axis=-1),
         "robot_contact": steps.contact_begins[..., gaps.KINDS.index("robot")],
-        "time": np.ones_like(steps.distance),
+        "step_penalty": np.ones_like(steps.distance),
     }
     weighted = {name: getattr(weights, name) * term for name, term in found.items()}
     return {name: term for name, term in weighted.items() if getattr(weights, name)}
@@ -147,7 +148,8 @@ def weights(trained: Policy, task: TaskConfig) -> RewardConfig:
         raise PolicyError(f"meta.config.task is {show(stored)}: expected an object.")
     if "reward" not in stored:
         return task.reward
-    return build(RewardConfig, stored["reward"], "the policy's config.task.reward.")
+    kept = modernise(RewardConfig, stored["reward"])
+    return build(RewardConfig, kept, "the policy's config.task.reward.")
 
 
 def record(

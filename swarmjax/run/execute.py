@@ -84,9 +84,11 @@ def _closing(run: Path, settings: TrainConfig, tally: Tally) -> str:
     if tally.update < settings.updates:
         return (
             f"stopped after update {tally.update:,} of {settings.updates:,}, saved; go on with: "
-            f"python -m swarmjax.train resume={run}"
+            f"{command.line('train', command.word('resume', str(run)))}"
         )
     policy = seed_path(run / POLICY, settings, settings.seed)
-    stage = settings.stage[-1].name
+    arguments = [command.word("policy", str(policy))]
+    if settings.extensions is not None:
+        arguments.append(command.word("extensions", settings.extensions))
     what = "the policy" if settings.seeds == 1 else f"each of {settings.seeds} policies"
-    return f"done; judge {what} with: python -m swarmjax.evaluate policy={policy} stage={stage}"
+    return f"done; judge {what} with: {command.line('evaluate', *arguments)}"

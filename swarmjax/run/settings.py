@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from swarmjax import extension
-from swarmjax.config import ConfigError, Section, about, build, files, to_dict
+from swarmjax.config import ConfigError, Section, about, build, files, inherit, to_dict
 from swarmjax.config.section import MAX_COUNT, modernise
 from swarmjax.ppo.config import AlgoConfig, resolve
 from swarmjax.task import pieces, stage_files
 from swarmjax.task.config import check_realism
+from swarmjax.task.stage_config import make_room
 from swarmjax.training.config import ProgramConfig
 
 # Arenas of all seeds whose episodes are written down one by one: more end thousands a second.
@@ -80,6 +81,7 @@ class TrainConfig(ProgramConfig):
     )
 
     def _check(self) -> None:
+        object.__setattr__(self, "sim", make_room(self.sim, self.stage))
         if self.seed + self.seeds - 1 > MAX_COUNT:
             raise ConfigError(
                 f"seed is {self.seed}, but seeds is {self.seeds} and the last seed may be "
@@ -119,11 +121,11 @@ class TrainConfig(ProgramConfig):
 
     def _check_counts(self) -> None:
         steps = max(self.task.step_limit, self.algo.rollout_length)
-        most = MAX_COUNT // (self.sim.max_robots * steps)
+        most = MAX_COUNT // (self.sim.robots * steps)
         if self.arenas > most:
             raise ConfigError(
                 f"arenas is {self.arenas}, but robot steps are counted in 32 bits, and "
-                f"{self.sim.max_robots} robots for {steps} control steps leave room for {most}: "
+                f"{self.sim.robots} robots for {steps} control steps leave room for {most}: "
                 f"give at most {most}."
             )
 
@@ -200,13 +202,19 @@ def read_config(run: Path) -> dict:
     return found
 
 
-def load_train(overrides: Sequence[str], *, auto: bool = False) -> TrainConfig:
+def load_train(
+    overrides: Sequence[str],
+    *,
+    auto: bool = False,
+    stages: Sequence[dict[str, Any]] | None = None,
+) -> TrainConfig:
     """Make the configuration of `swarmjax.train` from its `key=value` words.
 
     Args:
         overrides: the words.
         auto: whether `arenas=auto` may be among them. It leaves the fewest arenas there can be,
             algo.num_minibatches; `memory.fill` chooses how many there will be.
+        stages: plain data of the stages, in place of a file's.
 
     Raises:
         ConfigError: a word, a choice, a file or a value is unsound.
@@ -220,10 +228,34 @@ def load_train(overrides: Sequence[str], *, auto: bool = False) -> TrainConfig:
                 f"init_from_std is {mapping['init_from_std']}, but there is no init_from: give "
                 "init_from=DIR with it, the directory of a run."
             )
-        stages = stage_files.expand(mapping.get("stage", {}), chosen["stage"])
-        return mapping | {"stage": stages, "stage_name": stage_files.name_of(chosen["stage"])}
+        if stages is not None:
+            return mapping | {"stage": list(stages)}
+        found = stage_files.expand(mapping.get("stage", {}), chosen["stage"])
+        return mapping | {"stage": found, "stage_name": stage_files.name_of(chosen["stage"])}
 
-    return settle(files.load(TrainConfig, overrides, complete))
+    return settle(files.load(TrainConfig, [*_inherited(overrides), *overrides], complete))
+
+
+# Of the learner, what a run with init_from has to share with the run that it begins with.
+_SHARED = ("policy", "network", "hidden_sizes", "activation", "mean_activation")
+
+
+def _inherited(typed: Sequence[str]) -> list[str]:
+    """Return the words that a run with `init_from` takes from the run it begins with.
+
+    Robot, task, realism and the shape of the networks, but for what is typed.
+    """
+    source = files.values(files.split_words(TrainConfig, typed)).get("init_from")
+    if not isinstance(source, str):
+        return []
+    held = from_stored(read_config(Path(source)), f"{source}: ")
+    others = [key for key in to_dict(held.algo) if key not in _SHARED]
+    return [
+        *inherit.group_words(TrainConfig, "robot", held.robot, typed),
+        *inherit.group_words(TrainConfig, "task", held.task, typed),
+        *inherit.group_words(TrainConfig, "algo", held.algo, typed, skip=others),
+        *inherit.preset_words(TrainConfig, "realism", held.realism, typed),
+    ]
 
 
 def settle(settings: TrainConfig) -> TrainConfig:

@@ -12,6 +12,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from swarmjax import extension
 from swarmjax.config import ConfigError, show
 from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import CheckpointError, Leaves
@@ -128,6 +129,8 @@ def _check_alike(init_from: str, stored: TrainConfig, settings: TrainConfig) -> 
             f"init_from is {show(init_from)}, a run of {stored.seeds} seeds, but seeds is "
             f"{settings.seeds}: give seeds={stored.seeds}, or a run of one seed."
         )
+    pieces, kinds = extension.load(settings.extensions), ["observation", "network"]
+    extension.check_needs(stored.pieces, pieces, init_from, kinds)
     policy = f"algo.policy={stored.algo.policy}"
     if stored.algo.policy == "independent":
         policy += f" sim.max_robots={stored.sim.max_robots}"

@@ -94,8 +94,14 @@ class SimConfig(Section):
             renamed={"newton": "mjx"},
         ),
     )
-    max_robots: int = field(default=5, metadata=about("robots compiled in", 1, 100))
-    max_obstacles: int = field(default=4, metadata=about("obstacles compiled in", 0, 32))
+    max_robots: int | None = field(
+        default=None,
+        metadata=about("robots compiled in; null: 5, or as many as the stages need", 1, 100),
+    )
+    max_obstacles: int | None = field(
+        default=None,
+        metadata=about("obstacles compiled in; null: 4, or as many as the stages need", 0, 32),
+    )
     substeps: int | None = field(
         default=None,
         metadata=about("physics steps per control step; null: those of the body", 1, 1000),
@@ -108,6 +114,16 @@ class SimConfig(Section):
         default=None,
         metadata=about("line-search iterations of mjx; null: as measured", 1, 1000),
     )
+
+    @property
+    def robots(self) -> int:
+        """Robots compiled in."""
+        return 5 if self.max_robots is None else self.max_robots
+
+    @property
+    def obstacles(self) -> int:
+        """Obstacles compiled in."""
+        return 4 if self.max_obstacles is None else self.max_obstacles
 
 
 def physics_substeps(robot: RobotConfig, given: int | None) -> int:

@@ -124,7 +124,7 @@ def choose(sim: "SimConfig", body: str) -> EngineChoice:
       ConfigError: if Warp is asked for and not installed, or a solver where it cannot be.
     """
     impl = resolve_impl(sim.impl)
-    solver = resolve_solver(sim.solver, impl, body, sim.max_robots)
+    solver = resolve_solver(sim.solver, impl, body, sim.robots)
     iterations, ls_iterations = _MOST_STEPS
     if (solver, body) == ("swarm", "planar"):
         iterations = _MOST_SWEEPS

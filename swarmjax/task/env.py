@@ -30,7 +30,7 @@ from swarmjax.task.episode import Episode
 from swarmjax.task.factors import Factors
 from swarmjax.task.level import Level, Spacing
 from swarmjax.task.observation import View
-from swarmjax.task.stage_config import StageConfig
+from swarmjax.task.stage_config import StageConfig, make_room
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,10 +145,10 @@ def load(
         piece of an extension is missing or of the wrong shape.
     """
     robot, task = robot or RobotConfig(), task or TaskConfig()
-    realism, sim = realism or RealismConfig(), sim or SimConfig()
+    realism, sim = realism or RealismConfig(), make_room(sim or SimConfig(), stages)
     chosen = pieces.choose(extensions, task, stages)
-    extended.check(chosen, robots=sim.max_robots, obstacles=sim.max_obstacles)
-    size = model.ArenaSize(sim.max_robots, sim.max_obstacles, task_stage.largest_half(stages))
+    extended.check(chosen, robots=sim.robots, obstacles=sim.obstacles)
+    size = model.ArenaSize(sim.robots, sim.obstacles, task_stage.largest_half(stages))
     return World(
         robot=robot,
         task=task,

@@ -3,11 +3,12 @@
 import itertools
 import math
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.sim.config import SimConfig
 
 # The room that a random level asks for. A start and a target each take a square of 0.15 m (two
 # hulls of 0.074 m side by side); an obstacle takes the square about its circumscribed circle,
@@ -94,6 +95,26 @@ def smallest_side(stage: StageConfig) -> float:
     """
     random = stage.level != "fixed"  # a drawing of an extension changes a random level
     return _smallest_side(stage.robots, stage.obstacles, stage.obstacle_size, random=random)
+
+
+def make_room(sim: SimConfig, stages: Sequence[StageConfig]) -> SimConfig:
+    """Say how many robots and obstacles are compiled in, where the settings leave it open.
+
+    Args:
+        sim: the settings.
+        stages: that must fit.
+
+    Returns:
+        The settings with numbers for both: 5 and 4 at least, so that a curriculum's stages share a
+        program and its checkpoints.
+    """
+    robots = max([sim.robots, *(stage.robots for stage in stages)])
+    obstacles = max([sim.obstacles, *(stage.obstacles for stage in stages)])
+    return replace(
+        sim,
+        max_robots=robots if sim.max_robots is None else sim.max_robots,
+        max_obstacles=obstacles if sim.max_obstacles is None else sim.max_obstacles,
+    )
 
 
 def _smallest_side(robots: int, obstacles: int, obstacle_size: float, *, random: bool) -> float:

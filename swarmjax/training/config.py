@@ -62,7 +62,7 @@ class ProgramConfig(Section):
     @property
     def learners(self) -> int:
         """Actor-critics that are trained: one, or one for each robot."""
-        return self.sim.max_robots if self.algo.policy == "independent" else 1
+        return self.sim.robots if self.algo.policy == "independent" else 1
 
     @property
     def numbers(self) -> range:

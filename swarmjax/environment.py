@@ -1,0 +1,192 @@
+"""The swarm as an environment: many arenas stepped together, by pure functions.
+
+`make_env` makes one. Axes: A arenas, R robots (as many as the largest stage has), O observation.
+"""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from swarmjax import extension
+from swarmjax.sim import physics
+from swarmjax.task import env, extended, level
+from swarmjax.task import stage as task_stage
+from swarmjax.task.env import EnvState, TimeStep, World
+from swarmjax.task.stage import Stage
+from swarmjax.training import program as programs
+from swarmjax.training import rollout
+from swarmjax.training.config import ProgramConfig
+
+_REDRAW = 32  # control steps in which every level that waits is drawn anew; episodes take longer
+
+
+class Space(NamedTuple):
+    """What one robot's observation or action is.
+
+    Attributes:
+        shape: of it.
+        names: of its entries.
+        units: of its entries.
+        low: least value of each; None if there is none.
+        high: largest value of each; None if there is none.
+    """
+
+    shape: tuple[int, ...]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    low: np.ndarray | None
+    high: np.ndarray | None
+
+
+@struct.dataclass
+class SwarmState:
+    """All that changes: a JAX tree to carry through `jit`, `vmap` and `scan`.
+
+    Attributes:
+        arenas: [A] the arenas; `arenas.observation` [A, R, O] is what to act on, and
+            `arenas.level` where the episodes started.
+        waiting: [A] the episodes that begin next.
+        key: random key of the levels to come.
+        clock: [] control steps since `reset`, int32.
+    """
+
+    arenas: EnvState
+    waiting: EnvState
+    key: Array
+    clock: Array
+
+    @property
+    def observation(self) -> Array:
+        """[A, R, O] what to act on: of a new episode where the last one has ended."""
+        return self.arenas.observation
+
+    @property
+    def present(self) -> Array:
+        """[A, R] whether the robot takes part."""
+        return self.arenas.level.present
+
+
+@dataclass(frozen=True, eq=False)
+class Swarm:
+    """An environment of many arenas. Made by `make_env`.
+
+    Attributes:
+        config: its settings.
+        world: the compiled arena.
+        stages: [S] the stages; arena i plays stage i modulo S.
+    """
+
+    config: ProgramConfig
+    world: World
+    stages: Stage
+
+    @property
+    def num_arenas(self) -> int:
+        """Arenas, A."""
+        return self.config.arenas
+
+    @property
+    def num_robots(self) -> int:
+        """Robots in an arena, R; where a stage has fewer, `state.present` says which are there."""
+        return self.world.spacing.robots
+
+    @property
+    def observation_space(self) -> Space:
+        """One robot's observation, [O]."""
+        layout = self.world.electronics.layout
+        return Space((layout.size,), layout.names, layout.units, None, None)
+
+    @property
+    def action_space(self) -> Space:
+        """One robot's action, [2]: -1..1 spans the commands; what is beyond is clipped."""
+        ones = np.ones(programs.ACTION_SIZE, np.float32)
+        return Space(ones.shape, ("speed", "turn_rate"), ("1", "1"), -ones, ones)
+
+    def pose(self, state: SwarmState) -> Array:
+        """[A, R, 3] x (m), y (m), yaw (rad) of the robots; absent ones stand outside."""
+        return jax.vmap(partial(physics.poses, self.world.physics))(state.arenas.sim)
+
+    def reset(self, key: Array) -> SwarmState:
+        """Starts an episode in every arena.
+
+        Args:
+            key: random key, consumed.
+
+        Returns:
+            The state; act on its `observation`.
+        """
+        key, first, second = jax.random.split(key, 3)
+        every = jnp.arange(self.num_arenas)
+        return SwarmState(
+            arenas=self._draw(first, every),
+            waiting=self._draw(second, every),
+            key=key,
+            clock=jnp.zeros((), jnp.int32),
+        )
+
+    def step(self, state: SwarmState, action: Array) -> tuple[SwarmState, TimeStep]:
+        """Moves all arenas on by one control step; those whose episode ends start another.
+
+        Arenas reset themselves: where `done`, the state is that of the next episode, while the
+        step's observation is the last one of the old. Levels of the next episodes are drawn ahead,
+        each anew every 32 steps, so that an arena that ends twice within those begins alike.
+
+        Args:
+            state: before.
+            action: [A, R, 2], -1..1 spans the commands; what is beyond is clipped.
+
+        Returns:
+            The state after, and what the step came to: observation [A, R, O], reward, terminated,
+            truncated and valid [A, R], done and sound [A].
+        """
+        unpack = partial(physics.unpack, self.world.physics)
+        arenas = replace(state.arenas, sim=jax.vmap(unpack)(state.arenas.sim))
+        arenas, came = jax.vmap(partial(env.step, self.world))(arenas, action)
+        arenas = rollout.restart(arenas, state.waiting, came.done)
+        arenas = replace(arenas, sim=jax.vmap(physics.pack)(arenas.sim))
+        key, drawn = jax.random.split(state.key)
+        waiting = self._redraw(state.waiting, state.clock, drawn)
+        return SwarmState(arenas=arenas, waiting=waiting, key=key, clock=state.clock + 1), came
+
+    def _redraw(self, waiting: EnvState, clock: Array, key: Array) -> EnvState:
+        """Draws the next few of the episodes that wait anew, in turn."""
+        count = -(-self.num_arenas // _REDRAW)
+        which = (clock * count + jnp.arange(count)) % self.num_arenas
+        fresh = self._draw(key, which)
+        return jax.tree.map(lambda old, new: old.at[which].set(new), waiting, fresh)
+
+    def _draw(self, key: Array, arena: Array) -> EnvState:
+        """Starts episodes [N] for these arenas [N], packed."""
+        spacing, stages = self.world.spacing, jax.tree.map(jnp.asarray, self.stages)
+        count = len(self.stages.robots)
+
+        def start(uniform: Array, index: Array) -> EnvState:
+            stage = task_stage.select(stages, index % count)
+            drawn = extended.draw(uniform, stage, spacing, self.world.drawings)
+            return env.reset(self.world, drawn)
+
+        uniforms = jax.random.uniform(key, (len(arena), level.uniform_count(spacing)))
+        return jax.vmap(start)(uniforms, arena)
+
+
+def load(config: ProgramConfig) -> Swarm:
+    """Builds the environment that a config describes.
+
+    Args:
+        config: its stages, robot, task, realism, simulation, arenas and extensions are read.
+
+    Returns:
+        The environment.
+
+    Raises:
+        ConfigError: a piece of an extension does not fit, or see `task.env.load`.
+    """
+    names = [piece.name for piece in extension.load(config.extensions).levels]
+    stages: Any = task_stage.stack(config.stage, names)
+    return Swarm(config=config, world=programs.load_world(config), stages=stages)

@@ -1,0 +1,50 @@
+"""Refuses what a form cannot express, before anything is written."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from swarmjax import epuck
+from swarmjax.config import ConfigError, show
+from swarmjax.export import webots_controller
+from swarmjax.policy import PolicyError
+from swarmjax.sim import response
+
+
+def expressible(meta: Mapping[str, Any], form: str, sensors: str) -> None:
+    """Refuses a policy that a form cannot hold, or whose inputs its controller cannot measure.
+
+    Args:
+        meta: of the policy.
+        form: `onnx`, `c` or `webots`.
+        sensors: what answers a controller: `webots` or `real`.
+
+    Raises:
+        PolicyError: the policy's network is code, or it observes what e-pucks do not measure.
+        ConfigError: its infrared reaches further than the sensors.
+    """
+    if "network" in meta:
+        raise PolicyError(
+            f"format is {form}, but the policy's network is {show(meta['network'])}, code of an "
+            "extension that no other form holds: give format=npz, or train with algo.network=mlp."
+        )
+    if form != "webots":
+        return
+    known = webots_controller.QUANTITIES
+    unknown = [name for name in meta["observation"]["names"] if name not in known]
+    if unknown:
+        raise PolicyError(
+            f"format is webots, but the policy observes {', '.join(unknown)}, which the controller "
+            "cannot measure: give format=c or onnx, and a controller of your own."
+        )
+    _check_range(meta, sensors)
+
+
+def _check_range(meta: Mapping[str, Any], sensors: str) -> None:
+    """Refuses infrared that reaches beyond the last point at which a sensor tells distances."""
+    reach, farthest = meta["sensors"]["range"], response.REACH[sensors]
+    if meta["observation"]["encoding"] == "metric" and reach > farthest:
+        raise ConfigError(
+            f"format is webots, but the policy was trained with infrared to {reach:g} m, and "
+            f"sensors={sensors} tell distances to {farthest:g} m: train with "
+            f"task.sensor_range={epuck.SENSOR_RANGE:g}, or give format=c or onnx."
+        )
