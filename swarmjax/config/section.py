@@ -29,10 +29,22 @@ class Bounds:
     high: float = math.inf
     above: float = -math.inf
     below: float = math.inf
+    reason: str = ""  # why no more is taken than `high`, and what to do about it
 
     def hold(self, value: float) -> bool:
         """Tell whether a number lies within."""
         return self.low <= value <= self.high and self.above < value < self.below
+
+    def refuse(self, key: str, value: object, number: float) -> ConfigError:
+        """Say what to give instead of a number.
+
+        Args:
+            key: what a sentence calls the setting.
+            value: all that was given.
+            number: that of it which does not hold.
+        """
+        why = f"; {self.reason}" if self.reason and number > self.high else ""
+        return ConfigError(f"{key} is {show(value)}: give {self}{why}.")
 
     def __str__(self) -> str:
         if math.isfinite(self.low) and math.isfinite(self.high):
@@ -47,7 +59,7 @@ class Bounds:
         return ", ".join(given) or "any finite number"
 
 
-def about(
+def about(  # noqa: PLR0913  # most fields give two or three
     meaning: str,
     low: float = -math.inf,
     high: float = math.inf,
@@ -57,6 +69,7 @@ def about(
     derived: bool = False,
     stored: bool = True,
     renamed: Mapping[str, str] | None = None,
+    reason: str = "",
 ) -> dict[str, Any]:
     """Return the metadata of a field.
 
@@ -69,8 +82,9 @@ def about(
         derived: whether it follows from the files chosen, and is no key of the command line.
         stored: whether `to_dict` keeps it; what is not stored is worked out again.
         renamed: values that have a new name, by the old one.
+        reason: why `high` is the largest and how to raise it, for whoever gives more.
     """
-    bounds = Bounds(low, high, above, below)
+    bounds = Bounds(low, high, above, below, reason)
     found = {"meaning": meaning, "bounds": bounds, "renamed": renamed or {}}
     return found | {"derived": derived, "stored": stored}
 
@@ -95,7 +109,7 @@ class Section:
             bounds = item.metadata.get("bounds", Bounds())
             for number in _leaves(value):
                 if isinstance(number, int | float) and not bounds.hold(number):
-                    raise ConfigError(f"{item.name} is {show(value)}: give {bounds}.")
+                    raise bounds.refuse(item.name, value, number)
             for ends in _ranges(item.type, value):
                 _check_range(item.name, ends)
         self._check()

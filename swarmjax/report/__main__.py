@@ -1,8 +1,8 @@
 """`python -m swarmjax.report run=DIR [out=DIR]`: what a run came to, as figures and one page.
 
-Writes `mix.png`, `success.png`, `grid.png` if the stages make a grid, and `report.html`, which
-holds them all. The run may be under way or have been killed: what it has not finished writing is
-left out. No JAX.
+Writes `mix.png`, `success.png`, `curves.png`, `grid.png` if the stages make a grid, and
+`report.html`, which holds them all. The run may be under way or have been killed: what it has not
+finished writing is left out. No JAX.
 """
 
 import shlex

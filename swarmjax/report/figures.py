@@ -28,6 +28,13 @@ _POINTS, _STRETCHES = 600, 200  # of a curve and of a band: about what the dots 
 _NAMED = 24  # stages named along a strip of colours; more would touch
 _SEED, _ALL, _LIMIT = "0.62", "#0b4f9e", "#c04000"
 _STEPS = "arena control steps of a seed"
+_CURVES = {
+    "return": "return per robot",
+    "contacts_per_robot": "contacts per robot",
+    "entropy": "entropy of the policy",
+    "policy_loss": "policy loss",
+    "value_loss": "value loss",
+}
 
 type Cell = tuple[int, int, tuple[float, float]]  # robots, obstacles, side
 
@@ -36,11 +43,12 @@ def draw(history: History) -> dict[str, bytes]:
     """Draws the figures of a run.
 
     Returns:
-      PNG files by name: `mix`, `success`, and `grid` if the stages make one. The same run gives
-      the same files: they do not hold Matplotlib's version.
+      PNG files by name: `mix`, `success`, `curves` if the run wrote them down, and `grid` if the
+      stages make one. The same run gives the same files: they do not hold Matplotlib's version.
     """
     files = {}
-    for name, make in (("mix", mix), ("success", success), ("grid", grid)):
+    makers = {"mix": mix, "success": success, "curves": curves, "grid": grid}
+    for name, make in makers.items():
         figure, content = make(history), io.BytesIO()
         if figure is not None:
             figure.savefig(content, format="png", dpi=_DOTS, metadata={"Software": None})
@@ -96,6 +104,36 @@ def success(history: History) -> Figure:
         panel.set_visible(False)
     _label_outer(figure, history)
     _explain_lines(figure, history)
+    return figure
+
+
+def curves(history: History) -> Figure | None:
+    """Draws how learning went, a panel for each number of an update: every seed, and their IQM.
+
+    None if the run has written none of them down.
+    """
+    if all(np.isnan(values).all() for values in history.curves.values()):
+        return None
+    figure = Figure(figsize=(8.6, 5.2), layout="constrained")
+    panels = list(figure.subplots(2, 3, sharex=True).flat)
+    for panel, (key, title) in zip(panels, _CURVES.items(), strict=False):
+        steps, seeds = _stretched(history.arena_steps, history.curves[key])
+        for seed in seeds:
+            panel.plot(steps, seed, color=_SEED, lw=0.7)
+        panel.plot(steps, report_rows.together(seeds), color=_ALL, lw=2.0)
+        panel.set_title(title, loc="left", fontsize=10, pad=3)
+        panel.grid(visible=True, alpha=0.25)
+        panel.tick_params(labelsize=9)
+    for panel in panels[len(_CURVES) :]:
+        panel.set_visible(False)
+    panels[2].tick_params(labelbottom=True)  # below it there is none
+    panels[0].set_xlim(0, history.arena_steps[-1])
+    panels[0].xaxis.set_major_locator(MaxNLocator(4))
+    panels[0].xaxis.set_major_formatter(EngFormatter(sep=""))
+    figure.supxlabel(_STEPS, fontsize=10)
+    figure.legend(
+        handles=_seed_lines(history), loc="outside upper right", ncols=2, fontsize=8, frameon=False
+    )
     return figure
 
 
@@ -159,6 +197,18 @@ def _stretches(steps: np.ndarray, shares: np.ndarray) -> tuple[np.ndarray, np.nd
     return steps[ends - 1], np.array(means)
 
 
+def _stretched(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Means of values [N, T] over stretches of updates, and the steps at which each ends.
+
+    What was not measured counts for nothing; a stretch in which nothing was is nan.
+    """
+    ends = _at(len(steps), _STRETCHES) + 1
+    starts = np.concatenate([[0], ends[:-1]])
+    there = np.add.reduceat(~np.isnan(values), starts, axis=1)
+    sums = np.add.reduceat(np.nan_to_num(values), starts, axis=1)
+    return steps[ends - 1], np.where(there, sums / np.maximum(there, 1), np.nan)
+
+
 def _name_colours(figure: Figure, axes: Axes, names: list[str]) -> None:
     """Names the bands along a strip of their colours, in their order."""
     count = len(names)
@@ -197,17 +247,23 @@ def _mark(panel: Axes, history: History, stage: int) -> None:
 
 def _explain_lines(figure: Figure, history: History) -> None:
     """Says above the panels what each kind of line is."""
-    seeds = len(history.seeds)
-    kinds = [Line2D([], [], color=_ALL, lw=2.0, label=f"interquartile mean of {seeds} seeds")]
-    if seeds == 1:
-        kinds = [Line2D([], [], color=_ALL, lw=2.0, label=f"seed {history.seeds[0]}")]
-    else:
-        kinds.append(Line2D([], [], color=_SEED, lw=0.7, label="each seed"))
+    kinds = _seed_lines(history)
     if not report_rows.trained_lately(history)[~np.isnan(history.success)].all():
         kinds.append(Line2D([], [], color=_ALL, ls=":", label="no longer trained on"))
     if _promoting(history) is not None:
         kinds.append(Line2D([], [], color=_LIMIT, lw=0.8, ls="--", label="promotes"))
     figure.legend(handles=kinds, loc="outside upper right", ncols=4, fontsize=8, frameon=False)
+
+
+def _seed_lines(history: History) -> list[Line2D]:
+    """Says which line is a seed's and which that of all."""
+    seeds = len(history.seeds)
+    if seeds == 1:
+        return [Line2D([], [], color=_ALL, lw=2.0, label=f"seed {history.seeds[0]}")]
+    return [
+        Line2D([], [], color=_ALL, lw=2.0, label=f"interquartile mean of {seeds} seeds"),
+        Line2D([], [], color=_SEED, lw=0.7, label="each seed"),
+    ]
 
 
 def _promoting(history: History) -> float | None:

@@ -37,6 +37,9 @@ _CAPTIONS = {
     "success": "Success of each stage: the share of a whole cohort, all episodes that began within "
     "one step limit. Above each panel the last one; the thick line is drawn where every seed has "
     "one.",
+    "curves": "How learning went, at each update. Return and contacts are sums over an episode and "
+    "means over the robots of the episodes that ended in the update; short episodes end first, so "
+    "the first ones say little. Entropy is that of the policy's actions, in nats.",
     "grid": "Success of each cell at last, in percent; grey: not a stage of this run.",
 }
 
@@ -101,7 +104,7 @@ def _last_stage(history: History) -> str:
     mean, measured = report_rows.among(values[:, None])
     name, of = history.names[-1], len(history.seeds)
     if not measured[0]:
-        return f"{name}: not measured yet"
+        return f"{name}: {_unmeasured(history)}"
     text = f"{name}: {report_rows.measure(history)} {_percent(mean[0])}"
     if of == 1:
         return text
@@ -109,6 +112,18 @@ def _last_stage(history: History) -> str:
     return (
         f"{text} (interquartile mean of {measured[0]} of {of} seeds, {_percent(low)} to "
         f"{_percent(high)})"
+    )
+
+
+def _unmeasured(history: History) -> str:
+    """Says why the last stage has no figure."""
+    trained = int((history.mix[..., -1] > 0.0).sum(axis=1).max())
+    if not trained:
+        return "not measured, since no arena has been on it"
+    takes = words.count(report_rows.verdict_updates(history), "update")
+    return (
+        f"not measured, since no whole cohort has ended on it: that takes {takes}, and arenas were "
+        f"on it for {trained:,}"
     )
 
 

@@ -33,6 +33,8 @@ BY_STAGE = (
     "episodes_by_stage",
 )
 _LISTS = ("mix", "weights", *BY_STAGE)
+# Of an update as a whole; the first two over the episodes that ended in it.
+CURVES = ("return", "contacts_per_robot", "policy_loss", "value_loss", "entropy")
 MANY = 9  # stages from which on each is drawn small
 SUMMARY = "summary.json"
 _NUMBERS = ("seed", "update", "arena_steps")
@@ -52,6 +54,7 @@ class History:
       mix: [N, T, S] share of the arenas that were on the stage, 0 to 1.
       weights: [N, T, S] share of the arenas that the curriculum gave the stage, 0 to 1.
       by_stage: [N, T, S] for each name of `BY_STAGE`.
+      curves: [N, T] for each name of `CURVES`.
       seconds: of training by the last update; None if they were not written down.
       decisions: of the curriculum, as they were written down, by seed and update.
       summary: of the run, as it was written down; empty before its end.
@@ -64,6 +67,7 @@ class History:
     mix: np.ndarray
     weights: np.ndarray
     by_stage: dict[str, np.ndarray]
+    curves: dict[str, np.ndarray]
     seconds: float | None
     decisions: list[Row]
     summary: Row
@@ -111,11 +115,16 @@ def trained_lately(history: History) -> np.ndarray:
     It is until two cohorts (see `curriculum`) after the stage last had a share of the arenas: so
     long may a verdict still come in. After that it is what the stage was left with.
     """
-    task, algo = history.config.task, history.config.algo
-    lag = _COHORTS_OF_A_VERDICT * math.ceil(task.step_limit / algo.rollout_length)
+    lag = verdict_updates(history)
     updates = history.updates[None, :, None]
     given = np.where(history.weights > 0.0, updates, -np.inf)
     return updates - np.maximum.accumulate(given, axis=1) <= lag
+
+
+def verdict_updates(history: History) -> int:
+    """Updates from a stage's first share of the arenas to its first verdict."""
+    task, algo = history.config.task, history.config.algo
+    return _COHORTS_OF_A_VERDICT * math.ceil(task.step_limit / algo.rollout_length)
 
 
 def together(values: np.ndarray) -> np.ndarray:
@@ -160,6 +169,7 @@ def _history(
     seeds = sorted(by_seed)
     rows = [[by_seed[seed][update] for update in updates] for seed in seeds]
     lists = np.array([[row["lists"] for row in of_seed] for of_seed in rows])
+    curves = np.array([[row["curves"] for row in of_seed] for of_seed in rows])
     columns = dict(zip(_LISTS, np.moveaxis(lists, 2, 0), strict=True))
     mix = np.nan_to_num(columns["mix"])
     return History(
@@ -170,6 +180,7 @@ def _history(
         mix=mix / np.maximum(mix.sum(axis=-1, keepdims=True), 1.0),
         weights=np.nan_to_num(columns["weights"]),
         by_stage={key: columns[key] for key in BY_STAGE},
+        curves=dict(zip(CURVES, np.moveaxis(curves, 2, 0), strict=True)),
         seconds=rows[0][-1].get("train_s"),
         decisions=rest[0],
         summary=rest[1],
@@ -177,17 +188,22 @@ def _history(
 
 
 def _checked(raw: Row, stages: int, where: str) -> Row:
-    """Takes out of a row what a report needs, its lists as one array [.., S] of float32."""
+    """Takes out of a row what a report needs.
+
+    Lists become one array [.., S] of float32; the curves, which may be missing, one of nan or
+    numbers.
+    """
     for key in (*_NUMBERS, *_LISTS):
         if key not in raw:
             raise ConfigError(
                 f"{where} has no {key}: the run is of a version that did not write it."
             )
     check_whole(raw, _NUMBERS, where)
-    check_numbers(raw, ("train_s",), where)
+    check_numbers(raw, ("train_s", *CURVES), where)
     lists = [per_stage(raw[key], stages, f"{where} has {key}") for key in _LISTS]
     return {key: raw[key] for key in (*_NUMBERS, "train_s") if key in raw} | {
-        "lists": np.array(lists)
+        "lists": np.array(lists),
+        "curves": np.array([raw.get(key) for key in CURVES], np.float32),
     }
 
 

@@ -9,6 +9,11 @@ from swarmjax.config import ConfigError, Section, about, show
 # m; a level leaves a passage of 0.10 m (task/stage_config.py), through which a robot of this radius
 # fits with a tenth of it to spare.
 LARGEST_HULL = 0.045
+_HULL_REASON = (
+    "levels leave passages of 0.10 m, and a larger robot would not fit through them. To train "
+    "larger ones, raise PASSAGE in swarmjax/task/stage_config.py and LARGEST_HULL in "
+    "swarmjax/sim/config.py together"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +26,7 @@ class RobotConfig(Section):
     )
     hull_radius: float = field(
         default=epuck.HULL_RADIUS,
-        metadata=about("radius of the hull, m", above=0.0, high=LARGEST_HULL),
+        metadata=about("radius of the hull, m", above=0.0, high=LARGEST_HULL, reason=_HULL_REASON),
     )
     mass: float = field(
         default=epuck.MASS,

@@ -29,7 +29,14 @@ class ProgramConfig(Section):
     sim: SimConfig = field(default_factory=SimConfig)
     seed: int = field(default=0, metadata=about("random seed", 0, MAX_COUNT))
     seeds: int = field(
-        default=1, metadata=about("runs trained at once, of seed, seed + 1, ...", 1, 4096)
+        default=1,
+        metadata=about(
+            "runs trained at once, of seed, seed + 1, ...",
+            1,
+            4096,
+            reason="a call of the compiled program reports 4096 rows, one a seed. Train more in a "
+            "second run, with seed=4096",
+        ),
     )
     seeds_by: Literal["vmap", "map", "cores"] = field(
         default="vmap",

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from dataclasses import dataclass, field
 from functools import partial
 
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sentences import refusal
 
-from swarmjax.config import ConfigError, build, files, to_dict
+from swarmjax.config import ConfigError, Section, about, build, files, to_dict
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.export.config import ExportConfig
 from swarmjax.report.config import ReportConfig
@@ -164,3 +165,25 @@ def test_sections_made_by_hand_are_held_to_their_bounds():
     assert refusal(lambda: RewardConfig(step_penalty=math.nan)) == (
         "step_penalty is nan: give any finite number."
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Limited(Section):
+    number: int = field(default=1, metadata=about("a number", 1, 5, reason="there are five"))
+
+
+def test_a_bound_gives_its_reason_to_who_exceeds_it():
+    assert refusal(lambda: _Limited(number=6)) == "number is 6: give 1 to 5; there are five."
+
+
+def test_a_bound_keeps_its_reason_from_who_gives_too_little():
+    assert refusal(lambda: _Limited(number=0)) == "number is 0: give 1 to 5."
+
+
+def test_the_largest_hull_has_a_reason():
+    sentence = refusal(load_train, ["robot.hull_radius=0.05"])
+    assert sentence.startswith(
+        "robot.hull_radius is 0.05: give more than 0, at most 0.045; levels leave passages of "
+        "0.10 m, and a larger robot would not fit through them."
+    )
+    assert "raise PASSAGE in" in sentence

@@ -59,7 +59,22 @@ def file(tmp_path_factory: pytest.TempPathFactory, runs: list[list[Recording]]) 
     return path
 
 
-def _open(browser: Any, file: Path, width: int = 1200, height: int = 900) -> None:
+def _open(
+    browser: Any,
+    file: Path,
+    width: int = 1200,
+    height: int = 900,
+    *,
+    still: bool = True,
+    dark: bool = False,
+) -> None:
+    """Opens the page, for a person who asks for less motion unless it is to play."""
+    wishes = {
+        "prefers-reduced-motion": "reduce" if still else "no-preference",
+        "prefers-color-scheme": "dark" if dark else "light",
+    }
+    features = [{"name": name, "value": value} for name, value in wishes.items()]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
     size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     for log in ("performance", "browser"):
@@ -96,6 +111,19 @@ def test_it_opens_from_a_file_and_asks_for_nothing_else(browser, file):
     assert asked - {"data:,"} == {file.as_uri()}
     assert _js(browser, "performance.getEntriesByType('resource').map((each) => each.name)") == []
     assert browser.get_log("browser") == []  # no errors, and nothing that the page forbids itself
+
+
+def test_it_plays_at_once(browser, file):
+    _open(browser, file, still=False)
+    assert _js(browser, "replay.playing")
+    assert _js(browser, "document.getElementById('play').textContent") == "Pause"
+    WebDriverWait(browser, 20).until(lambda _: _js(browser, "replay.frame") > 0)
+
+
+def test_it_waits_where_less_motion_is_asked_for(browser, file):
+    _open(browser, file)
+    assert not _js(browser, "replay.playing")
+    assert _js(browser, "replay.frame") == 0
 
 
 def test_positions_are_those_that_were_recorded(browser, file, runs):
@@ -278,9 +306,7 @@ def test_a_hostile_name_is_shown_as_it_is(browser, file):
 
 @pytest.mark.parametrize(("width", "dark"), [(400, False), (1600, False), (900, True)])
 def test_it_fits_and_is_drawn(browser, file, width, dark):
-    scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
-    _open(browser, file, width)
+    _open(browser, file, width, dark=dark)
     _js(browser, "replay.seek(60)")
     assert _js(browser, "document.documentElement.scrollWidth") <= width
     for number in range(2):

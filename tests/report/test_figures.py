@@ -171,10 +171,44 @@ def test_stages_that_share_a_cell_make_no_grid() -> None:
     assert report_figures.cells_of((*stages, replace(stages[0], name="again"))) is None
 
 
+def _panel(history: History, title: str) -> Axes:
+    figure = report_figures.curves(history)
+    assert figure is not None
+    (found,) = (each for each in figure.axes if each.get_title(loc="left") == title)
+    return found
+
+
+def test_a_curve_has_every_seed_and_their_interquartile_mean(tmp_path: Path) -> None:
+    values = [1.0, 2.0, 4.0, 9.0]
+    rows = [row(0, seed, value_loss=value) for seed, value in enumerate(values)]
+    panel = _panel(_history(tmp_path, rows), "value loss")
+    assert [line[0].tolist() for line in _lines(panel, THIN, "-")] == [[64, v] for v in values]
+    [bold] = _lines(panel, BOLD, "-")
+    assert bold.tolist() == [[64, 3.0]]  # the mean of 2 and 4
+
+
+def test_a_curve_leaves_out_what_was_not_measured(tmp_path: Path) -> None:
+    rows = [row(i, **{"return": value}) for i, value in enumerate([None, 0.5, None, 0.25])]
+    [bold] = _lines(_panel(_history(tmp_path, rows), "return per robot"), BOLD, "-")
+    assert bold.tolist() == [[128, 0.5], [256, 0.25]]
+
+
+def test_a_long_curve_is_averaged_and_nothing_is_left_out(tmp_path: Path) -> None:
+    rows = [row(i, entropy=10.0 if i == 777 else 0.0) for i in range(2000)]
+    [bold] = _lines(_panel(_history(tmp_path, rows), "entropy of the policy"), BOLD, "-")
+    assert len(bold) == 200
+    assert bold[:, 1].max() == pytest.approx(1.0, rel=0.2)  # 10 in a stretch of about ten
+
+
+def test_a_run_without_these_numbers_has_no_curves(tmp_path: Path) -> None:
+    assert report_figures.curves(_history(tmp_path, [row(0)])) is None
+
+
 def test_files_are_png_and_the_same_again(tmp_path: Path) -> None:
-    history = _history(tmp_path, [_wide_row([0.1, 0.2, None, 0.4, 0.5])], _stages(CELLS))
+    wide = _wide_row([0.1, 0.2, None, 0.4, 0.5], entropy=1.0)
+    history = _history(tmp_path, [wide], _stages(CELLS))
     files = report_figures.draw(history)
-    assert list(files) == ["mix", "success", "grid"]
+    assert list(files) == ["mix", "success", "curves", "grid"]
     assert all(content.startswith(b"\x89PNG\r\n") for content in files.values())
     assert not any(b"Matplotlib" in content for content in files.values())
     assert report_figures.draw(history) == files

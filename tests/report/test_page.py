@@ -78,7 +78,7 @@ def test_the_summary_says_where_the_run_stands(tmp_path: Path) -> None:
 def test_a_run_that_measured_nothing_has_a_page(tmp_path: Path) -> None:
     history = replace(_history(tmp_path, [row(0)]), seconds=None)
     page = _page(history)
-    assert page.fact("last stage") == "trio: not measured yet"
+    assert page.fact("last stage") == "trio: not measured, since no arena has been on it"
     assert page.fact("all stages") == "0 of 2 at 90.0 % or more"
     assert page.fact("decisions") == "none"
     assert page.fact("Decisions of the curriculum") == "None."
@@ -169,3 +169,11 @@ def test_the_page_needs_nothing_else(tmp_path: Path) -> None:
     found = [base64.b64decode((source or "").removeprefix(start)) for source in sources]
     assert found == list(FIGURES.values())
     assert not re.search(r"https?:|url\(|@import", text)
+
+
+def test_a_last_stage_without_a_figure_says_what_is_missing(tmp_path: Path) -> None:
+    page = _page(_history(tmp_path, [row(0), row(1, mix=[4, 4]), row(2, mix=[0, 8])]))
+    assert page.fact("last stage") == (
+        "trio: not measured, since no whole cohort has ended on it: that takes 4 updates, and "
+        "arenas were on it for 2"
+    )

@@ -36,6 +36,12 @@ def test_rows_become_arrays_by_seed_and_update(tmp_path: Path) -> None:
     np.testing.assert_array_equal(history.by_stage["contacts_by_stage"][1, 1], [2.0, NAN])
 
 
+def test_numbers_of_an_update_may_be_null_or_missing(tmp_path: Path) -> None:
+    rows = [row(0, value_loss=0.5), row(1, value_loss=None), row(2)]
+    history = report_rows.read(write(tmp_path, rows))
+    np.testing.assert_array_equal(history.curves["value_loss"], [[0.5, NAN, NAN]])
+
+
 def test_success_is_what_the_curriculum_decides_by(tmp_path: Path) -> None:
     rows = [row(0, success_by_stage=[0.9, None], complete_by_stage=[0.7, None])]
     by_all = replace(CONFIG, curriculum=CurriculumConfig(success="all"))

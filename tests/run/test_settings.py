@@ -178,7 +178,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["run.dir="], "run.dir is '': give text or null."),
         (["seed=-1"], "seed is -1: give 0 to 2147483647."),
         (["robot.max_speed=0"], "robot.max_speed is 0: give more than 0."),
-        (["robot.hull_radius=0.08"], "robot.hull_radius is 0.08: give more than 0, at most "
+        (["robot.hull_radius=-0.08"], "robot.hull_radius is -0.08: give more than 0, at most "
          "0.045."),
         (["curriculum.budget_share=1"], "curriculum.budget_share is 1: give more than 0, less "
          "than 1."),
@@ -525,7 +525,7 @@ def test_help_lists_every_key_once():
             value = value[0] if key == "stage" else value
             if value and isinstance(value, dict):
                 yield from leaves(value, f"{where}{key}.")
-            elif f"{where}{key}" not in ("stage_name", "realism.name", "pieces"):
+            elif f"{where}{key}" not in ("stage_name", "realism.name", "algo.name", "pieces"):
                 yield f"{where}{key}"
 
     assert listed == list(leaves(to_dict(load_train([]))))

@@ -2,6 +2,7 @@
 
 const SPEEDS = [0.25, 0.5, 1, 2, 4, 8, 16];
 const TRAILS = [["off", 0], ["10 s", 10], ["whole", Infinity]]; // s
+const LONGEST = 1; // s between two pictures that count: a page in a hidden tab waits
 const REFRESH = 100; // ms between two readings of the numbers beside the pictures
 
 const page = (id) => document.getElementById(id);
@@ -160,7 +161,7 @@ function pause() {
 
 function tick(now) {
   if (!state.playing) return;
-  const passed = Math.max(0, now - state.clock) / 1000;
+  const passed = Math.min(Math.max(0, now - state.clock) / 1000, LONGEST);
   state.clock = now;
   state.moment += passed * Number(page("speed").value);
   const frame = Math.floor(state.moment / state.header.step);
@@ -341,6 +342,7 @@ async function begin() {
   openEpisode(0);
   listen();
   publish();
+  if (!matchMedia("(prefers-reduced-motion: reduce)").matches) play();
 }
 
 begin().catch((error) => {
