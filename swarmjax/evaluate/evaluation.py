@@ -43,14 +43,36 @@ def evaluate(settings: EvaluateConfig, progress: Progress | None = None) -> Eval
         PolicyError: If a policy is unsound, or does not fit the levels.
         ConfigError: If a file is missing, a suite unsound, or the physics breaks down.
     """
-    sides = [evaluate_trials.read_policies(each, settings.extensions) for each in _sides(settings)]
+    files = _sides(settings)
+    sides = [evaluate_trials.read_policies(each, settings.extensions) for each in files]
+    return _judge(settings, sides, progress or Progress(disable=True))
+
+
+def judge_entrants(settings: EvaluateConfig, entrants: list[Entrant]) -> Evaluation:
+    """Judges policies that have been read already, of one recipe.
+
+    Args:
+        settings: Of the evaluation; its `policy` is not read.
+        entrants: The policies.
+
+    Returns:
+        What it found.
+
+    Raises:
+        PolicyError: If a policy does not fit the levels.
+        ConfigError: If a suite is unsound, or the physics breaks down.
+    """
+    return _judge(settings, [entrants], Progress(disable=True))
+
+
+def _judge(settings: EvaluateConfig, sides: list[list[Entrant]], progress: Progress) -> Evaluation:
+    """Judges the policies of one side, or of the two that are compared."""
     entrants = [each for side in sides for each in side]
     for stage in cells.stages(settings):  # before levels are drawn, which takes a while
         for path, trained in entrants:
             judge.check_policy(settings, stage, path, trained)
     suite = cells.load(settings)
     total = len(entrants) * sum(len(cell.episodes) for cell in suite.cells)
-    progress = progress or Progress(disable=True)
     bar = progress.add_task("episodes", total=total)
     report = partial(progress.advance, bar)
     trials = evaluate_trials.run(settings, suite.cells, entrants, report)

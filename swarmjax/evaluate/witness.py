@@ -12,6 +12,7 @@ from swarmjax import policy_file
 from swarmjax.config import ConfigError, Section, build, files, inherit
 from swarmjax.config.section import modernise
 from swarmjax.evaluate.evaluation import list_files
+from swarmjax.evaluate.trials import Entrant
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import stage_files
@@ -74,12 +75,19 @@ def _known(cls: type[Section], mapping: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in mapping.items() if key in names}
 
 
-def load[C: Section](cls: type[C], typed: Sequence[str]) -> tuple[C, str]:
+def load[C: Section](
+    cls: type[C],
+    typed: Sequence[str],
+    entrants: Sequence[Entrant] | None = None,
+    stage: dict[str, Any] | None = None,
+) -> tuple[C, str]:
     """Makes the settings of a command that runs policies: as they were trained, unless it is told.
 
     Args:
         cls: The command's dataclass, with `policy` and perhaps `compare`.
         typed: `key=value` words.
+        entrants: The policies, if they have been read already; None: those that the words name.
+        stage: Plain data of the stage, where no word names one; None: the policies' last one.
 
     Returns:
         The settings, and one line that says what was taken from the policies.
@@ -88,19 +96,25 @@ def load[C: Section](cls: type[C], typed: Sequence[str]) -> tuple[C, str]:
         ConfigError: A word is unsound, or policies were trained differently and no word decides.
         PolicyError: A policy is unsound.
     """
-    given = files.values(files.split_words(cls, typed))
-    paths = [
-        path
-        for key in ("policy", "compare")
-        if isinstance(given.get(key), str) and given[key]
-        for path in list_files(key, given[key])
-    ]
-    found = [trained(policy_file.read_meta(path), path) for path in paths]
+    if entrants is None:
+        metas = {path: policy_file.read_meta(path) for path in _paths(cls, typed)}
+    else:
+        metas = {each.path: each.policy.meta for each in entrants}
+        typed = [f"policy={','.join(metas)}", *typed]
+    found = [trained(meta, path) for path, meta in metas.items()]
     words = [_words(cls, each, typed) for each in found]
-    _check_alike(cls, paths, words, typed)
-    stage = found[0].stages[-1] if found and found[0].stages else None
+    _check_alike(cls, list(metas), words, typed)
+    if stage is None and found and found[0].stages:
+        stage = found[0].stages[-1]
     settings = stage_files.load_levels(cls, [*(words[0] if words else ()), *typed], stage)
     return settings, _say(settings, typed)
+
+
+def _paths(cls: type[Section], typed: Sequence[str]) -> list[str]:
+    """Lists the policy files that the words name."""
+    given = files.values(files.split_words(cls, typed))
+    named = [(key, given[key]) for key in ("policy", "compare") if isinstance(given.get(key), str)]
+    return [path for key, text in named if text for path in list_files(key, text)]
 
 
 def _words(cls: type[Section], found: Trained, typed: Sequence[str]) -> list[str]:

@@ -3,3 +3,7 @@
 
 class CheckpointError(ValueError):
     """A checkpoint that is missing, damaged or of another run, in one sentence."""
+
+
+class TrainingError(RuntimeError):
+    """A run that cannot go on, in one sentence."""

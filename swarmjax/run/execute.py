@@ -9,10 +9,11 @@ import jax
 from swarmjax import command, words
 from swarmjax.run import compile_cache, memory
 from swarmjax.run.display import Display, measured, spread, working
+from swarmjax.run.errors import TrainingError
 from swarmjax.run.lifecycle import carry_out, dry_run, find_run
 from swarmjax.run.policy_export import POLICY, seed_path
 from swarmjax.run.settings import TrainConfig
-from swarmjax.run.trainer import Stop, Tally, TrainingError, measure
+from swarmjax.run.trainer import Stop, Tally, measure
 
 FAILED = 1
 

@@ -23,6 +23,7 @@ from swarmjax.curriculum.log import log
 from swarmjax.run import memory, recorder
 from swarmjax.run.checkpoint import Checkpoints
 from swarmjax.run.display import Display, summarize
+from swarmjax.run.errors import TrainingError
 from swarmjax.run.recorder import Recorder, Row
 from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import physics
@@ -36,10 +37,6 @@ Built = Program[TrainConfig]  # the program of a run
 
 CALL_SECONDS = 1.0  # what a call should take when run.chunk is auto: the display's pace
 GROWTH = 4  # a call is at most this many times as long as the one before
-
-
-class TrainingError(RuntimeError):
-    """A run that cannot go on, in one sentence."""
 
 
 @dataclass(frozen=True)
@@ -361,6 +358,7 @@ def _report(
         if "to" in entry:  # the rest is many, and stands in the log
             display.say(_sentence(settings, entry))
     pace = tally.seconds / (tally.update - tally.first)
+    display.hear(rows)
     display.show(summarize(rows, names), speeds, pace * (settings.updates - tally.update))
 
 

@@ -1,0 +1,284 @@
+"""swarmjax from Python: environments, training, judging and policies.
+
+These are the functions of `swarmjax` itself: `swarmjax.make_env` and so on. Settings are those of
+the commands, by the same names, and what a command refuses raises `SwarmjaxError` here, with the
+same sentence.
+"""
+
+import functools
+import json
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from swarmjax import extension, policy_file
+from swarmjax.config import ConfigError, Section, inherit, to_dict
+from swarmjax.policy import Policy, PolicyError
+from swarmjax.run.errors import CheckpointError, TrainingError
+
+if TYPE_CHECKING:
+    from swarmjax.environment import Swarm
+    from swarmjax.run.settings import TrainConfig
+
+Row = dict[str, Any]
+Settings = Mapping[str, Any] | Sequence[str]
+
+
+class SwarmjaxError(ValueError):
+    """A mistake in what was given, or a run that broke, in one sentence."""
+
+
+class TrainResult(NamedTuple):
+    """What came of a training run.
+
+    Attributes:
+        policy: of the first seed.
+        policies: of all seeds.
+        metrics: a row an update and seed, as `metrics.jsonl` holds them.
+        run: the run directory.
+    """
+
+    policy: Policy
+    policies: list[Policy]
+    metrics: list[Row]
+    run: Path
+
+
+def _one_error[**P, R](function: Callable[P, R]) -> Callable[P, R]:
+    """Raises the errors of the package as one class."""
+
+    @functools.wraps(function)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return function(*args, **kwargs)
+        except (ConfigError, PolicyError, CheckpointError, TrainingError) as error:
+            raise SwarmjaxError(str(error)) from None
+
+    return wrapped
+
+
+@_one_error
+def make_env(
+    stage: Any = "s6",
+    robot: Any = None,
+    task: Any = None,
+    realism: Any = None,
+    sim: Any = None,
+    *,
+    arenas: int = 64,
+    extensions: Any = None,
+) -> "Swarm":
+    """Builds many arenas that are stepped together, by pure functions.
+
+        env = swarmjax.make_env("s6", arenas=64)
+        state = jax.jit(env.reset)(jax.random.key(0))
+        state, step = jax.jit(env.step)(state, action)  # action [64, 5, 2], -1..1
+
+    Act on `state.observation` [A, R, O]; arenas start another episode by themselves.
+
+    Args:
+        stage: a name of `configs/stage/`, the path of a .yaml file, a `StageConfig`, or several of
+            these; arena i plays stage i modulo their number.
+        robot: `planar`, `wheeled` or another name of `configs/robot/`, or settings by name, as in
+            `{"hull_radius": 0.04}`.
+        task: settings by name, as in `{"step_limit": 300, "reward": {"contact": -0.1}}`.
+        realism: `ideal`, `webots`, `real`, or settings by name.
+        sim: settings by name, as in `{"solver": "mjx"}`.
+        arenas: how many are stepped together, A.
+        extensions: pieces of your own: a file, a module, or a list of them.
+
+    Returns:
+        The environment: `reset(key)`, `step(state, action)`, `observation_space`, `action_space`.
+
+    Raises:
+        SwarmjaxError: something given is unsound.
+    """
+    from swarmjax import environment
+
+    given = {"robot": robot, "task": task, "realism": realism, "sim": sim, "extensions": extensions}
+    named = {key: value for key, value in given.items() if value is not None}
+    config = _train_config({"stage": stage, **named, "arenas": arenas, **_NOT_LEARNING})
+    most = {key: max(getattr(each, key) for each in config.stage) for key in _ROOM}
+    told = _flat(named)
+    left = {f"max_{key}": value for key, value in most.items() if f"sim.max_{key}" not in told}
+    return environment.load(replace(config, sim=replace(config.sim, **left)))
+
+
+_ROOM = ("robots", "obstacles")
+# Settings of the learner, which an environment does not read, that hold for any number of arenas.
+_NOT_LEARNING = {"budget": 2**20, "algo.num_minibatches": 1, "algo.rollout_length": 1}
+
+
+@_one_error
+def train_policy(
+    settings: "Settings | TrainConfig" = (),
+    *,
+    on_update: Callable[[Row], object] | None = None,
+    extensions: Any = None,
+) -> TrainResult:
+    """Trains a swarm, as `python -m swarmjax.train` does, and writes a run directory.
+
+        result = swarmjax.train_policy({"stage": "s3", "arenas": 64, "budget": 500_000})
+
+    Args:
+        settings: keys of the command and their values, as `{"algo.discount": 0.995}` or
+            `["algo.discount=0.995"]`; `stage` may also be a `StageConfig` or a list of them.
+        on_update: is called with each row of `metrics.jsonl`; the run saves and stops when it
+            returns True. So it does at Ctrl-C.
+        extensions: pieces of your own: a file, a module, or a list of them.
+
+    Returns:
+        The policies, the metrics and the run directory.
+
+    Raises:
+        SwarmjaxError: a setting is unsound, or the run broke.
+    """
+    from swarmjax.run import quiet
+    from swarmjax.run.settings import TrainConfig
+
+    if isinstance(settings, TrainConfig):
+        config = settings
+    else:
+        more = {} if extensions is None else {"extensions": extensions}
+        config = _train_config({**_mapping(settings), **more})
+    run, files = quiet.train(config, on_update or (lambda row: None), _signals)
+    policies = [policy_file.read(file, config.extensions) for file in files]
+    lines = (run / "metrics.jsonl").read_text().splitlines()
+    return TrainResult(policies[0], policies, [json.loads(line) for line in lines], run)
+
+
+@_one_error
+def evaluate_policy(
+    policy: Any,
+    suite: str | None = None,
+    stage: Any = None,
+    *,
+    extensions: Any = None,
+    workers: int = 1,
+    **settings: Any,
+) -> dict[str, Any]:
+    """Judges a policy in MuJoCo's C engine, as `python -m swarmjax.evaluate` does.
+
+        found = swarmjax.evaluate_policy(result.policy, stage="s6", episodes=100)
+        found["cells"][0]["measures"]["targets_reached"]["mean"]
+
+    Robot, task and realism are those that the policy was trained with, on the wheeled body.
+
+    Args:
+        policy: a `Policy`, the path of a policy file, or several of one recipe.
+        suite: a name of `configs/suites/`, or a file, instead of a stage.
+        stage: a name, a path or a `StageConfig`; None: the last one it was trained on.
+        extensions: pieces that the policy needs: a file, a module, or a list of them.
+        workers: processes. More than one imports the calling script again, which then needs
+            `if __name__ == "__main__":`.
+        settings: further keys of the command, as `episodes=100`, `realism="real"`.
+
+    Returns:
+        What `result.json` holds (docs/interface.md).
+
+    Raises:
+        SwarmjaxError: something given is unsound, or does not fit the policy.
+    """
+    from swarmjax.evaluate import evaluation, witness
+    from swarmjax.evaluate.config import EvaluateConfig
+    from swarmjax.evaluate.trials import Entrant
+
+    word = extension.hand_over(extensions)
+    several = [policy] if _is_one(policy) else list(policy)
+    entrants = [
+        Entrant(each.digest, each)
+        if isinstance(each, Policy)
+        else Entrant(str(each), policy_file.read(each, word))
+        for each in several
+    ]
+    given: dict[str, Any] = {"workers": workers, "extensions": word, "suite": suite, **settings}
+    stages = None if stage is None or isinstance(stage, str | Path) else _stages(stage)
+    if stages is None and stage is not None:
+        given["stage"] = str(stage)
+    words = _words({key: value for key, value in given.items() if value is not None})
+    config, _ = witness.load(EvaluateConfig, words, entrants, stages[0] if stages else None)
+    return evaluation.judge_entrants(config, entrants).result
+
+
+@_one_error
+def load_policy(path: str | Path, extensions: Any = None) -> Policy:
+    """Reads a policy file and checks all of it; `swarmjax.policy.act` runs it.
+
+    Args:
+        path: of the file.
+        extensions: a file, module or list with the network that the policy needs, if it needs one.
+
+    Raises:
+        SwarmjaxError: the file is missing, damaged or inconsistent.
+    """
+    return policy_file.read(path, extension.hand_over(extensions))
+
+
+def _is_one(policy: Any) -> bool:
+    """Tells a policy or its path from a list of them; a policy is a tuple too."""
+    return isinstance(policy, str | Path | Policy)
+
+
+def _train_config(given: Mapping[str, Any]) -> "TrainConfig":
+    """Makes a config of settings by name."""
+    from swarmjax.run.settings import load_train
+
+    rest = dict(given)
+    stage = rest.get("stage")
+    stages = None if stage is None or isinstance(stage, str | Path) else _stages(stage)
+    if stages is not None:
+        del rest["stage"]
+    rest["extensions"] = extension.hand_over(rest.get("extensions"))
+    return load_train(_words(rest), stages=stages)
+
+
+def _stages(given: Any) -> list[dict[str, Any]]:
+    """Makes plain data of stages: of settings, of mappings, or of names in a list."""
+    from swarmjax.task import stage_files
+
+    every = [given] if isinstance(given, Section | Mapping) else list(given)
+    found: list[dict[str, Any]] = []
+    for each in every:
+        if isinstance(each, Section):
+            found.append(to_dict(each))
+        elif isinstance(each, Mapping):
+            found.append(dict(each))
+        else:
+            found.append(stage_files.read_stage(str(each)))
+    return found
+
+
+def _mapping(settings: Settings) -> dict[str, Any]:
+    """Makes a mapping of `key=value` words too."""
+    if isinstance(settings, Mapping):
+        return dict(settings)
+    if isinstance(settings, str):
+        raise ConfigError(f"settings is {settings!r}: give a list of words, as in ['stage=s3'].")
+    return {key: value for key, _, value in (word.partition("=") for word in settings)}
+
+
+def _words(given: Mapping[str, Any]) -> list[str]:
+    """Writes settings as words of a command line."""
+    return [f"{key}={value}" for key, value in _flat(given).items()]
+
+
+def _flat(given: Mapping[str, Any], where: str = "") -> dict[str, str]:
+    """Flattens settings to values by dotted keys, written as they would be typed."""
+    found: dict[str, str] = {}
+    for key, value in given.items():
+        value = to_dict(value) if isinstance(value, Section) else value
+        if isinstance(value, Mapping):
+            found |= _flat(value, f"{where}{key}.")
+        elif isinstance(value, str | Path):  # names, paths and what was typed
+            found[f"{where}{key}"] = str(value)
+        else:
+            found[f"{where}{key}"] = inherit.write(value)
+    return found
+
+
+def _signals(stop: Any) -> AbstractContextManager[Any]:
+    """Listens to Ctrl-C where that is possible: in the main thread."""
+    return stop if threading.current_thread() is threading.main_thread() else nullcontext()

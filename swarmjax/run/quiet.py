@@ -1,0 +1,65 @@
+"""A training run without a terminal, for Python programs that call it."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any
+
+from swarmjax.run import compile_cache, memory
+from swarmjax.run.display import Display, Row
+from swarmjax.run.lifecycle import carry_out, find_run
+from swarmjax.run.policy_export import POLICY, seed_path
+from swarmjax.run.settings import TrainConfig
+from swarmjax.run.trainer import Stop
+
+
+class _Listener(Display):
+    """Prints nothing, and hands on the rows of each call."""
+
+    def __init__(
+        self, updates: int, on_update: Callable[[dict[str, Any]], object], stop: Stop
+    ) -> None:
+        super().__init__(updates)
+        self._on_update, self._stop = on_update, stop
+
+    def say(self, sentence: str) -> None:
+        """Prints nothing."""
+
+    @contextmanager
+    def working(self, what: str) -> Iterator[None]:
+        """Shows nothing."""
+        yield
+
+    def hear(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Hands each row on, and asks the run to stop where the answer is True."""
+        for row in rows:
+            if self._on_update(dict(row)) is True:
+                self._stop.signalled = True
+
+    def show(self, summary: Row, speeds: Row, seconds_left: float) -> None:
+        """Shows nothing."""
+
+
+def train(
+    settings: TrainConfig,
+    on_update: Callable[[dict[str, Any]], object],
+    listen: Callable[[Stop], AbstractContextManager[object]],
+) -> tuple[Path, list[Path]]:
+    """Trains as a config says.
+
+    Args:
+      settings: the config.
+      on_update: is called with each row of `metrics.jsonl`; True stops the run.
+      listen: what to be in while it trains, such as `Stop` itself, which notices signals.
+
+    Returns:
+      The run directory, and the policy files of its seeds.
+
+    Raises:
+      ConfigError, CheckpointError, TrainingError: as `lifecycle.carry_out`.
+    """
+    with compile_cache.use(settings.run.compile_cache), memory.refusal(settings):
+        run, stop = find_run(settings), Stop()
+        with listen(stop), _Listener(settings.updates, on_update, stop) as display:
+            carry_out(settings, run, stop, display)
+    return run, [seed_path(run / POLICY, settings, seed) for seed in settings.numbers]
