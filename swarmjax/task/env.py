@@ -149,12 +149,17 @@ def load(
     chosen = pieces.choose(extensions, task, stages)
     extended.check(chosen, robots=sim.robots, obstacles=sim.obstacles)
     size = model.ArenaSize(sim.robots, sim.obstacles, task_stage.largest_half(stages))
+    spacing = Spacing(*size[:2], robot.hull_radius, task.target_radius)
+    if chosen.drawings:
+        drawn = task_stage.stack(stages, [piece.name for piece in chosen.drawings])
+        names = [stage.name for stage in stages]
+        extended.check_levels(chosen.drawings, drawn, spacing, names)
     return World(
         robot=robot,
         task=task,
         realism=realism,
         physics=_load_physics(size, robot, task, realism, sim, arenas),
-        spacing=Spacing(*size[:2], robot.hull_radius, task.target_radius),
+        spacing=spacing,
         drive=sim_drive.from_config(robot),
         electronics=task_electronics.load(task, realism, own=chosen.observations),
         terms=chosen.terms,

@@ -18,7 +18,9 @@ from swarmjax.task.level import Level, Spacing
 from swarmjax.task.observation import View
 from swarmjax.task.pieces import Chosen
 from swarmjax.task.reward import Step
-from swarmjax.task.stage import Stage
+from swarmjax.task.stage import Stage, select
+
+_TRIED = 8  # levels of a drawing that are looked at before a program is built
 
 
 def look(own: Sequence[Observation], view: View) -> Array:
@@ -57,6 +59,56 @@ def draw(uniforms: Any, stage: Stage, spacing: Spacing, drawings: Sequence[Level
         pairs = zip(piece.function(drawn, key), found, strict=True)
         found = Level(*(jnp.where(mine, own, other) for own, other in pairs))
     return level.park(found, jnp)
+
+
+def check_levels(
+    drawings: Sequence[LevelDrawing], stages: Stage, spacing: Spacing, names: Sequence[str]
+) -> None:
+    """Refuses drawings whose levels put robots or targets outside of the walls, or robots together.
+
+    Args:
+      drawings: ways of drawing.
+      stages: [S], as NumPy arrays.
+      spacing: sizes.
+      names: [S] of the stages.
+
+    Raises:
+      ConfigError: naming the piece, the stage and what is wrong with one of its levels.
+    """
+    count = level.uniform_count(spacing)
+    uniforms = np.random.default_rng(0).random((_TRIED, count), dtype=np.float32)
+    for index, name in enumerate(names):
+        stage = select(stages, index)
+        if not stage.drawing:
+            continue
+        piece = drawings[int(stage.drawing) - 1]
+        for each in uniforms:
+            found = redraw(piece, level.sample(each, stage, spacing, np))
+            problem = _problem(found, spacing)
+            if problem:
+                raise ConfigError(f"{label(piece)}, drawn for stage {name}, {problem}.")
+
+
+def _problem(found: Level, spacing: Spacing) -> str | None:
+    """Says what is wrong with a level, if anything is."""
+    start, target = found.start[found.present], found.target[found.present]
+    if not all(np.isfinite(field).all() for field in (start, target, found.obstacle)):
+        return "holds a number that is not finite: return numbers"
+    room = 0.5 * float(found.side) - spacing.hull_radius
+    for what, place in (("starts", start[:, :2]), ("has its target", target)):
+        outside = np.flatnonzero(np.abs(place).max(axis=-1) > room)
+        if outside.size:
+            x, y = place[outside[0]]
+            return (
+                f"robot {outside[0]} {what} at ({x:.3g}, {y:.3g}) m: stay within {room:.3g} m of "
+                "the middle, the walls less the hull"
+            )
+    apart = np.linalg.norm(start[:, None, :2] - start[None, :, :2], axis=-1)
+    close = np.argwhere(np.triu(apart < 2.0 * spacing.hull_radius, 1))
+    if close.size:
+        first, second = close[0]
+        return f"robots {first} and {second} start within each other: keep two hulls apart"
+    return None
 
 
 def redraw(piece: LevelDrawing, drawn: Level) -> Level:

@@ -1,0 +1,158 @@
+"""What pieces of somebody's own do in an arena, and how those that do not fit are refused."""
+
+import dataclasses
+from functools import partial
+from pathlib import Path
+
+import extensions
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from sentences import refusal
+
+from swarmjax import extension
+from swarmjax.evaluate import judge
+from swarmjax.sim import physics
+from swarmjax.sim.config import SimConfig
+from swarmjax.task import env, extended, level
+from swarmjax.task import stage as task_stage
+from swarmjax.task.config import RewardConfig, TaskConfig
+from swarmjax.task.env import World
+from swarmjax.task.stage_config import StageConfig
+
+RING = StageConfig(name="ring", robots=3, side=1.0, level="ring")
+SIM = SimConfig(impl="jax", max_robots=4, max_obstacles=1)
+WEIGHT = -0.25
+
+
+def _world(source: str, stages: tuple[StageConfig, ...] = (RING,), **task: object) -> World:
+    return env.load(stages, task=TaskConfig(**task), sim=SIM, extensions=extension.load(source))
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    reward = RewardConfig(progress=0.0, contact=0.0, step_penalty=0.0, extra={"turning": WEIGHT})
+    return _world(str(extensions.OWN), reward=reward)
+
+
+@pytest.fixture(scope="module")
+def drawn(world: World) -> level.Level:
+    uniforms = np.random.default_rng(3).random(level.uniform_count(world.spacing), np.float32)
+    stage = task_stage.select(task_stage.stack([RING], ["ring"]), 0)
+    return extended.draw(uniforms, stage, world.spacing, world.drawings)
+
+
+def _step(world: World, drawn: level.Level, action: np.ndarray) -> tuple:
+    state = env.reset(world, drawn)
+    begun = dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
+    return jax.jit(partial(env.step, world))(begun, action)
+
+
+def test_an_observation_follows_the_built_in_ones(world: World, drawn: level.Level) -> None:
+    names = world.electronics.layout.names
+    assert (len(names), names[-1]) == (world.observation_size, "nearest_robot")
+    place = np.array(drawn.start[:3, :2])
+    apart = np.linalg.norm(place[:, None] - place[None], axis=-1) + 9.0 * np.eye(3)
+    seen = env.reset(world, drawn).observation[:3, -1]
+    np.testing.assert_allclose(seen, apart.min(axis=1), atol=1e-6)  # float32
+
+
+def test_a_term_has_its_weight(world: World, drawn: level.Level) -> None:
+    action = np.zeros((4, 2), np.float32)
+    action[:, 1] = [0.5, -1.0, 7.0, 1.0]  # what is beyond 1 is clipped; the last one is absent
+    came = _step(world, drawn, action)[1]
+    np.testing.assert_allclose(came.reward, WEIGHT * np.array([0.25, 1.0, 1.0, 0.0]), rtol=1e-6)
+
+
+def test_a_level_is_drawn_by_the_piece_and_the_rest_is_parked(drawn: level.Level) -> None:
+    radius = np.linalg.norm(drawn.start[:3, :2], axis=-1)
+    np.testing.assert_allclose(radius, 0.35, rtol=1e-6)  # float32
+    np.testing.assert_allclose(drawn.target[:3], -np.array(drawn.start[:3, :2]), atol=1e-6)
+    assert not np.any(drawn.obstacle_present)
+    assert np.all(np.abs(drawn.start[3, :2]) > 1.0)
+
+
+def test_the_judge_draws_the_same_level(world: World) -> None:
+    stage = task_stage.select(task_stage.stack([RING], ["ring"]), np.intp(0))
+    theirs = judge.draw_level(stage, world.spacing, 5, 2, world.drawings)
+    uniforms = np.random.default_rng([5, 2]).random(level.uniform_count(world.spacing), np.float32)
+    mine = extended.draw(uniforms, stage, world.spacing, world.drawings)
+    for one, other in zip(theirs, mine, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-6)  # XLA fuses, and rounds otherwise
+
+
+def test_other_stages_are_drawn_as_without_the_piece(world: World) -> None:
+    plain = StageConfig(name="plain", robots=3, side=1.0)
+    stages = task_stage.stack([RING, plain], ["ring"])
+    uniforms = np.random.default_rng(4).random(level.uniform_count(world.spacing), np.float32)
+    found = extended.draw(uniforms, task_stage.select(stages, 1), world.spacing, world.drawings)
+    expected = level.sample(uniforms, task_stage.select(stages, 1), world.spacing, jnp)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_term_of_weight_0_is_not_computed() -> None:
+    found = _world(str(extensions.OWN), reward=RewardConfig(extra={"turning": 0.0}))
+    assert found.terms == ()
+
+
+def test_observations_may_be_left_out() -> None:
+    assert _world(str(extensions.OWN), observations=()).observation_size == 10
+
+
+@pytest.mark.parametrize(
+    ("body", "sentence"),
+    [
+        ("@observation(size=2)\ndef a(view): return view.distance",
+         "observation a returns float32 of shape [4]: return float numbers of shape [4, 2]."),
+        ("@observation()\ndef a(view): return view.arrived",
+         "observation a returns bool of shape [4]: return float numbers of shape [4, 1] or [4]."),
+        ("@observation()\ndef a(view): return 3",
+         "observation a returns int32 of shape []: return float numbers of shape [4, 1] or [4]."),
+        ("@observation()\ndef a(view): return view.no_such",
+         "observation a fails: AttributeError: 'View' object has no attribute 'no_such'."),
+        ("@reward_term(weight=1.0)\ndef a(step): return step.pose",
+         "reward a returns float32 of shape [4, 3]: return float numbers of shape [4]."),
+        ("@level_drawing\ndef ring(level, key): return level.start",
+         "level ring returns "),
+        ("@level_drawing\ndef ring(level, key): return level._replace(target=level.start)",
+         "level ring returns target as float32 of shape [4, 3]: return float32 of shape [4, 2]."),
+        ("@level_drawing\ndef ring(level, key): return level._replace(target=level.target + 9)",
+         "level ring, drawn for stage ring, robot 0 has its target at ("),
+        ("@level_drawing\ndef ring(level, key): return level._replace(start=0 * level.start)",
+         "level ring, drawn for stage ring, robots 0 and 1 start within each other: keep two hulls "
+         "apart."),
+        ("@level_drawing\ndef ring(level, key): return level._replace(start=level.start + jnp.nan)",
+         "level ring, drawn for stage ring, holds a number that is not finite: return numbers."),
+        ("@level_drawing\ndef ring(level, key): return level._replace(obstacle=2 * level.obstacle)",
+         "level ring changes the half edges of obstacles: leave obstacle[:, 3:] as it is, and give "
+         "the stage's obstacle_size."),
+    ],
+)  # fmt: skip
+def test_a_piece_that_does_not_fit_is_one_sentence(
+    tmp_path: Path, body: str, sentence: str
+) -> None:
+    source = extensions.write(tmp_path / "mine.py", body)
+    stages = (RING,) if "def ring" in body else (StageConfig(name="s", robots=3, side=1.0),)
+    found = refusal(_world, source, stages)
+    assert found.startswith(f"{source}: {sentence}")
+
+
+def test_what_the_task_names_and_nobody_defines_is_refused() -> None:
+    stages = (StageConfig(name="s", robots=3, side=1.0),)
+    for task, key in (
+        ({"observations": ("x",)}, "task.observations names 'x', "),
+        ({"reward": RewardConfig(extra={"x": 1.0})}, "task.reward.extra names 'x', "),
+    ):
+        sentence = refusal(partial(env.load, sim=SIM, task=TaskConfig(**task)), stages)
+        assert sentence == (
+            f"{key}which is not part of swarmjax: give extensions=FILE, the file that defines it."
+        )
+
+
+def test_a_way_of_drawing_that_is_missing_is_refused() -> None:
+    assert refusal(partial(env.load, sim=SIM), (RING,)) == (
+        "stage ring: level is 'ring': give one of random, fixed, or extensions=FILE, a file that "
+        "defines it."
+    )

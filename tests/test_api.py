@@ -1,0 +1,182 @@
+"""swarmjax from Python: the four functions, and what they refuse."""
+
+import importlib
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+
+import extensions
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import swarmjax
+from swarmjax.environment import Swarm, SwarmState
+from swarmjax.task.stage_config import StageConfig
+
+PAIR = StageConfig(name="pair", robots=2, side=0.5)
+TRIO = StageConfig(name="trio", robots=3, side=0.8, obstacles=1)
+LIMIT, ARENAS = 6, 4
+TINY = {
+    "stage": [PAIR, TRIO],
+    "sim.impl": "jax",
+    "arenas": 4,
+    "algo": {"rollout_length": 4, "num_minibatches": 2, "epochs": 1, "hidden_sizes": [8]},
+    "task.step_limit": 8,
+    "budget": 4 * 4 * 6,
+    "run.tensorboard": False,
+    "run.chunk": 1,
+}
+
+
+@pytest.fixture(scope="module")
+def env() -> Swarm:
+    return swarmjax.make_env(
+        [PAIR, TRIO], task={"step_limit": LIMIT}, sim={"impl": "jax"}, arenas=ARENAS
+    )
+
+
+@pytest.fixture(scope="module")
+def states(env: Swarm) -> list[SwarmState]:
+    """The states of 14 control steps in which every robot stands still."""
+    state = jax.jit(env.reset)(jax.random.key(0))
+    step, found = jax.jit(env.step), [state]
+    still = jnp.tile(jnp.array([-1.0, 0.0]), (ARENAS, env.num_robots, 1))
+    for _ in range(14):
+        found.append(step(found[-1], still)[0])
+    return found
+
+
+def test_importing_the_package_imports_no_jax() -> None:
+    code = "import sys, swarmjax; swarmjax.__version__; print('jax' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_no_module_shadows_a_function() -> None:
+    for module in pkgutil.walk_packages(swarmjax.__path__, "swarmjax."):
+        if ".templates" not in module.name and "_warp" not in module.name:
+            importlib.import_module(module.name)
+    functions = ("make_env", "train_policy", "evaluate_policy", "load_policy")
+    assert all(callable(getattr(swarmjax, name)) for name in functions)
+    assert not set(functions) & {module.name for module in pkgutil.iter_modules(swarmjax.__path__)}
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="has no attribute 'no_such'"):
+        swarmjax.no_such  # noqa: B018 # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_arenas_play_the_stages_in_turn(env: Swarm, states: list[SwarmState]) -> None:
+    assert (env.num_arenas, env.num_robots) == (ARENAS, 3)
+    np.testing.assert_array_equal(states[0].present.sum(axis=1), [2, 3, 2, 3])
+
+
+def test_spaces_say_what_goes_in_and_out(env: Swarm, states: list[SwarmState]) -> None:
+    seen, action = env.observation_space, env.action_space
+    assert seen.shape == states[0].observation.shape[2:] == (len(seen.names),)
+    assert (action.shape, action.names) == ((2,), ("speed", "turn_rate"))
+
+
+def test_an_episode_that_is_over_gives_way_to_another(states: list[SwarmState]) -> None:
+    start = [np.array(state.arenas.level.start) for state in states]
+    for before, after in zip(range(LIMIT - 1), range(1, LIMIT), strict=True):
+        np.testing.assert_array_equal(start[before], start[after])
+    for arena in range(ARENAS):  # each has another level after the step limit, and after the next
+        assert len({start[i][arena].tobytes() for i in (0, LIMIT, 2 * LIMIT)}) == 3
+    np.testing.assert_array_equal(states[LIMIT].arenas.clock, 0)
+
+
+def test_the_step_has_the_old_episode_and_the_state_the_new_one(
+    env: Swarm, states: list[SwarmState]
+) -> None:
+    still = jnp.tile(jnp.array([-1.0, 0.0]), (ARENAS, env.num_robots, 1))
+    state, came = jax.jit(env.step)(states[LIMIT - 1], still)
+    assert came.done.all()
+    present = states[0].present
+    assert not np.allclose(came.observation[present], state.observation[present])
+    np.testing.assert_array_equal(came.truncated, present)
+
+
+def test_the_same_key_gives_the_same_episodes(env: Swarm, states: list[SwarmState]) -> None:
+    again = jax.jit(env.reset)(jax.random.key(0))
+    jax.tree.map(np.testing.assert_array_equal, again.arenas, states[0].arenas)
+    jax.tree.map(np.testing.assert_array_equal, again.waiting, states[0].waiting)
+
+
+def test_it_runs_under_vmap_as_alone(env: Swarm, states: list[SwarmState]) -> None:
+    keys = jnp.stack([jax.random.key(0), jax.random.key(1)])
+    pair = jax.vmap(env.reset)(keys)
+    action = jnp.zeros((2, ARENAS, env.num_robots, 2))
+    after, _ = jax.jit(jax.vmap(env.step))(pair, action)
+    alone, _ = jax.jit(env.step)(states[0], action[0])
+    # XLA fuses a batch otherwise, and rounds otherwise.
+    np.testing.assert_allclose(after.observation[0], alone.observation, atol=1e-5)
+
+
+def test_poses_are_where_the_level_starts(env: Swarm, states: list[SwarmState]) -> None:
+    np.testing.assert_allclose(env.pose(states[0]), states[0].arenas.level.start, atol=1e-6)
+
+
+def test_a_callback_sees_every_update_and_stops_the_run(tmp_path: Path) -> None:
+    seen: list[int] = []
+
+    def stop(row: dict) -> bool:
+        seen.append(row["update"])
+        return row["update"] == 3
+
+    result = swarmjax.train_policy(TINY | {"run.dir": tmp_path / "run"}, on_update=stop)
+    assert seen == [row["update"] for row in result.metrics] == [0, 1, 2, 3]
+    assert result.run == tmp_path / "run"
+    assert result.policy.digest == swarmjax.load_policy(result.run / "policy.npz").digest
+    assert result.policy.meta["update"] == 4
+
+
+def test_every_seed_has_its_policy(tmp_path: Path) -> None:
+    settings = TINY | {"run.dir": tmp_path / "run", "seeds": 2, "budget": 16}
+    result = swarmjax.train_policy(settings)
+    assert [each.meta["seed"] for each in result.policies] == [0, 1]
+
+
+def test_words_of_the_command_line_are_settings_too(tmp_path: Path) -> None:
+    words = ["stage=s1", "arenas=4", "algo.num_minibatches=2", "algo.rollout_length=4", "budget=16"]
+    more = ["sim.impl=jax", "run.tensorboard=false", f"run.dir={tmp_path / 'run'}"]
+    assert swarmjax.train_policy(words + more).policy.meta["config"]["stage"][0]["name"] == "s1"
+
+
+def test_pieces_handed_over_are_trained_and_judged(tmp_path: Path) -> None:
+    settings = TINY | {"stage": extensions.RING, "run.dir": tmp_path / "run", "budget": 16}
+    result = swarmjax.train_policy(settings, extensions=str(extensions.OWN))
+    assert result.policy.meta["observation"]["names"][-1] == "nearest_robot"
+    assert result.policy.meta["network"] == "residual"
+    found = swarmjax.evaluate_policy(
+        result.policy, extensions=str(extensions.OWN), episodes=2, steps=5
+    )
+    assert [cell["cell"] for cell in found["cells"]] == ["ring"]
+    with pytest.raises(swarmjax.SwarmjaxError, match="was trained with the observation nearest_ro"):
+        swarmjax.evaluate_policy(result.policy, episodes=2)
+    with pytest.raises(swarmjax.SwarmjaxError, match="was trained with the network residual, whi"):
+        swarmjax.load_policy(result.run / "policy.npz")
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda: swarmjax.make_env("s7"), r"^stage is 's7': give one of .*nearest: s6"),
+        (lambda: swarmjax.make_env("s3", robot={"hull_radius": -1}), r"^robot\.hull_radius is -1: "
+        ""),
+        (lambda: swarmjax.make_env("s3", robot="legs"), r"^robot is 'legs': give one of paper"),
+        (lambda: swarmjax.make_env("s3", arenas=0), r"^arenas is 0: give 1 to 1048576"),
+        (lambda: swarmjax.make_env("s3", extensions="no.py"), r"^extensions is 'no.py', which "
+        "cann"),
+        (lambda: swarmjax.train_policy({"algo.hidden": [8]}), r"^algo\.hidden is called algo\.hid"),
+        (lambda: swarmjax.train_policy("stage=s3"), r"^settings is 'stage=s3': give a list of wor"),
+        (lambda: swarmjax.evaluate_policy("no.npz"), r"^no\.npz is no file: give the path of a po"),
+        (lambda: swarmjax.load_policy("no.npz"), r"^no\.npz is no file: give the path of a policy"),
+    ],
+)  # fmt: skip
+def test_errors_are_one_class_with_the_sentences_of_the_commands(call, sentence: str) -> None:
+    with pytest.raises(swarmjax.SwarmjaxError, match=sentence):
+        call()

@@ -1,0 +1,139 @@
+"""Pieces of somebody's own: how they are found, named, told apart and refused."""
+
+import re
+from pathlib import Path
+
+import extensions
+import pytest
+from sentences import refusal
+
+from swarmjax import extension
+from swarmjax.extension import Extensions
+
+TERM = """
+SCALE = 2.0
+@reward_term(weight=0.5)
+def speed(step):
+    return SCALE * jnp.abs(step.action[:, 0])
+"""
+
+
+def _load(path: Path, body: str) -> Extensions:
+    return extension.load(extensions.write(path, body))
+
+
+def _digest(path: Path, body: str) -> str:
+    return _load(path, body).rewards[0].digest
+
+
+def test_every_kind_is_found_in_the_example() -> None:
+    found = extension.load(str(extensions.OWN))
+    names = [[piece.name for piece in pieces] for pieces in found]
+    assert names == [["turning"], ["nearest_robot"], ["ring"], ["residual"]]
+
+
+def test_no_source_is_no_pieces() -> None:
+    assert extension.load(None) == Extensions()
+
+
+def test_a_digest_is_that_of_the_code_and_not_of_comments(tmp_path: Path) -> None:
+    commented = TERM.replace("    return", "    # why\n    return")
+    assert _digest(tmp_path / "a.py", TERM) == _digest(tmp_path / "b.py", commented)
+
+
+def test_a_digest_leaves_the_default_weight_out(tmp_path: Path) -> None:
+    heavier = TERM.replace("weight=0.5", "weight=0.7")
+    assert _digest(tmp_path / "a.py", TERM) == _digest(tmp_path / "b.py", heavier)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("SCALE = 2.0", "SCALE = 3.0"), ("jnp.abs", "jnp.square"), ("[:, 0]", "[:, 1]")],
+)
+def test_a_digest_changes_with_what_a_piece_computes(tmp_path: Path, old: str, new: str) -> None:
+    changed = TERM.replace(old, new)
+    assert _digest(tmp_path / "a.py", TERM) != _digest(tmp_path / "b.py", changed)
+
+
+def test_a_digest_changes_with_a_function_that_a_piece_calls(tmp_path: Path) -> None:
+    calling = TERM.replace("SCALE = 2.0", "def SCALED(x):\n    return 2.0 * x").replace(
+        "SCALE * jnp.abs(step.action[:, 0])", "SCALED(step.action[:, 0])"
+    )
+    other = calling.replace("2.0 * x", "3.0 * x")
+    assert _digest(tmp_path / "a.py", calling) != _digest(tmp_path / "b.py", other)
+
+
+def test_an_edited_file_is_read_again(tmp_path: Path) -> None:
+    path = tmp_path / "a.py"
+    before = _digest(path, TERM)
+    assert _digest(path, TERM.replace("2.0", "5.0")) != before
+
+
+@pytest.mark.parametrize(
+    ("body", "sentence"),
+    [
+        ("x = 1", r"a\.py holds no piece: put a decorator of swarmjax\.extension before a "
+        "function"),
+        ("import nowhere_to_be_found", r"a\.py does not import: ModuleNotFoundError: No module"),
+        ("def broken(:", r"a\.py does not import: SyntaxError: "),
+        ("1 / 0", r"a\.py does not import: ZeroDivisionError: division by zero"),
+        (TERM + TERM.replace("def speed", "def again").replace("0.5)", "0.5, name='speed')"),
+         r"a\.py: reward speed is there twice: rename one"),
+        (TERM.replace("def speed", "def progress"),
+         r"a\.py: reward progress is the name of a built-in reward: rename it"),
+        (TERM.replace("def speed", "def Speed"),
+         r"a\.py: reward Speed cannot be called so: give 1 to 40 lower-case letters"),
+        ("@observation(size=0)\ndef a(view): return 0", r"a\.py: observation a has size 0: give 1 "
+        ""),
+        ("@observation(scale=0)\ndef a(view): return 0", r"a\.py: observation a has scale 0: "),
+        ("@network\ndef a(x): return x", r"a\.py: network a is no class: decorate a flax"),
+    ],
+)  # fmt: skip
+def test_an_unsound_file_is_one_sentence(tmp_path: Path, body: str, sentence: str) -> None:
+    assert re.search(sentence, refusal(_load, tmp_path / "a.py", body))
+
+
+def test_a_missing_file_is_one_sentence() -> None:
+    assert refusal(extension.load, "no/such.py") == (
+        "extensions is 'no/such.py', which cannot be read: No such file or directory."
+    )
+
+
+def test_a_file_of_another_kind_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("x")
+    assert refusal(extension.load, str(tmp_path / "a.txt")).endswith(
+        "give a file that ends in .py."
+    )
+
+
+def test_pieces_are_handed_over_by_a_word() -> None:
+    found = extension.load(str(extensions.OWN))
+    word = extension.hand_over([found.rewards[0], found.networks[0]])
+    assert extension.load(word) == Extensions(rewards=found.rewards, networks=found.networks)
+
+
+def test_a_word_of_another_program_is_refused() -> None:
+    assert refusal(extension.load, "python:0123") == (
+        "extensions is python:0123, pieces that a Python program handed over and that only it has: "
+        "put them into a file and give extensions=FILE."
+    )
+
+
+def test_what_is_no_piece_is_refused() -> None:
+    sentence = refusal(extension.hand_over, [print])
+    assert sentence.endswith("or functions with a decorator of swarmjax.extension.")
+
+
+def test_a_piece_that_is_missing_or_has_changed_is_named() -> None:
+    found = extension.load(str(extensions.OWN))
+    needs = {"observation": {"nearest_robot": "0" * 64}}
+    assert refusal(extension.check_needs, needs, Extensions(), "p.npz") == (
+        "p.npz was trained with the observation nearest_robot, which is not part of swarmjax: give "
+        "extensions=FILE, the file that defines it."
+    )
+    changed = refusal(extension.check_needs, needs, found, "p.npz")
+    assert changed.startswith("p.npz was trained with the observation nearest_robot of digest 0000")
+
+
+def test_only_the_kinds_that_matter_are_asked_for() -> None:
+    extension.check_needs({"reward": {"turning": "0" * 64}}, Extensions(), "p", ["observation"])
