@@ -3,7 +3,7 @@
 Train with them, and judge what was trained:
 
     python -m swarmjax.train extensions=examples/own_pieces.py stage=examples/ring.yaml
-    python -m swarmjax.evaluate policy=runs/NAME/policy.npz
+    python -m swarmjax.evaluate policy=runs/NAME/policy.npz extensions=examples/own_pieces.py
 """
 
 import jax

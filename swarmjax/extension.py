@@ -45,7 +45,7 @@ class Piece:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of its code and of what it uses of its own file; comments do not count."""
+        """SHA-256 of its code and of what it uses of its own file, without comments."""
         texts = sorted(_sources(self.function, {}).items())
         return hashlib.sha256(repr(texts).encode()).hexdigest()
 
@@ -347,6 +347,9 @@ def _sources(thing: Any, found: dict[str, str]) -> dict[str, str]:
             f"{getattr(thing, '__name__', thing)} has no source that can be read: define it in a "
             "file or a notebook."
         ) from None
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            node.body = _without_docstring(node.body)
     for node in tree.body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             node.decorator_list = []  # what it says is a setting: keys and layouts hold it
@@ -362,6 +365,13 @@ def _sources(thing: Any, found: dict[str, str]) -> dict[str, str]:
         elif getattr(value, "__module__", None) == thing.__module__ and hasattr(value, "__name__"):
             _sources(value, found)
     return found
+
+
+def _without_docstring(body: list[ast.stmt]) -> list[ast.stmt]:
+    first = body[0] if body else None
+    if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
+        return body[1:]
+    return body
 
 
 def _names(tree: ast.AST) -> Iterator[str]:

@@ -29,12 +29,12 @@ class Policy(NamedTuple):
     mean: np.ndarray  # [L, O], of the observation
     std: np.ndarray  # [L, O], likewise
     is_shared: bool
-    encoding: Any  # of the observation, "metric" or "webots"
+    encoding: Any  # "metric" or "webots"
     max_speed: float  # m/s; commands begin at 0
     max_turn_rate: float  # rad/s, to either side
     meta: dict[str, Any]
     digest: str  # SHA-256 of all else in the file, in hexadecimal
-    network: Any = None  # of format 3, normalised [..., R, O] to features; the file has no code
+    network: Any = None  # of format 3: normalised [..., R, O] to features
 
 
 def load(path: str | Path | IO[bytes]) -> Policy:
@@ -52,9 +52,9 @@ def load(path: str | Path | IO[bytes]) -> Policy:
             raise ValueError("digest is not that of the arrays")
         names = [*(f"hidden_{i}" for i in range((len(arrays) - 6) // 2)), "mean"]
         layers = [(arrays[f"actor/{n}/kernel"], arrays[f"actor/{n}/bias"]) for n in names]
-        rest = [arrays[name] for name in ("actor/log_std", "normalizer/mean", "normalizer/std")]
-        shared, encoding = meta["policy"] == "shared", meta["observation"]["encoding"]
-        return Policy(*[layers, *rest, shared, encoding, *meta["action"]["high"], meta, found])
+        rest = [arrays[n] for n in ("actor/log_std", "normalizer/mean", "normalizer/std")]
+        rest += [meta["policy"] == "shared", meta["observation"]["encoding"]]
+        return Policy(*[layers, *rest, *meta["action"]["high"], meta, found])
     except Exception as error:  # whatever a damaged file makes zipfile, NumPy and json raise
         reason = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
         raise PolicyError(f"{path} cannot be read as a policy: {reason}.") from None
@@ -83,8 +83,7 @@ def act(policy: Policy, observation: np.ndarray, normal: Any = 0.0) -> np.ndarra
         raise PolicyError(f"{robots} robots are too many for {learners} independent policies.")
     mine, limit = slice(robots), policy.meta["observation"]["limit"]
     x = (observation.astype(np.float32) - policy.mean[mine]) / policy.std[mine]
-    x = np.clip(x, -limit, limit)
-    x = x if policy.network is None else policy.network(x)
+    x = (policy.network or np.asarray)(np.clip(x, -limit, limit))
     *hidden, (kernel, bias) = policy.layers
     for weights, offset in hidden:
         x = _ACTIVATIONS[policy.meta["activation"]](np.vecmat(x, weights[mine]) + offset[mine])

@@ -36,8 +36,8 @@ def meta(**changes: Any) -> dict[str, Any]:
         "action": {
             "names": ["speed", "turn_rate"],
             "units": ["m/s", "rad/s"],
-            "low": [0.0, -3.14],
-            "high": [0.1256, 3.14],
+            "low": [0.0, -epuck.MAX_TURN_RATE],
+            "high": [epuck.MAX_SPEED, epuck.MAX_TURN_RATE],
         },
         **EMBODIMENT,
         "config": {"seed": 3},

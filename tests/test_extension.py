@@ -9,6 +9,7 @@ from sentences import refusal
 
 from swarmjax import extension
 from swarmjax.extension import Extensions
+from swarmjax.task import observation, reward, stage_config
 
 TERM = """
 SCALE = 2.0
@@ -37,7 +38,7 @@ def test_no_source_is_no_pieces() -> None:
 
 
 def test_a_digest_is_that_of_the_code_and_not_of_comments(tmp_path: Path) -> None:
-    commented = TERM.replace("    return", "    # why\n    return")
+    commented = TERM.replace("    return", "    '''What.'''\n    # why\n    return")
     assert _digest(tmp_path / "a.py", TERM) == _digest(tmp_path / "b.py", commented)
 
 
@@ -122,6 +123,13 @@ def test_a_word_of_another_program_is_refused() -> None:
 def test_what_is_no_piece_is_refused() -> None:
     sentence = refusal(extension.hand_over, [print])
     assert sentence.endswith("or functions with a decorator of swarmjax.extension.")
+
+
+def test_names_of_the_package_are_taken() -> None:
+    assert set(extension.RewardTerm.taken) == set(reward.TERMS)
+    assert extension.LevelDrawing.taken == stage_config.BUILT_IN
+    inputs = {re.sub(r"_\d+$", "", name) for name in observation.NAMES}
+    assert set(extension.Observation.taken) == inputs
 
 
 def test_a_piece_that_is_missing_or_has_changed_is_named() -> None:

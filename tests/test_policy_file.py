@@ -136,7 +136,12 @@ _GOOD = policies.arrays()
             {},
             r"normalizer/std holds a value that is not above 0",
         ),
-        (_GOOD, {"format": 1}, r"meta.format is 1, but this version reads 2: export the policy"),
+        (
+            _GOOD,
+            {"format": 1},
+            r"meta.format is 1, but this version reads 2, and 3 with meta.network: export the "
+            "policy",
+        ),
         (_GOOD, {"activation": "gelu"}, r'meta.activation is "gelu": expected tanh or relu or sw'),
         (_GOOD, {"policy": "mine"}, r'meta.policy is "mine": expected shared or independent'),
         (_GOOD, {"learners": True}, r"meta.learners is true: expected a whole number"),

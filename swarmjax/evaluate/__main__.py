@@ -8,6 +8,7 @@ import json
 import os
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -25,8 +26,6 @@ from swarmjax.evaluate.table import PLAIN_WIDTH
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings, said = witness.load(EvaluateConfig, arguments)
-    sys.stdout.write(f"swarmjax.evaluate: {said}\n")
-    sys.stdout.flush()
     out = None if settings.out is None else Path(settings.out)
     if out is not None:
         _check_out(out)
@@ -34,7 +33,7 @@ def main(arguments: Sequence[str]) -> int:
     progress.disable = not progress.console.is_terminal
     try:
         with progress:
-            found = evaluate(settings, progress)
+            found = evaluate(settings, progress, partial(_say, said))
     except KeyboardInterrupt:
         sys.stderr.write("swarmjax.evaluate: interrupted, nothing was written.\n")
         return command.INTERRUPTED
@@ -45,6 +44,12 @@ def main(arguments: Sequence[str]) -> int:
         console.width = PLAIN_WIDTH
     evaluate_table.show(console, found.result)
     return 0
+
+
+def _say(sentence: str) -> None:
+    """Says what was taken from the policies, before it takes a minute to judge them."""
+    sys.stdout.write(f"swarmjax.evaluate: {sentence}\n")
+    sys.stdout.flush()
 
 
 def _check_out(path: Path) -> None:

@@ -1,6 +1,7 @@
 """Judges policies on the levels of a suite or a stage: who, on which, and what came of it."""
 
 import os
+from collections.abc import Callable
 from functools import partial
 from glob import glob
 from typing import Any, NamedTuple
@@ -29,12 +30,17 @@ class Evaluation(NamedTuple):
     trials: list[Trial]
 
 
-def evaluate(settings: EvaluateConfig, progress: Progress | None = None) -> Evaluation:
+def evaluate(
+    settings: EvaluateConfig,
+    progress: Progress | None = None,
+    announce: Callable[[], object] = lambda: None,
+) -> Evaluation:
     """Judges policies.
 
     Args:
         settings: Of the evaluation.
         progress: To show how far it is; None shows nothing.
+        announce: Is called when all that was given is sound, before the first episode.
 
     Returns:
         What it found.
@@ -45,7 +51,7 @@ def evaluate(settings: EvaluateConfig, progress: Progress | None = None) -> Eval
     """
     files = _sides(settings)
     sides = [evaluate_trials.read_policies(each, settings.extensions) for each in files]
-    return _judge(settings, sides, progress or Progress(disable=True))
+    return _judge(settings, sides, progress or Progress(disable=True), announce)
 
 
 def judge_entrants(settings: EvaluateConfig, entrants: list[Entrant]) -> Evaluation:
@@ -62,16 +68,22 @@ def judge_entrants(settings: EvaluateConfig, entrants: list[Entrant]) -> Evaluat
         PolicyError: If a policy does not fit the levels.
         ConfigError: If a suite is unsound, or the physics breaks down.
     """
-    return _judge(settings, [entrants], Progress(disable=True))
+    return _judge(settings, [entrants], Progress(disable=True), lambda: None)
 
 
-def _judge(settings: EvaluateConfig, sides: list[list[Entrant]], progress: Progress) -> Evaluation:
+def _judge(
+    settings: EvaluateConfig,
+    sides: list[list[Entrant]],
+    progress: Progress,
+    announce: Callable[[], object],
+) -> Evaluation:
     """Judges the policies of one side, or of the two that are compared."""
     entrants = [each for side in sides for each in side]
     for stage in cells.stages(settings):  # before levels are drawn, which takes a while
         for path, trained in entrants:
             judge.check_policy(settings, stage, path, trained)
     suite = cells.load(settings)
+    announce()
     total = len(entrants) * sum(len(cell.episodes) for cell in suite.cells)
     bar = progress.add_task("episodes", total=total)
     report = partial(progress.advance, bar)

@@ -159,7 +159,7 @@ def _stack(stage: StageConfig, drawings: Sequence[LevelDrawing]) -> task_stage.S
 
 def _observations(extensions: Extensions, trained: Policy) -> tuple[Observation, ...]:
     """Finds the observations of an extension that a policy sees, in its order."""
-    names = trained.meta["task"].get("observations", [])
+    names = trained.meta.get("task", {}).get("observations", [])
     return tuple(each for name in names for each in extensions.observations if each.name == name)
 
 

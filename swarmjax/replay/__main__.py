@@ -160,8 +160,6 @@ def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings, said = witness.load(ReplayConfig, arguments)
     entrants = evaluate_trials.read_policies(settings.policies, settings.extensions)
-    sys.stdout.write(f"swarmjax.replay: {said}\n")
-    sys.stdout.flush()
     out, video = Path(settings.out), settings.video and Path(settings.video)
     _check_out(out, [*settings.policies, settings.suite, settings.video])
     if video:
@@ -177,6 +175,7 @@ def main(arguments: Sequence[str]) -> int:
             bar = progress.add_task("pictures", total=replay_video.count(settings, episodes))
             report = partial(progress.advance, bar)
             _write("video", video, lambda: replay_video.write(video, settings, episodes, report))
+    sys.stdout.write(f"swarmjax.replay: {said}\n")
     labels = "; ".join(episode.label for episode in episodes)
     sys.stdout.write(f"{out}: {labels}; {len(page) / 1e6:.2f} MB.\n")
     if video:

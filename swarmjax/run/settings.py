@@ -248,7 +248,10 @@ def _inherited(typed: Sequence[str]) -> list[str]:
     source = files.values(files.split_words(TrainConfig, typed)).get("init_from")
     if not isinstance(source, str):
         return []
-    held = from_stored(read_config(Path(source)), f"{source}: ")
+    try:
+        held = from_stored(read_config(Path(source)))
+    except ConfigError:  # which `warm_start.read` refuses, when the run is to begin
+        return []
     others = [key for key in to_dict(held.algo) if key not in _SHARED]
     return [
         *inherit.group_words(TrainConfig, "robot", held.robot, typed),

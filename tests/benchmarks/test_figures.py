@@ -178,7 +178,9 @@ def test_speeds_of_a_run_are_its_steps_by_the_seconds_of_a_call(
         return _State(state.update + n), metrics
 
     shown: list[Line] = []
-    display: Any = SimpleNamespace(show=lambda _, speeds, __: shown.append(speeds), say=print)
+    display: Any = SimpleNamespace(
+        show=lambda _, speeds, __: shown.append(speeds), say=print, hear=lambda _: None
+    )
     compiled: Any = trainer.Compiled(call, seconds=0.0, state_bytes=0, work_bytes=0)
     begun: Any = _State(jnp.zeros(SEEDS, jnp.int32))
     trainer.train(tmp_path / "run", program, schedule, compiled, begun, display, trainer.Stop())

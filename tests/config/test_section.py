@@ -126,8 +126,8 @@ def test_only_true_and_false_are_booleans(value):
 
 def test_null_only_where_it_is_allowed():
     assert build(SimConfig, {"iterations": None}).iterations is None
-    assert refusal(build, SimConfig, {"max_robots": None}, "sim.") == (
-        "sim.max_robots is null: give a whole number."
+    assert refusal(build, RewardConfig, {"progress": None}, "task.reward.") == (
+        "task.reward.progress is null: give a number."
     )
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import re
 import sys
 from pathlib import Path
@@ -78,15 +79,14 @@ def test_the_policy_says_what_it_was_trained_with(tmp_path: Path) -> None:
         ["stage=s1", "robot=wheeled_v2", "realism=real", "task.control_step=0.064", "seed=4"]
     )
     said = policy_meta(trained, update=7, seed=4)
-    assert said["robot"] == {
-        "preset": "wheeled_v2",
-        "body": "wheeled",
-        "wheel_radius": 0.02,
-        "track": 0.052,
-        "max_wheel_speed": 7.536,
-    }
-    assert said["sensors"] == {"preset": "real", "response": "real", "range": 0.04}
-    assert said["task"] == {"control_step": 0.064, "target_radius": 0.05}
+    assert said["robot"] == {"preset": "wheeled_v2"} | to_dict(trained.robot)
+    assert (said["robot"]["hull_radius"], said["robot"]["max_wheel_speed"]) == (0.037, 7.536)
+    sensors = said["sensors"]
+    assert (sensors["preset"], sensors["response"], sensors["range"]) == ("real", "real", 0.04)
+    assert sensors["poses"][2] == [0.0, -0.031, -math.pi / 2]  # ps2 looks to the right
+    task = {"control_step": 0.064, "target_radius": 0.05, "step_limit": 500, "observations": []}
+    assert said["task"] == task
+    assert (said["realism"], said["extensions"]) == (to_dict(trained.realism), {})
     assert said["observation"]["encoding"] == "metric"
     assert (said["update"], said["seed"]) == (7, 4)
     assert build(TrainConfig, said["config"]) == trained

@@ -153,7 +153,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage.side=0.9"], "stage.side cannot be given for curriculum, a curriculum: choose "
          "one stage, as in stage=s6."),
         (["stage.sequence=[s1,s9]"], f"stage.sequence is 's9': give one of {CHOICES} (nearest: "
-         "s6)."),
+         "s6), or a file .yaml."),
         (["stage.sequence=[]"], "stage.sequence is []: give at least one stage."),
         (["stage.sequence=s1"], "stage.sequence is 's1': give a list, as in [s1,s2]."),
         (["stage.sequence=[s1,s1]"], "stage names s1 more than once: give each stage once."),
@@ -220,8 +220,8 @@ def test_import_needs_neither_jax_nor_hydra():
          "axes, as in stage.grid.side=[0.7,1.0]."),
         (["stage=grid", "stage.grid.robots=[]"], "stage.grid.robots is []: give at least one "
          "number."),
-        (["stage=grid", "stage.grid.robots=[2,6]"], "stage r6-o0-s70: robots is 6, but "
-         "sim.max_robots is 5: give 1 to 5."),
+        (["stage=grid", "stage.grid.robots=[2,6]", "sim.max_robots=5"], "stage r6-o0-s70: robots "
+         "is 6, but sim.max_robots is 5: give 1 to 5."),
         (["stage=grid", "stage.grid.robot=[2]"], "stage.grid.robot is not a key: did you mean "
          "stage.grid.robots?"),
         (["stage=grid", "stage.grid.side=1"], "stage.grid.side is 1: give a list, as in "
@@ -240,8 +240,8 @@ def test_import_needs_neither_jax_nor_hydra():
         # Checks across keys.
         (["robot.track=0.08"], "robot.track is 0.08, but hull_radius is 0.037 and the wheels lie "
          "inside the hull: give less than 0.074."),
-        (["stage=s6", "stage.robots=6"], "stage.robots is 6, but sim.max_robots is 5: give 1 to "
-         "5."),
+        (["stage=s6", "stage.robots=6", "sim.max_robots=5"], "stage.robots is 6, but "
+         "sim.max_robots is 5: give 1 to 5."),
         (["sim.max_obstacles=2"], "stage s6: obstacles is 3, but sim.max_obstacles is 2: give 0 "
          "to 2."),
         (["seeds=0"], "seeds is 0: give 1 to 4096."),
@@ -282,7 +282,8 @@ def test_train_refuses(words, sentence):
         (["workers=0"], "workers is 0: give 1 to 1024."),
         (["engine=warp"], "engine is 'warp': give c or mjx."),
         (["algo=ppo"], "algo is not a key: give one of policy, compare, stage, robot, task, suite, "
-         "shape, realism, action, engine, steps, episodes, seed, workers, substeps, out."),
+         "shape, realism, action, engine, steps, episodes, seed, workers, substeps, extensions, "
+         "out."),
     ],
 )  # fmt: skip
 def test_evaluate_refuses(words, sentence):

@@ -294,7 +294,7 @@ def test_independent_learners_are_told_how_many_they_were(
     stored = to_dict(load_train([*TINY, "algo.policy=independent"]))
     (tmp_path / "config.json").write_text(json.dumps(stored))
     monkeypatch.chdir(tmp_path)
-    assert _refusal(capsys, monkeypatch, *TINY, "init_from=.") == (
+    assert _refusal(capsys, monkeypatch, *TINY, "init_from=.", "algo.policy=shared") == (
         "init_from is '.', whose number of learners is 2, but here it is 1: give "
         "algo.policy=independent sim.max_robots=2, or another run."
     )
