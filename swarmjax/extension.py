@@ -347,13 +347,7 @@ def _sources(thing: Any, found: dict[str, str]) -> dict[str, str]:
             f"{getattr(thing, '__name__', thing)} has no source that can be read: define it in a "
             "file or a notebook."
         ) from None
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            node.body = _without_docstring(node.body)
-    for node in tree.body:
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            node.decorator_list = []  # what it says is a setting: keys and layouts hold it
-    found[thing.__name__] = ast.dump(tree)
+    found[thing.__name__] = ast.dump(_bare(tree))
     names = vars(sys.modules[thing.__module__]) if thing.__module__ in sys.modules else {}
     for name in _names(tree):
         value = names.get(name)
@@ -367,11 +361,16 @@ def _sources(thing: Any, found: dict[str, str]) -> dict[str, str]:
     return found
 
 
-def _without_docstring(body: list[ast.stmt]) -> list[ast.stmt]:
-    first = body[0] if body else None
-    if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
-        return body[1:]
-    return body
+def _bare(tree: ast.Module) -> ast.Module:
+    """Takes the decorator and all docstrings off: what a decorator says, keys and layouts hold."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            if node in tree.body:
+                node.decorator_list = []
+            first = node.body[0]
+            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
+                del node.body[0]
+    return tree
 
 
 def _names(tree: ast.AST) -> Iterator[str]:

@@ -1,5 +1,6 @@
 """Policies written by hand, for the tests of all who read or export them."""
 
+import copy
 import json
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,7 @@ def meta(**changes: Any) -> dict[str, Any]:
             "low": [0.0, -epuck.MAX_TURN_RATE],
             "high": [epuck.MAX_SPEED, epuck.MAX_TURN_RATE],
         },
-        **EMBODIMENT,
+        **copy.deepcopy(EMBODIMENT),
         "config": {"seed": 3},
         "versions": {"swarmjax": "0.1.0"},
         "update": 17,

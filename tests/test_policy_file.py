@@ -307,7 +307,11 @@ def _npy(descr: str, shape: str, data: bytes = b"", spaces: int = 0) -> bytes:
         ("actor/mean/bias", _npy("<f4", "200000000, 2"), "has not as many values as its shape"),
         # NumPy has 64 axes at most, and a product with a 0 in it fits any size.
         ("actor/mean/bias", _npy("<f4", ", ".join("1" * 65), b"\0" * 4), "is no plain array"),
-        ("actor/mean/bias", _npy("<f4", "1, 1, 1, 2", b"\0" * 8), "is no plain array"),
+        (
+            "actor/mean/bias",
+            _npy("<f4", "1, 1, 1, 1, 1, 1, 1, 1, 2", b"\0" * 8),
+            "is no plain array",
+        ),
         (
             "actor/mean/bias",
             _npy("<c16", "0, 999999999, 999999999"),

@@ -113,8 +113,10 @@ def load[C: Section](
 def _paths(cls: type[Section], typed: Sequence[str]) -> list[str]:
     """Lists the policy files that the words name."""
     given = files.values(files.split_words(cls, typed))
-    named = [(key, given[key]) for key in ("policy", "compare") if isinstance(given.get(key), str)]
-    return [path for key, text in named if text for path in list_files(key, text)]
+    policy, compare = (given.get(key) or "" for key in ("policy", "compare"))
+    sides = [("policy", policy), *(("compare", part) for part in str(compare).split(","))]
+    found = [path for key, text in sides if text for path in list_files(key, str(text))]
+    return list(dict.fromkeys(found))
 
 
 def _words(cls: type[Section], found: Trained, typed: Sequence[str]) -> list[str]:

@@ -269,7 +269,7 @@ def test_a_suite_and_several_policies_fill_a_folder(
         assert (out / name).read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out
     assert "seed0.npz and 2 more on suite tiny, 9 episodes" in printed
-    assert [line.split()[0] for line in printed.splitlines()[2:]] == ["one", "two", "all"]
+    assert [line.split()[0] for line in printed.splitlines()[3:]] == ["one", "two", "all"]
 
 
 def test_a_comparison_is_written_and_shown(
@@ -309,7 +309,7 @@ def test_a_suite_that_is_not_pooled_has_no_row_of_all(
     words = (f"suite={suite}", "steps=2", "workers=1")
     assert _command(monkeypatch, f"policy={path}", *words) == 0
     printed = capsys.readouterr().out
-    assert [line.split()[0] for line in printed.splitlines()[2:]] == ["one", "again"]
+    assert [line.split()[0] for line in printed.splitlines()[3:]] == ["one", "again"]
     assert _command(monkeypatch, f"compare={path},{path}", *words) == 0
     printed = capsys.readouterr().out
     heads = [line.split(" levels")[0].strip() for line in printed.splitlines() if " levels" in line]

@@ -60,7 +60,7 @@ def test_the_preset_leaves_no_number_of_the_learner_to_a_default() -> None:
     rewards = {f.name for f in dataclasses.fields(RewardConfig)} - {"extra"}
     assert set(given["task"]["reward"]) == rewards
     # Equation 3.
-    assert dataclasses.astuple(PAPER.task.reward) == (1.0, -0.001, 0.0, 0.0, 0.0, 0.0)
+    assert dataclasses.astuple(PAPER.task.reward) == (1.0, -0.001, 0.0, 0.0, 0.0, 0.0, {})
 
 
 def test_the_preset_chooses_the_files_that_are_not_given() -> None:

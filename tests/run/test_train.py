@@ -425,7 +425,10 @@ def test_a_checkpoint_of_another_shape_is_refused(
         (["stage=s9"], ["s9", "s1"]),
         (["arena=4"], ["arena", "arenas"]),
         (["budget=ten"], ["budget", "ten", "whole number"]),
-        (["stage=s6", "stage.robots=6"], ["stage.robots", "6", "sim.max_robots", "5"]),
+        (
+            ["stage=s6", "stage.robots=6", "sim.max_robots=5"],
+            ["stage.robots", "6", "sim.max_robots", "5"],
+        ),
         (["stage=s6", "stage.side=0.5"], ["stage.side", "0.5", "at least"]),
         (["arenas=6", "algo.num_minibatches=4"], ["arenas", "6", "multiple of 4"]),
         (["seeds=0"], ["seeds", "0", "1 to 4096"]),

@@ -1,0 +1,105 @@
+"""A policy says as what it is judged, unless the command line says otherwise."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import policies
+import pytest
+from sentences import refusal
+
+from swarmjax.config import build, files, to_dict
+from swarmjax.evaluate import witness
+from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.run.policy_export import policy_meta
+from swarmjax.run.settings import load_train
+from swarmjax.sim.config import RobotConfig
+from swarmjax.sim.realism_config import RealismConfig
+
+ODD = ["stage=s3", "robot.hull_radius=0.044", "task.sensor_range=0.1", "task.control_step=0.016"]
+
+
+def _policy(path: Path, *words: str) -> str:
+    """Writes a policy that was trained with these words."""
+    meta = policy_meta(load_train([*words]), update=1, seed=0)
+    policies.saved(path, **meta)
+    return f"policy={path}"
+
+
+def _load(*words: str) -> EvaluateConfig:
+    return witness.load(EvaluateConfig, words)[0]
+
+
+@pytest.fixture
+def odd(tmp_path: Path) -> str:
+    return _policy(tmp_path / "odd.npz", *ODD, "realism=real", "realism.mass=null")
+
+
+def test_hull_sensors_task_realism_and_stage_are_those_of_training(odd: str) -> None:
+    found = _load(odd)
+    assert (found.robot.hull_radius, found.stage.name) == (0.044, "s3")
+    assert (found.task.sensor_range, found.task.control_step) == (0.1, 0.016)
+    real = build(RealismConfig, files.read_preset("realism", "real"))
+    assert found.realism == replace(real, mass=None)
+
+
+def test_the_body_is_on_wheels_unless_it_is_told(odd: str) -> None:
+    assert _load(odd).robot.body == "wheeled"
+    assert _load(odd, "robot=planar").robot.body == "planar"
+
+
+def test_what_is_typed_wins(odd: str) -> None:
+    found = _load(odd, "robot.hull_radius=0.04", "task.sensor_range=0.05", "stage=s1")
+    assert (found.robot.hull_radius, found.task.sensor_range) == (0.04, 0.05)
+    assert (found.stage.name, found.task.control_step) == ("s1", 0.016)
+
+
+def test_a_realism_that_is_typed_replaces_all_of_it(odd: str) -> None:
+    assert _load(odd, "realism=ideal").realism == RealismConfig()
+
+
+def test_a_robot_that_is_typed_changes_what_its_file_says(odd: str) -> None:
+    found = _load(odd, "robot=wheeled_v2").robot
+    assert (found.hull_radius, found.mass) == (0.044, 0.14)
+
+
+def test_the_stage_of_training_may_be_changed(odd: str) -> None:
+    found = _load(odd, "stage.side=1.1").stage
+    assert (found.name, found.side) == ("s3", 1.1)
+
+
+def test_a_cell_of_a_grid_is_judged_without_a_file(tmp_path: Path) -> None:
+    word = _policy(tmp_path / "p.npz", "stage=grid", "curriculum.mode=adaptive")
+    assert _load(word).stage.name == "r5-o3-s120"
+
+
+def test_the_first_line_says_what_was_taken_and_what_was_told(odd: str) -> None:
+    said = witness.load(EvaluateConfig, [odd, "task.sensor_range=0.05"])[1]
+    assert said.startswith("as trained but for task.sensor_range=0.05: hull 0.044 m, infrared to ")
+    assert said.endswith("control step 0.016 s, realism real; wheeled body, stage s3")
+
+
+def test_policies_that_were_trained_differently_need_a_word(tmp_path: Path) -> None:
+    first, other = (_policy(tmp_path / f"{x}.npz", *ODD[: 1 + x]) for x in (0, 1))
+    both = f"{first},{other.partition('=')[2]}"
+    assert refusal(_load, both) == (
+        f"{tmp_path / '0.npz'} and {tmp_path / '1.npz'} were trained differently, with "
+        "robot.hull_radius its default and 0.044: say by which to judge them, as in "
+        "robot.hull_radius=0.044."
+    )
+    assert _load(both, "robot.hull_radius=0.037").robot.hull_radius == 0.037
+
+
+def test_a_file_of_an_older_version_says_what_it_has(tmp_path: Path) -> None:
+    config = {"robot": to_dict(RobotConfig(hull_radius=0.04)), "stage": [{"name": "s1"}]}
+    meta = policies.meta(config=config)
+    meta["sensors"]["range"] = 0.06
+    found = witness.trained(meta, "p.npz")
+    assert (found.robot.hull_radius, found.task.sensor_range) == (0.04, 0.06)
+    assert found.stages == [{"name": "s1"}]
+
+
+def test_a_file_without_a_config_says_what_its_own_keys_hold() -> None:
+    meta = policies.meta(config={})
+    meta["robot"] = {**meta["robot"], "track": 0.05}
+    found = witness.trained(meta, "p.npz")
+    assert (found.robot.track, found.robot.hull_radius, found.stages) == (0.05, 0.037, [])
