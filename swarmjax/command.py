@@ -162,7 +162,7 @@ def _overview(cls: type[Section], module: str) -> list[str]:
         lines += ["", "Examples:"]
     for words, meaning in examples.items():
         lines += [f"  # {meaning}", f"  {command} {words}".rstrip()]
-    groups = files.describe_groups(cls.command) if cls.command else []
+    groups = files.describe_groups(cls) if cls.command else []
     if groups:
         lines += ["", "Groups, each a folder of configs/:", *groups]
     top = [key for key in section.keys(cls) if "." not in key]

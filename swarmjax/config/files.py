@@ -123,11 +123,14 @@ def defaults(command: str) -> dict[str, str]:
     }
 
 
-def describe_groups(command: str) -> list[str]:
+def describe_groups(cls: type[Section]) -> list[str]:
     """Return a line for each group of a command: its default and its choices."""
+    found = defaults(cls.command) | {
+        group: f"<{text}>" for group, text in cls.inherited.items() if choices(group)
+    }
     return [
         f"  {f'{group}={choice}':<38}  ({', '.join(choices(group))})"
-        for group, choice in defaults(command).items()
+        for group, choice in found.items()
     ]
 
 

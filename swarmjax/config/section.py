@@ -97,11 +97,13 @@ class Section:
         command: name of the command's file in configs/, of a section that is all of a command's.
         removed: why a key is gone, by its old name.
         renamed: a key's new name, by its old one.
+        inherited: what a section's values are where no word sets them, by the section's name.
     """
 
     command: ClassVar[str] = ""
     removed: ClassVar[Mapping[str, str]] = {}
     renamed: ClassVar[Mapping[str, str]] = {}
+    inherited: ClassVar[Mapping[str, str]] = {}
 
     def __post_init__(self) -> None:
         for item in dataclasses.fields(self):
@@ -299,7 +301,9 @@ def describe_keys(cls: type[Section], chosen: Collection[str] | None = None) -> 
             continue
         section = key.partition(".")[0]
         default = f"<{'required' if section == key else f'the {section}'}>"
-        if item.default_factory is not dataclasses.MISSING:
+        if section in cls.inherited and section != key:
+            default = f"<{cls.inherited[section]}>"
+        elif item.default_factory is not dataclasses.MISSING:
             default = show(item.default_factory(), quote="")
         elif item.default is not dataclasses.MISSING:
             default = show(item.default, quote="")

@@ -1,5 +1,6 @@
 """The settings of an evaluation."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
@@ -11,12 +12,21 @@ from swarmjax.task.config import TaskConfig, check_realism
 from swarmjax.task.shapes import Shape
 from swarmjax.task.stage_config import StageConfig
 
+# What `witness.load` takes from the policies.
+AS_TRAINED = {
+    "stage": "its last stage",
+    "robot": "as trained, on wheels",
+    "task": "as trained",
+    "realism": "as trained",
+}
+
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig(Section):
     """Everything that fixes an evaluation of policies."""
 
     command: ClassVar[str] = "evaluate"
+    inherited: ClassVar[Mapping[str, str]] = AS_TRAINED
 
     policy: str | None = field(
         default=None,

@@ -1,12 +1,13 @@
 """The settings of a replay."""
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.config.section import MAX_COUNT
-from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.evaluate.config import AS_TRAINED, EvaluateConfig
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig, check_realism
@@ -19,6 +20,7 @@ class ReplayConfig(Section):
     """Which episodes of which policies are shown, and where to."""
 
     command: ClassVar[str] = "replay"
+    inherited: ClassVar[Mapping[str, str]] = AS_TRAINED
 
     policy: str = field(
         metadata=about("path of a policy.npz; of two for a comparison, as in a.npz,b.npz")
