@@ -6,12 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from entries import by_name
 
 from swarmjax import epuck, policy, policy_file
+from swarmjax.export import webots_controller
 from swarmjax.policy import Policy
 from swarmjax.task import observation
 
 Arrays = dict[str, np.ndarray]
+Names = tuple[str, ...]
 
 EMBODIMENT = {
     "robot": {
@@ -27,13 +30,23 @@ EMBODIMENT = {
 }
 
 
+def observed(
+    encoding: observation.Encoding = "metric", names: Names = observation.NAMES
+) -> dict[str, Any]:
+    """What `meta` says of observations that have these entries alone."""
+    full = observation.describe(encoding)
+    at = [full["names"].index(name) for name in names]
+    parts = {key: [full[key][i] for i in at] for key in ("names", "units", "offset", "scale")}
+    return full | parts | {"limit": 10.0}
+
+
 def meta(**changes: Any) -> dict[str, Any]:
     """All that `policy_file.write` takes beside the arrays of `arrays`."""
     full = {
         "policy": "shared",
         "learners": 1,
         "activation": "tanh",
-        "observation": observation.describe("metric") | {"limit": 10.0},
+        "observation": observed(),
         "action": {
             "names": ["speed", "turn_rate"],
             "units": ["m/s", "rad/s"],
@@ -53,23 +66,28 @@ def several(learners: int) -> dict[str, Any]:
     return {"policy": "shared" if learners == 1 else "independent", "learners": learners}
 
 
-def arrays(hidden: tuple[int, ...] = (4, 3), learners: int = 1, seed: int = 0) -> Arrays:
+def arrays(
+    hidden: tuple[int, ...] = (4, 3),
+    learners: int = 1,
+    seed: int = 0,
+    names: Names = observation.NAMES,
+) -> Arrays:
     """Networks whose actions are some units large and depend on all that is observed.
 
     The normaliser's mean and deviation are those of a robot between walls: centimetres of
     infrared, decimetres of distance, radians of bearing.
     """
     draw = np.random.default_rng(seed)
-    sizes = (observation.SIZE, *hidden, 2)
-    names = [*(f"hidden_{i}" for i in range(len(hidden))), "mean"]
+    sizes = (len(names), *hidden, 2)
+    layers = [*(f"hidden_{i}" for i in range(len(hidden))), "mean"]
     found: Arrays = {}
-    for name, inner, outer in zip(names, sizes, sizes[1:], strict=False):
+    for name, inner, outer in zip(layers, sizes, sizes[1:], strict=False):
         kernel = draw.normal(size=(learners, inner, outer)) / np.sqrt(inner)
         found[f"actor/{name}/kernel"] = kernel
         found[f"actor/{name}/bias"] = 0.1 * draw.normal(size=(learners, outer))
     found["actor/log_std"] = draw.normal(size=(learners, 2))
-    mean = np.array([*[0.035] * epuck.SENSORS, 0.5, 0.0])
-    std = np.array([*[0.008] * epuck.SENSORS, 0.3, 1.2])
+    mean = by_name(names, infrared=0.035, distance=0.5, bearing=0.0, other=0.0)
+    std = by_name(names, infrared=0.008, distance=0.3, bearing=1.2, other=1.0)
     found["normalizer/mean"] = mean * draw.uniform(0.8, 1.2, (learners, len(mean)))
     found["normalizer/std"] = std * draw.uniform(0.8, 1.2, (learners, len(std)))
     return {name: array.astype(np.float32) for name, array in found.items()}
@@ -79,6 +97,12 @@ def saved(path: Path, given: Arrays | None = None, **changes: Any) -> Policy:
     """Writes a policy and reads it again."""
     policy_file.write(path, arrays() if given is None else given, meta(**changes))
     return policy_file.read(path)
+
+
+def saved_for_webots(path: Path) -> Policy:
+    """Writes a policy that observes what the controller can measure, and nothing else."""
+    names = webots_controller.QUANTITIES
+    return saved(path, arrays(names=names), observation=observed(names=names))
 
 
 def forge(path: Path, given: Arrays, said: Any, digest: str | None = None) -> None:
@@ -92,13 +116,15 @@ def forge(path: Path, given: Arrays, said: Any, digest: str | None = None) -> No
 def seen(trained: Policy, count: int, seed: int = 0) -> np.ndarray:
     """Draws observations [count, R, O] of a metric policy, R its learners.
 
-    Half lie in their physical ranges: 0 to 4 cm of infrared, 0 to 2.2 m, -pi to pi. The others
-    reach half as far again as the normaliser's limit, where it clips them.
+    Half lie in their physical ranges: 0 to 4 cm of infrared, 0 to 2.2 m, -pi to pi, -1 to 1 of
+    what is not known here. The others reach half as far again as the normaliser's limit, where it
+    clips them.
     """
     draw = np.random.default_rng(seed)
     shape = (count // 2, *trained.mean.shape)
-    low = np.array([*[0.0] * epuck.SENSORS, 0.0, -np.pi])
-    high = np.array([*[epuck.SENSOR_RANGE] * epuck.SENSORS, 2.2, np.pi])
+    names = tuple(trained.meta["observation"]["names"])
+    low = by_name(names, infrared=0.0, distance=0.0, bearing=-np.pi, other=-1.0)
+    high = by_name(names, infrared=epuck.SENSOR_RANGE, distance=2.2, bearing=np.pi, other=1.0)
     far = 1.5 * trained.meta["observation"]["limit"] * draw.uniform(-1, 1, shape)
     drawn = [draw.uniform(low, high, shape), trained.mean + trained.std * far]
     return np.concatenate(drawn).astype(np.float32)

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import policies
 import pytest
+from entries import by_name
 from policies import Arrays, saved, several
 
 from swarmjax import epuck, policy
@@ -257,7 +258,9 @@ def test_mean_action_is_the_mode_of_the_learner(tmp_path: Path, activation: Any)
     params = jax.tree.map(
         lambda leaf: leaf + 0.1 * draw.normal(size=leaf.shape).astype(np.float32), learner.params
     )
-    spread = _f32([*[0.01] * 8, 2.0, 1e-9])  # of the last, the least one counts
+    # Of the bearing, the least one counts.
+    names = observation.NAMES
+    spread = _f32(by_name(names, infrared=0.01, distance=2.0, bearing=1e-9, other=1.0))
     batch = draw.normal(size=(64, SIZE)).astype(np.float32) * spread
     moments = ppo.normalizer.update(learner.normalizer, jnp.asarray(batch), jnp.ones(64, bool))
     learner = dataclasses.replace(learner, params=params, normalizer=moments)

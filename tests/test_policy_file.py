@@ -20,6 +20,7 @@ from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.export import __main__ as export
 from swarmjax.export.config import ExportConfig
 from swarmjax.policy import MAX_BYTES, PolicyError
+from swarmjax.task.observation import SIZE
 
 
 def _f32(values: Any) -> np.ndarray:
@@ -114,12 +115,12 @@ _GOOD = policies.arrays()
         (
             _with("normalizer/mean", np.zeros((1, 4), np.float32)),
             {},
-            r"normalizer/mean has shape \[1, 4\]: expected \[1, 10\]",
+            rf"normalizer/mean has shape \[1, 4\]: expected \[1, {SIZE}\]",
         ),
         (
             policies.arrays(learners=2),
             {},
-            r"actor/hidden_0/kernel has shape \[2, 10, 4\]: expected \[1, 10, 4\]",
+            rf"actor/hidden_0/kernel has shape \[2, {SIZE}, 4\]: expected \[1, {SIZE}, 4\]",
         ),
         (
             _with("actor/mean/kernel", np.asfortranarray(np.ones((1, 3, 2), np.float32))),
@@ -132,7 +133,7 @@ _GOOD = policies.arrays()
             r"actor/hidden_1/bias holds a value that is not finite",
         ),
         (
-            _with("normalizer/std", _f32([[1] * 9 + [0]])),
+            _with("normalizer/std", _f32([[1] * (SIZE - 1) + [0]])),
             {},
             r"normalizer/std holds a value that is not above 0",
         ),
@@ -157,18 +158,18 @@ _GOOD = policies.arrays()
         ),
         (
             _GOOD,
-            _part("observation", names=["*/ int main;"] * 10),
+            _part("observation", names=["*/ int main;"] * SIZE),
             r"meta.observation.names is .*: expected a list of names in plain letters",
         ),
         (
             _GOOD,
-            _part("observation", names=["same"] * 10),
+            _part("observation", names=["same"] * SIZE),
             r"meta.observation.names is .*: expected names that differ",
         ),
         (
             _GOOD,
             _part("observation", units=["m"]),
-            r"meta.observation.units has 1 entries: expected 10",
+            rf"meta.observation.units has 1 entries: expected {SIZE}",
         ),
         (
             _GOOD,
@@ -178,15 +179,15 @@ _GOOD = policies.arrays()
         (
             _GOOD,
             _part("observation", offset=[0.0]),
-            r"meta.observation.offset is \[0.0\]: expected 10 finite numbers",
+            rf"meta.observation.offset is \[0.0\]: expected {SIZE} finite numbers",
         ),
         (
             _GOOD,
-            _part("observation", offset=[10**400] * 10),
-            r"meta.observation.offset is \[10+\.\.\.: expected 10 finite numbers",
+            _part("observation", offset=[10**400] * SIZE),
+            rf"meta.observation.offset is \[10+\.\.\.: expected {SIZE} finite numbers",
         ),
         # As float32, which is what divides, this is 0.
-        (_GOOD, _part("observation", scale=[1e-60] * 10), r"meta.observation.scale holds 0"),
+        (_GOOD, _part("observation", scale=[1e-60] * SIZE), r"meta.observation.scale holds 0"),
         (
             _GOOD,
             _part("observation", limit=float("nan")),
@@ -212,12 +213,12 @@ _GOOD = policies.arrays()
         (_GOOD, _part("action", low=[0, -1e-60], high=[1, 1e-60]), r"meta.action.low is \[0, -1e-"),
         (
             _GOOD,
-            _part("observation", units=["*/x/*"] * 10),
+            _part("observation", units=["*/x/*"] * SIZE),
             r"meta.observation.units is .*: expected a list of units in plain letters",
         ),
         (
             _GOOD,
-            _part("observation", units=["m/*s"] * 10),
+            _part("observation", units=["m/*s"] * SIZE),
             r"meta.observation.units is .*: expected a list of units in plain letters",
         ),
         (_GOOD, _part("robot", preset=""), r'meta.robot.preset is "": expected the name of a pres'),

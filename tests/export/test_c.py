@@ -18,6 +18,7 @@ from swarmjax.policy import Policy
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.sim import drive
 from swarmjax.sim.config import RobotConfig
+from swarmjax.task import observation
 
 STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wshadow",
           "-Wconversion", "-Wdouble-promotion")  # fmt: skip
@@ -79,11 +80,7 @@ def test_make_builds_and_runs_the_self_test(tmp_path: Path) -> None:
 
 @needs_gcc
 def test_from_quantities_to_wheel_speeds(tmp_path: Path) -> None:
-    layout = policies.meta()["observation"] | {
-        "encoding": "webots",
-        "offset": [*[0.0] * 9, -np.pi],
-        "scale": [*[1023.0] * 8, 1.5, 2 * np.pi],
-    }
+    layout = policies.observed("webots")
     trained = saved(tmp_path / "p.npz", observation=layout)
     folder = _written(tmp_path / "c", trained)
     _run(folder, "gcc", "-std=c99", "-O2", "-shared", "-fPIC", "policy.c", "-lm", "-o", "p.so")
@@ -97,10 +94,10 @@ def test_from_quantities_to_wheel_speeds(tmp_path: Path) -> None:
             getattr(library, function)(*pointers)
         return found
 
-    quantity = draw.uniform(0, 500, (50, 10)).astype(np.float32)
+    quantity = draw.uniform(0, 500, (50, observation.SIZE)).astype(np.float32)
     expected = (quantity - np.float32(layout["offset"])) / np.float32(layout["scale"])
     # The same operations on the same float32 numbers, here and in the two below.
-    np.testing.assert_array_equal(call("policy_observe", quantity, 10), expected)
+    np.testing.assert_array_equal(call("policy_observe", quantity, observation.SIZE), expected)
     action = draw.normal(size=(50, 2)).astype(np.float32)
     command = policy.command(trained, action)
     np.testing.assert_array_equal(call("policy_command", action, 2), command)
@@ -120,8 +117,9 @@ def test_it_fits_on_a_cortex_m4f(tmp_path: Path) -> None:
     listed = _run(folder, "arm-none-eabi-size", "policy.o").stdout.splitlines()[1].split()
     text, data, bss = (int(word) for word in listed[:3])
     assert (data, bss) == (0, 0)  # RAM is used on the stack alone
-    # Two layers of 64 between 10 and 2, the normaliser's 20 and the scaling of 20 numbers.
-    floats = 10 * 64 + 64 + 64 * 64 + 64 + 64 * 2 + 2 + 20 + 20
+    # Two layers of 64 between inputs and 2, the normaliser's and the scaling's two numbers each.
+    size = observation.SIZE
+    floats = size * 64 + 64 + 64 * 64 + 64 + 64 * 2 + 2 + 2 * size + 2 * size
     assert 4 * floats < text < 4 * floats + 1024
     stack = (folder / "policy.su").read_text()
     used = {line.split()[0].split(":")[-1]: int(line.split()[1]) for line in stack.splitlines()}
@@ -139,7 +137,7 @@ def test_the_layout_stands_in_the_header(tmp_path: Path) -> None:
     trained = saved(tmp_path / "p.npz")
     header = export_c.render(trained)["policy.h"].decode()
     assert f'#define POLICY_DIGEST "{trained.digest}"' in header
-    names = re.findall(r"^ \*   \[(\d)\] (\S+) +(\S+) +offset (\S+), scale (\S+)$", header, re.M)
+    names = re.findall(r"^ \*   \[(\d+)\] (\S+) +(\S+) +offset (\S+), scale (\S+)$", header, re.M)
     layout = trained.meta["observation"]
     assert [(name, unit) for _, name, unit, *_ in names] == list(
         zip(layout["names"], layout["units"], strict=True)

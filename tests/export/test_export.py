@@ -9,7 +9,7 @@ from pathlib import Path
 
 import policies
 import pytest
-from policies import saved
+from policies import saved, saved_for_webots
 from sentences import refusal
 
 from swarmjax import command, policy_file
@@ -50,7 +50,7 @@ def test_a_policy_file_is_exported_beside_itself(
     if form == "onnx":
         pytest.importorskip("onnx", reason="needs the package onnx")
     path = tmp_path / "policy.npz"
-    saved(path)
+    saved_for_webots(path) if form == "webots" else saved(path)
     assert export.main([f"policy={path}", f"format={form}"]) == 0
     out = tmp_path / FORMATS[form]
     assert capsys.readouterr().out == f"{out}: the policy of {path}.\n"

@@ -10,6 +10,7 @@ from policies import saved, several
 
 from swarmjax import policy
 from swarmjax.export import onnx as export_onnx
+from swarmjax.task.observation import SIZE
 
 onnx = pytest.importorskip("onnx", reason="needs the package onnx")
 runtime = pytest.importorskip("onnxruntime", reason="needs the package onnxruntime")
@@ -26,14 +27,14 @@ def test_the_model_is_sound_and_runs_any_batch(learners: int, tmp_path: Path) ->
     session = runtime.InferenceSession(content, providers=["CPUExecutionProvider"])
     (port,) = session.get_inputs()
     assert (port.name, port.type) == ("observation", "tensor(float)")
-    assert port.shape == (["batch", 10] if learners == 1 else ["batch", learners, 10])
+    assert port.shape == (["batch", SIZE] if learners == 1 else ["batch", learners, SIZE])
     assert [out.name for out in session.get_outputs()] == ["action", "command"]
     for count in (2, 14):
         seen = policies.seen(trained, count)
         expected = policy.act(trained, seen)
         fed = seen[:, 0] if learners == 1 else seen
         action, command = session.run(None, {"observation": fed})
-        # Sums of 10 terms at most, in another order; actions are below 4.
+        # Sums of few terms, in another order; actions are below 4.
         np.testing.assert_allclose(action.reshape(expected.shape), expected, atol=2e-6)
         # Ranges of 6.28 rad/s, of which the action is off by 2e-6 / 2.
         np.testing.assert_allclose(

@@ -11,6 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import policies
 import pytest
+from entries import by_name
 from hypothesis import given
 from hypothesis import strategies as st
 from policies import saved, several
@@ -25,6 +26,9 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors, observation
 from swarmjax.task.config import TaskConfig
+
+NAMES = webots_controller.QUANTITIES  # what the controller can measure, and these policies observe
+METRIC, WEBOTS = policies.observed("metric", NAMES), policies.observed("webots", NAMES)
 
 # What a controller sees of Webots: written from the manual's names and units. It plays a script,
 # {"basic": ms, "custom": text, "missing": [names], "steps": [{"counts": [8], "gps": [3],
@@ -102,10 +106,12 @@ class Robot:
 
 def _exported(tmp_path: Path, *words: str, **changes: Any) -> tuple[Policy, Path]:
     """Writes a policy and exports it."""
-    given = policies.arrays(hidden=(16, 16), learners=changes.get("learners", 1))
-    if changes.get("observation", {}).get("encoding") == "webots":
-        given["normalizer/mean"][:] = [*[0.3] * 8, 0.5, 0.5]
-        given["normalizer/std"][:] = [*[0.3] * 8, 0.3, 0.25]
+    changes = {"observation": METRIC} | changes
+    learners = changes.get("learners", 1)
+    given = policies.arrays(hidden=(16, 16), learners=learners, names=NAMES)
+    if changes["observation"]["encoding"] == "webots":
+        given["normalizer/mean"][:] = by_name(NAMES, 0.3, distance=0.5, bearing=0.5, other=0.0)
+        given["normalizer/std"][:] = by_name(NAMES, 0.3, distance=0.3, bearing=0.25, other=1.0)
     trained = saved(tmp_path / "policy.npz", given, **changes)
     assert export.main([f"policy={tmp_path / 'policy.npz'}", "format=webots", *words]) == 0
     return trained, tmp_path / "swarmjax_epuck"
@@ -174,19 +180,15 @@ def _chain(
     sight = task_electronics.Sight(ray, None, distance, bearing)
     none = factors.Factors(**dict.fromkeys(factors.Factors._fields))
     _, seen = task_electronics.begin(electronics, none, sight, np.zeros(len(scenes)), np)
-    robots = np.repeat(seen, len(trained.mean), axis=1)
+    known = [observation.NAMES.index(name) for name in NAMES]
+    robots = np.repeat(seen[..., known], len(trained.mean), axis=1)
     robot = drive.from_config(RobotConfig())
     command = drive.command(policy.act(trained, robots), robot, np)
     return drive.wheel_speeds(command, robot, np)
 
 
-WEBOTS = policies.meta()["observation"] | observation.describe("webots")
-
-
 @pytest.mark.parametrize("answers", ["webots", "real"])
-@pytest.mark.parametrize(
-    "layout", [policies.meta()["observation"], WEBOTS], ids=["metric", "webots"]
-)
+@pytest.mark.parametrize("layout", [METRIC, WEBOTS], ids=["metric", "webots"])
 @pytest.mark.parametrize("learners", [1, 3])
 def test_the_wheels_turn_as_they_do_in_the_judge(
     learners: int, layout: dict[str, Any], answers: Literal["webots", "real"], tmp_path: Path
@@ -211,11 +213,11 @@ def test_the_wheels_turn_as_they_do_in_the_judge(
 
 
 def test_a_robot_draws_its_actions_from_the_policy(tmp_path: Path) -> None:
-    given = policies.arrays(hidden=(16, 16))
+    given = policies.arrays(hidden=(16, 16), names=NAMES)
     given["actor/log_std"][:] = np.log([0.1, 0.02])  # too little to meet a limit of the command
     given["actor/mean/kernel"][:] = 0.0
     given["actor/mean/bias"][:] = 0.0
-    trained = saved(tmp_path / "policy.npz", given)
+    trained = saved(tmp_path / "policy.npz", given, observation=METRIC)
     assert export.main([f"policy={tmp_path / 'policy.npz'}", "format=webots"]) == 0
     folder = tmp_path / "swarmjax_epuck"
     steps = [_script(_scene(np.random.default_rng(0)), "webots")] * 2000

@@ -1,0 +1,21 @@
+"""Where quantities lie in an observation, for the tests of all who look into one."""
+
+import numpy as np
+
+from swarmjax import epuck
+from swarmjax.task import observation
+
+_FIRST = observation.NAMES.index("infrared_0")
+INFRARED = slice(_FIRST, _FIRST + epuck.SENSORS)  # entries of one input lie side by side
+DISTANCE = observation.NAMES.index("target_distance")
+BEARING = observation.NAMES.index("target_bearing")
+TARGET = np.array([DISTANCE, BEARING])
+
+
+def by_name(
+    names: tuple[str, ...], infrared: float, distance: float, bearing: float, other: float
+) -> np.ndarray:
+    """Puts a number for each entry [O] together; `other` is that of entries not known here."""
+    known = {f"infrared_{i}": infrared for i in range(epuck.SENSORS)}
+    known |= {"target_distance": distance, "target_bearing": bearing}
+    return np.array([known.get(name, other) for name in names])
