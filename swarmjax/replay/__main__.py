@@ -176,6 +176,10 @@ def main(arguments: Sequence[str]) -> int:
             report = partial(progress.advance, bar)
             _write("video", video, lambda: replay_video.write(video, settings, episodes, report))
     sys.stdout.write(f"swarmjax.replay: {said}\n")
+    for each in entrants:
+        left_out = ", ".join(each.policy.meta.get("extensions", {}).get("reward", {}))
+        if left_out:
+            sys.stdout.write(f"{each.path}: the rewards shown leave out {left_out} of extensions\n")
     labels = "; ".join(episode.label for episode in episodes)
     sys.stdout.write(f"{out}: {labels}; {len(page) / 1e6:.2f} MB.\n")
     if video:
