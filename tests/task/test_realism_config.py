@@ -337,24 +337,28 @@ def test_ranges_made_by_hand_are_held_to_the_same():
 
 
 @pytest.mark.parametrize(
-    ("cls", "command", "robot"),
-    [(TrainConfig, "train", "planar"), (EvaluateConfig, "evaluate", "wheeled")],
+    ("cls", "command", "robot", "realism", "mass"),
+    [
+        (TrainConfig, "train", "planar", "ideal", "null"),
+        (EvaluateConfig, "evaluate", "<as trained, on wheels>", "<as trained>", "<as trained>"),
+    ],
 )
-def test_help_gives_range_unit_and_choices(cls, command, robot):
+def test_help_gives_range_unit_and_choices(cls, command, robot, realism, mass):
     overview = " ".join(help_text(cls, command).split())
-    assert "realism=ideal (ideal, real, webots)" in overview
+    assert f"realism={realism} (ideal, real, webots)" in overview
     assert f"robot={robot} (paper, planar, planar_v2, wheeled, wheeled_v2)" in overview
     lines = [" ".join(line.split()) for line in help_text(cls, command, ["realism"]).splitlines()]
     assert (
-        "realism.mass=null kg; a robot and episode "
+        f"realism.mass={mass} kg; a robot and episode "
         "(a range [low,high] of numbers more than 0.01, at most 100 or null)" in lines
     )
     assert (
-        "realism.action_latency=null control steps; a robot and episode "
+        f"realism.action_latency={mass} control steps; a robot and episode "
         "(a range [low,high] of whole numbers 0 to 2147483647 or null)" in lines
     )
+    stall = "[0.1,0.3]" if mass == "null" else mass
     assert (
-        "realism.stall_time=[0.1,0.3] for how long, s; a stall "
+        f"realism.stall_time={stall} for how long, s; a stall "
         "(a range [low,high] of numbers more than 0)" in lines
     )
     assert not any(line.startswith("realism.name") for line in lines)
