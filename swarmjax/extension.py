@@ -10,6 +10,7 @@ import ast
 import hashlib
 import importlib.util
 import inspect
+import linecache
 import re
 import sys
 import textwrap
@@ -273,7 +274,9 @@ def _import(path: Path, digest: str) -> types.ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
-        spec.loader.exec_module(module)
+        # Not from bytecode, nor with old lines: both go by size and whole seconds of a file's age.
+        linecache.cache.pop(str(path), None)
+        exec(compile(path.read_bytes(), str(path), "exec"), vars(module))
     except Exception as error:
         del sys.modules[name]
         if isinstance(error, ConfigError):
