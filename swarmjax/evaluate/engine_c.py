@@ -31,7 +31,7 @@ from swarmjax.task import electronics, level, observation
 from swarmjax.task import factors as task_factors
 from swarmjax.task.electronics import Memory, Sight
 from swarmjax.task.factors import Factors
-from swarmjax.task.observation import View
+from swarmjax.task.level import Level
 
 
 class Arenas(NamedTuple):
@@ -44,8 +44,7 @@ class Arenas(NamedTuple):
         memory: [A] of the robots' electronics.
         target: [A, R, 2] x (m), y (m).
         obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
-        obstacle_present: [A, M] whether the obstacle is there.
-        side: [A] of the arenas, m.
+        level: [A] what the episodes started from.
         seed: [A] uint32 of the levels.
         pose: [A, R, 3] x (m), y (m), yaw (rad).
         observation: [A, R, O].
@@ -60,8 +59,7 @@ class Arenas(NamedTuple):
     memory: Memory
     target: np.ndarray
     obstacle: np.ndarray
-    obstacle_present: np.ndarray
-    side: np.ndarray
+    level: Level
     seed: np.ndarray
     pose: np.ndarray
     observation: np.ndarray
@@ -116,11 +114,11 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     Returns:
         The arenas at rest, observed.
     """
-    pose, target, obstacle, there, seed, side = (
-        np.stack([getattr(each, name) for each in levels])
-        for name in ("start", "target", "obstacle", "obstacle_present", "seed", "side")
+    begun = Level(*map(np.stack, zip(*levels, strict=True)))
+    pose, target, obstacle = (
+        x.astype(np.float64) for x in (begun.start, begun.target, begun.obstacle)
     )
-    pose, target, obstacle = (x.astype(np.float64) for x in (pose, target, obstacle))
+    seed, side = begun.seed, begun.side
     realism, robot, boxes = judge.config.realism, judge.config.robot, obstacle.shape[1]
     factors = task_factors.draw(seed, realism, robot, judge.spacing.robots, boxes, np)
     model = _models(judge, factors, len(levels))
@@ -128,8 +126,7 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     data[:] = [place(judge, *each) for each in zip(model, pose, obstacle, side, strict=True)]
     outcome = _no_outcome(len(levels), judge.spacing.robots)
     sight = look(judge, data, factors, pose, target, obstacle)
-    fixtures = _Fixtures(target, obstacle, there, side)
-    sight = _look_by_extension(judge, sight, pose, fixtures, outcome.arrived, outcome.clock)
+    sight = _look_by_extension(judge, sight, pose, begun, outcome.arrived, outcome.clock)
     memory, seen = electronics.begin(judge.electronics, factors, sight, outcome.clock, np)
     return Arenas(
         model=model,
@@ -138,8 +135,7 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
         memory=memory,
         target=target,
         obstacle=obstacle,
-        obstacle_present=there,
-        side=side,
+        level=begun,
         seed=seed,
         pose=pose,
         observation=seen,
@@ -236,8 +232,7 @@ def step(judge: Judge, arenas: Arenas) -> Arenas:
     begins, apart = gaps.count_contacts(gap, arenas.apart, task.control_step, np)
     clock = arenas.outcome.clock + 1
     arrived = arenas.outcome.arrived | arrives
-    fixtures = _Fixtures(arenas.target, arenas.obstacle, arenas.obstacle_present, arenas.side)
-    sight = _look_by_extension(judge, sight, pose, fixtures, arrived, clock)
+    sight = _look_by_extension(judge, sight, pose, arenas.level, arrived, clock)
     memory, seen = electronics.sense(judge.electronics, memory, arenas.factors, sight, clock, np)
     step = _Step(active, arrives, begins, touches, impulse, sight.ray < task.sensor_range)
     anchor, outcome = _tally(arenas, pose, step)
@@ -246,44 +241,18 @@ def step(judge: Judge, arenas: Arenas) -> Arenas:
     )
 
 
-class _Fixtures(NamedTuple):
-    """What stands still: targets [A, R, 2], obstacles [A, M, 5] and presence [A, M], sides [A]."""
-
-    target: np.ndarray
-    obstacle: np.ndarray
-    obstacle_present: np.ndarray
-    side: np.ndarray
-
-
 def _look_by_extension(
     judge: Judge,
     sight: Sight,
     pose: np.ndarray,
-    fixtures: _Fixtures,
+    levels: Level,
     arrived: np.ndarray,
     clock: np.ndarray,
 ) -> Sight:
     """Adds what the observations of an extension see."""
     if judge.own is None:
         return sight
-    shown = (pose, *fixtures, sight.distance, sight.bearing, sight.ray)
-    place, target, obstacle, there, side, distance, bearing, ray = (
-        x.astype(bool if x.dtype == bool else np.float32) for x in shown
-    )
-    view = View(
-        pose=place,
-        target=target,
-        distance=distance,
-        bearing=bearing,
-        infrared=ray,
-        present=np.ones_like(arrived),
-        arrived=arrived,
-        side=side,
-        obstacle=obstacle,
-        obstacle_present=there,
-        clock=clock.astype(np.int32),
-    )
-    return sight._replace(own=judge.own(view))
+    return sight._replace(own=judge.own(electronics.view(sight, pose, levels, arrived, clock)))
 
 
 class _Step(NamedTuple):

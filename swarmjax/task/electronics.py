@@ -21,7 +21,8 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import observation
 from swarmjax.task.config import TaskConfig, resolve_encoding
 from swarmjax.task.factors import Factors
-from swarmjax.task.observation import Encoding, Layout, Readings
+from swarmjax.task.level import Level
+from swarmjax.task.observation import Encoding, Layout, Readings, View
 
 Array = Any
 _SLACK = 1e-4  # of a period: a sample that is due now is not put off by rounding
@@ -93,6 +94,34 @@ class Sight(NamedTuple):
     distance: Array
     bearing: Array
     own: Array | None = None
+
+
+def view(sight: Sight, pose: Array, level: Level, arrived: Array, clock: Array) -> View:
+    """Puts together what observations of an extension look at.
+
+    Args:
+      sight: what there is to be sensed.
+      pose: [..., R, 3] x (m), y (m), yaw (rad).
+      level: what the episode started from.
+      arrived: [..., R] whether the robot has arrived.
+      clock: [...] or [] control steps since the start.
+
+    Returns:
+      The view, of one arena or of many.
+    """
+    return View(
+        pose=pose,
+        target=level.target,
+        distance=sight.distance,
+        bearing=sight.bearing,
+        infrared=sight.ray,
+        present=level.present,
+        arrived=arrived,
+        side=level.side,
+        obstacle=level.obstacle,
+        obstacle_present=level.obstacle_present,
+        clock=clock,
+    )
 
 
 def load(

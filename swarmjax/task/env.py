@@ -29,7 +29,6 @@ from swarmjax.task.electronics import Electronics, Memory, Sight
 from swarmjax.task.episode import Episode
 from swarmjax.task.factors import Factors
 from swarmjax.task.level import Level, Spacing
-from swarmjax.task.observation import View
 from swarmjax.task.stage_config import StageConfig, make_room
 
 
@@ -331,19 +330,7 @@ def _look_by_extension(
     """Adds what the observations of an extension see."""
     if not world.electronics.own:
         return sight
-    view = View(
-        pose=pose,
-        target=level.target,
-        distance=sight.distance,
-        bearing=sight.bearing,
-        infrared=sight.ray,
-        present=level.present,
-        arrived=arrived,
-        side=level.side,
-        obstacle=level.obstacle,
-        obstacle_present=level.obstacle_present,
-        clock=clock,
-    )
+    view = task_electronics.view(sight, pose, level, arrived, clock)
     return sight._replace(own=extended.look(world.electronics.own, view))
 
 
