@@ -5,7 +5,7 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from swarmjax import extension
+from swarmjax import policy_file
 from swarmjax.sim import physics
 from swarmjax.task import env, extended, level
 from swarmjax.task import stage as task_stage
@@ -23,7 +23,7 @@ from swarmjax.training import program as programs
 from swarmjax.training import rollout
 from swarmjax.training.config import ProgramConfig
 
-_REDRAW = 32  # control steps in which every level that waits is drawn anew; episodes take longer
+_REDRAW = 32  # control steps in which every level that waits is replaced; episodes take longer
 
 
 class Space(NamedTuple):
@@ -106,7 +106,7 @@ class Swarm:
     def action_space(self) -> Space:
         """One robot's action, [2]: -1..1 spans the commands; what is beyond is clipped."""
         ones = np.ones(programs.ACTION_SIZE, np.float32)
-        return Space(ones.shape, ("speed", "turn_rate"), ("1", "1"), -ones, ones)
+        return Space(ones.shape, policy_file.ACTION_NAMES, ("1", "1"), -ones, ones)
 
     def pose(self, state: SwarmState) -> Array:
         """[A, R, 3] x (m), y (m), yaw (rad) of the robots; absent ones stand outside."""
@@ -135,14 +135,14 @@ class Swarm:
 
         Arenas reset themselves: where `done`, the state is that of the next episode, while the
         step's observation is the last one of the old. Levels of the next episodes are drawn ahead,
-        each anew every 32 steps, so that an arena that ends twice within those begins alike.
+        each again every 32 steps; an arena that ends twice within those repeats its level.
 
         Args:
             state: before.
             action: [A, R, 2], -1..1 spans the commands; what is beyond is clipped.
 
         Returns:
-            The state after, and what the step came to: observation [A, R, O], reward, terminated,
+            The state after, and the step's outcome: observation [A, R, O], reward, terminated,
             truncated and valid [A, R], done and sound [A].
         """
         unpack = partial(physics.unpack, self.world.physics)
@@ -155,7 +155,7 @@ class Swarm:
         return SwarmState(arenas=arenas, waiting=waiting, key=key, clock=state.clock + 1), came
 
     def _redraw(self, waiting: EnvState, clock: Array, key: Array) -> EnvState:
-        """Draws the next few of the episodes that wait anew, in turn."""
+        """Replaces the next few of the episodes that wait, in turn."""
         count = -(-self.num_arenas // _REDRAW)
         which = (clock * count + jnp.arange(count)) % self.num_arenas
         fresh = self._draw(key, which)
@@ -187,6 +187,6 @@ def load(config: ProgramConfig) -> Swarm:
     Raises:
         ConfigError: a piece of an extension does not fit, or see `task.env.load`.
     """
-    names = [piece.name for piece in extension.load(config.extensions).levels]
-    stages: Any = task_stage.stack(config.stage, names)
-    return Swarm(config=config, world=programs.load_world(config), stages=stages)
+    world = programs.load_world(config)
+    stages = task_stage.stack(config.stage, world.drawings)
+    return Swarm(config=config, world=world, stages=stages)

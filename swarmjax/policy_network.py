@@ -4,6 +4,7 @@ Imports JAX when it is first called, so that policies that need none run without
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -60,17 +61,26 @@ class PolicyNetwork:
     def _compile(self) -> Callable[[np.ndarray], Any]:
         import jax
 
-        module, params = self.module, self.params
-        learners = len(next(iter(self._arrays.values())))
+        return jax.jit(partial(features, self.module, self.params))
 
-        def one(mine: Any, x: Any) -> Any:
-            return module.apply({"params": mine}, x)
 
-        def shared(x: Any) -> Any:
-            return one(jax.tree.map(lambda leaf: leaf[0], params), x)
+def features(module: Any, params: Any, x: Any) -> Any:
+    """Applies a network to arenas side by side, by JAX.
 
-        def independent(x: Any) -> Any:
-            mine = jax.tree.map(lambda leaf: leaf[: x.shape[-2]], params)
-            return jax.vmap(one, in_axes=(0, 1), out_axes=1)(mine, x)
+    Args:
+        module: Flax module.
+        params: [L, ...] of it; of one learner for all robots, or of one for each.
+        x: [B, R, O] normalised observations.
 
-        return jax.jit(shared if learners == 1 else independent)
+    Returns:
+        [B, R, F] features.
+    """
+    import jax
+
+    def one(mine: Any, seen: Any) -> Any:
+        return module.apply({"params": mine}, seen)
+
+    if jax.tree.leaves(params)[0].shape[0] == 1:
+        return one(jax.tree.map(lambda leaf: leaf[0], params), x)
+    mine = jax.tree.map(lambda leaf: leaf[: x.shape[-2]], params)
+    return jax.vmap(one, in_axes=(0, 1), out_axes=1)(mine, x)

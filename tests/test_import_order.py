@@ -16,7 +16,7 @@ ROOMS = {
     "sim": {"config", "epuck"},
     "task": {"config", "epuck", "extension", "sim"},
     "ppo": {"config", "extension"},
-    "curriculum": {"config", "task"},
+    "curriculum": {"config", "extension", "task"},
     "training": {"config", "extension", "provenance", "sim", "task", "ppo", "curriculum"},
     "run": SHARED | {"sim", "task", "ppo", "curriculum", "training"},
     "evaluate": SHARED | {"sim", "task"},
@@ -27,7 +27,7 @@ ROOMS = {
 }
 # The engine on the device judges by what trains; the cache of its programs is a run's.
 ALSO = {
-    "evaluate/engine_mjx.py": {"ppo", "training"},
+    "evaluate/engine_mjx.py": {"policy_network", "ppo", "training"},
     "evaluate/trials.py": {"run"},
 }
 # What rooms share imports no room but `config`; policy.py, which people take along, nothing.

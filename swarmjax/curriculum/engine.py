@@ -19,6 +19,7 @@ from flax import struct
 from jax import Array
 
 from swarmjax.curriculum.config import CurriculumConfig
+from swarmjax.extension import LevelDrawing
 from swarmjax.task import stage as task_stage
 from swarmjax.task.episode import Ended
 from swarmjax.task.stage import Stage
@@ -201,7 +202,7 @@ def schedule(
     updates: int,
     step_limit: int,
     rollout: int,
-    drawings: Sequence[str] = (),
+    drawings: Sequence[LevelDrawing] = (),
 ) -> Schedule:
     """Works the curriculum's numbers out.
 
@@ -213,7 +214,7 @@ def schedule(
       updates: of the whole run.
       step_limit: control steps of an episode, at most.
       rollout: control steps of an update.
-      drawings: names of an extension's ways of drawing levels.
+      drawings: an extension's ways of drawing levels.
 
     Returns:
       The numbers, an argument of the compiled program.

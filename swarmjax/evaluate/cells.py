@@ -168,8 +168,7 @@ def _draw(
     drawings: Sequence[LevelDrawing] = (),
 ) -> Level:
     """Draws levels of these numbers, for hulls and targets of these radii, m."""
-    names = [each.name for each in drawings]
-    one = task_stage.select(task_stage.stack([stage], names), np.intp(0))
+    one = task_stage.single(stage, drawings)
     spacing = level.Spacing(stage.robots, stage.obstacles, *radii)
     draw = judge.draw_level
     drawn = [shapes.expand(draw(one, spacing, seed, each, drawings), shape) for each in numbers]

@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from swarmjax import extension
+from swarmjax import extension, policy_network
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import judge, measures
 from swarmjax.evaluate.config import EvaluateConfig
@@ -82,10 +82,10 @@ def draw_levels(world: World, stage: StageConfig, seed: int, episodes: int) -> L
                 f"stage {stage.name}: {key} is {value}, but sim.max_{key} is {most}: give "
                 f"sim.max_{key}={value} or more."
             )
-    one = task_stage.select(task_stage.stack([stage]), np.intp(0))
+    one = task_stage.single(stage, world.drawings)
     spacing = world.spacing._replace(robots=stage.robots, obstacles=stage.obstacles)
     drawn = [
-        _make_room(judge.draw_level(one, spacing, seed, episode), world.spacing)
+        _make_room(judge.draw_level(one, spacing, seed, episode, world.drawings), world.spacing)
         for episode in range(episodes)
     ]
     return Level(*(np.stack(fields) for fields in zip(*drawn, strict=True)))
@@ -235,22 +235,11 @@ def _mean_action(
     robots = slice(observation.shape[-2])
     x = jnp.clip((observation - mean[robots]) / std[robots], -limit, limit)
     if network is not None:
-        x = _own_features(network, params, x)
+        x = policy_network.features(network, params, x)
     *hidden, last = layers
     for layer in hidden:
         x = _ACTIVATIONS[activation](_dense(x, layer, robots))
     return _dense(x, last, robots)
-
-
-def _own_features(network: Any, params: Any, x: Array) -> Array:
-    """Features [E, R, F] of an extension's network: of one learner, or of one for each robot."""
-    robots = x.shape[-2]
-    learners = jax.tree.leaves(params)[0].shape[0]
-    mine = jax.tree.map(lambda leaf: jnp.asarray(leaf)[: min(robots, learners)], params)
-    if learners == 1:
-        return network.apply({"params": jax.tree.map(lambda leaf: leaf[0], mine)}, x)
-    apply = partial(jax.vmap, in_axes=(0, 1), out_axes=1)
-    return apply(lambda own, seen: network.apply({"params": own}, seen))(mine, x)
 
 
 def _dense(x: Array, layer: tuple[ArrayLike, ArrayLike], robots: slice) -> Array:

@@ -81,7 +81,7 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
     check_policy(config, config.stage, config.policy, trained)
     extensions = extension.load(config.extensions)
     own = _observations(extensions, trained)
-    stage = task_stage.select(_stack(config.stage, extensions.levels), np.intp(0))
+    stage = task_stage.single(config.stage, extensions.levels)
     robots, obstacles = config.stage.robots, config.stage.obstacles
     spacing = level.Spacing(robots, obstacles, config.robot.hull_radius, config.task.target_radius)
     example = draw_level(stage, spacing, config.seed, 0, extensions.levels)
@@ -150,11 +150,6 @@ def _geoms(compiled: mujoco.MjModel, ids: sim_model.Ids) -> tuple[np.ndarray, np
         hull = compiled.geom(f"robot{i}_hull").id
         robot[hull], kind[hull] = i, gaps.KINDS.index("robot")
     return robot, kind
-
-
-def _stack(stage: StageConfig, drawings: Sequence[LevelDrawing]) -> task_stage.Stage:
-    """Stacks one stage [1]."""
-    return task_stage.stack([stage], [each.name for each in drawings])
 
 
 def _observations(extensions: Extensions, trained: Policy) -> tuple[Observation, ...]:

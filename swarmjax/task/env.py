@@ -150,7 +150,7 @@ def load(
     size = model.ArenaSize(sim.robots, sim.obstacles, task_stage.largest_half(stages))
     spacing = Spacing(*size[:2], robot.hull_radius, task.target_radius)
     if chosen.drawings:
-        drawn = task_stage.stack(stages, [piece.name for piece in chosen.drawings])
+        drawn = task_stage.stack(stages, chosen.drawings)
         names = [stage.name for stage in stages]
         extended.check_levels(chosen.drawings, drawn, spacing, names)
     return World(

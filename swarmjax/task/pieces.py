@@ -49,7 +49,7 @@ def choose(extensions: Extensions, task: TaskConfig, stages: Sequence[StageConfi
     for name in task.reward.extra:
         _check_named("task.reward.extra", name, terms)
     weighted = [(each, task.reward.extra.get(name, each.weight)) for name, each in terms.items()]
-    stack(stages, [piece.name for piece in extensions.levels])  # refuses one that is missing
+    stack(stages, extensions.levels)  # refuses one that is missing
     return Chosen(
         observations=tuple(observations[name] for name in wanted),
         terms=tuple((piece, weight) for piece, weight in weighted if weight),

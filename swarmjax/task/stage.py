@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from swarmjax.config import ConfigError, show
+from swarmjax.extension import LevelDrawing
 from swarmjax.task import fixed_level
 from swarmjax.task.stage_config import BUILT_IN, StageConfig
 
@@ -36,16 +37,17 @@ class Stage(NamedTuple):
     drawing: Array
 
 
-def stack(stages: Sequence[StageConfig], drawings: Sequence[str] = ()) -> Stage:
+def stack(stages: Sequence[StageConfig], drawings: Sequence[LevelDrawing] = ()) -> Stage:
     """Stacks configured stages into NumPy arrays [S].
 
     Args:
       stages: the stages.
-      drawings: names of an extension's ways of drawing levels.
+      drawings: an extension's ways of drawing levels.
 
     Raises:
       ConfigError: if a fixed level has no room for its robots, or a way of drawing is missing.
     """
+    names = [piece.name for piece in drawings]
     for stage in stages:
         _check_fixed(stage)
     return Stage(
@@ -56,8 +58,13 @@ def stack(stages: Sequence[StageConfig], drawings: Sequence[str] = ()) -> Stage:
         obstacle_size=np.array([s.obstacle_size for s in stages], np.float32),
         fixed=np.array([s.level == "fixed" for s in stages]),
         fence=np.array([s.layout == "fence" for s in stages]),
-        drawing=np.array([_drawing(s, drawings) for s in stages], np.int32),
+        drawing=np.array([_drawing(s, names) for s in stages], np.int32),
     )
+
+
+def single(stage: StageConfig, drawings: Sequence[LevelDrawing] = ()) -> Stage:
+    """Returns one configured stage, fields [] of NumPy, with the same checks as `stack`."""
+    return select(stack([stage], drawings), np.intp(0))
 
 
 def select(stages: Stage, index: Array) -> Stage:

@@ -92,7 +92,7 @@ def schedule(config: ProgramConfig) -> Schedule:
         updates=config.updates,
         step_limit=config.task.step_limit,
         rollout=config.algo.rollout_length,
-        drawings=[piece.name for piece in extension.load(config.extensions).levels],
+        drawings=extension.load(config.extensions).levels,
     )
 
 

@@ -39,7 +39,7 @@ def world() -> World:
 @pytest.fixture(scope="module")
 def drawn(world: World) -> level.Level:
     uniforms = np.random.default_rng(3).random(level.uniform_count(world.spacing), np.float32)
-    stage = task_stage.select(task_stage.stack([RING], ["ring"]), 0)
+    stage = task_stage.single(RING, world.drawings)
     return extended.draw(uniforms, stage, world.spacing, world.drawings)
 
 
@@ -74,7 +74,7 @@ def test_a_level_is_drawn_by_the_piece_and_the_rest_is_parked(drawn: level.Level
 
 
 def test_the_judge_draws_the_same_level(world: World) -> None:
-    stage = task_stage.select(task_stage.stack([RING], ["ring"]), np.intp(0))
+    stage = task_stage.single(RING, world.drawings)
     theirs = judge.draw_level(stage, world.spacing, 5, 2, world.drawings)
     uniforms = np.random.default_rng([5, 2]).random(level.uniform_count(world.spacing), np.float32)
     mine = extended.draw(uniforms, stage, world.spacing, world.drawings)
@@ -84,7 +84,7 @@ def test_the_judge_draws_the_same_level(world: World) -> None:
 
 def test_other_stages_are_drawn_as_without_the_piece(world: World) -> None:
     plain = StageConfig(name="plain", robots=3, side=1.0)
-    stages = task_stage.stack([RING, plain], ["ring"])
+    stages = task_stage.stack([RING, plain], world.drawings)
     uniforms = np.random.default_rng(4).random(level.uniform_count(world.spacing), np.float32)
     found = extended.draw(uniforms, task_stage.select(stages, 1), world.spacing, world.drawings)
     expected = level.sample(uniforms, task_stage.select(stages, 1), world.spacing, jnp)
