@@ -25,8 +25,8 @@ EXAMPLES: dict[str, dict[str, str]] = {
         "stage=s6 run.dry=true": "compile, say what the run needs, and train nothing",
     },
     "swarmjax.evaluate": {
-        "policy=runs/first/policy.npz": "1,000 levels of stage s6, on wheels",
-        "policy=runs/first/policy.npz stage=s3 robot=planar": "the body that it was trained on",
+        "policy=runs/first/policy.npz": "1,000 levels of its last stage, on wheels",
+        "policy=runs/first/policy.npz stage=s3 robot=planar": "another stage, and the planar body",
         "policy=runs/first/policy.npz suite=headline out=judged": "a suite, with tables and plots",
         "policy='runs/first/policy-seed*.npz'": "all seeds of a run together",
         "compare=a.npz,b.npz": "two policies, level by level",
@@ -45,7 +45,7 @@ EXAMPLES: dict[str, dict[str, str]] = {
         "run=runs/first out=reports/first": "into a folder of your choice",
     },
     "swarmjax.replay": {
-        "policy=runs/first/policy.npz": "level 0 of stage s6, into replay.html",
+        "policy=runs/first/policy.npz": "level 0 of its last stage, into replay.html",
         "policy=runs/first/policy.npz level=0,7,12": "several levels",
         "policy=runs/first/policy.npz worst=5": "the five of 1,000 that it does worst in",
         "policy=a.npz,b.npz worst=3": "two policies side by side",
@@ -104,14 +104,9 @@ def line(name: str, *arguments: str) -> str:
 
     Args:
         name: of the command, `evaluate` say.
-        arguments: its words, as `word` writes them.
+        arguments: its `key=value` words.
     """
     return shlex.join(["python", "-m", f"swarmjax.{name}", *arguments])
-
-
-def word(key: str, value: str) -> str:
-    """Write a text as a word of a command line, quoted where Hydra's grammar needs it."""
-    return f"{key}={value}"
 
 
 def _module(name: str) -> str:

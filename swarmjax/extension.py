@@ -228,7 +228,7 @@ def load(source: str | None) -> Extensions:
         ) from None
     key = (str(path.resolve()), hashlib.sha256(content).hexdigest())
     if key not in _files:
-        _files[key] = collect(_pieces(vars(_import(path, key[1]))), source)
+        _files[key] = collect(_pieces(vars(_import(path, content, key[1]))), source)
     return _files[key]
 
 
@@ -265,18 +265,18 @@ def hand_over(given: object) -> str | None:
     return word
 
 
-def _import(path: Path, digest: str) -> types.ModuleType:
+def _import(path: Path, content: bytes, digest: str) -> types.ModuleType:
     """Run a file as a module of its own, so that it cannot stand in the way of another."""
     name = f"_swarmjax_extension_{digest[:16]}"
     spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
+    if spec is None:
         raise ConfigError(f"extensions is {show(str(path))}: give a file that ends in .py.")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
         # Not from bytecode, nor with old lines: both go by size and whole seconds of a file's age.
         linecache.cache.pop(str(path), None)
-        exec(compile(path.read_bytes(), str(path), "exec"), vars(module))
+        exec(compile(content, str(path), "exec"), vars(module))
     except Exception as error:
         del sys.modules[name]
         if isinstance(error, ConfigError):

@@ -144,4 +144,6 @@ def test_a_piece_that_is_missing_or_has_changed_is_named() -> None:
 
 
 def test_only_the_kinds_that_matter_are_asked_for() -> None:
-    extension.check_needs({"reward": {"turning": "0" * 64}}, Extensions(), "p", ["observation"])
+    needs = {"reward": {"turning": "0" * 64}}
+    assert extension.check_needs(needs, Extensions(), "p", ["observation"]) is None
+    assert refusal(extension.check_needs, needs, Extensions(), "p", ["reward"]).startswith("p was ")

@@ -48,8 +48,7 @@ def compose(
     for key in words.keys() - groups.keys():
         _parse(words[key])
     for group, choice in (defaults(command) | groups).items():
-        if choice is not None:
-            read_choice(group, choice)  # names a broken file, where Hydra would not
+        read_choice(group, choice)  # names a broken file, where Hydra would not
     forced = [word if key in groups else f"++{word}" for key, word in words.items()]
     composed, chosen = _hydra(command, [word for word in forced if not _is_of(word, own)])
     mapping = _resolve(composed)
@@ -302,12 +301,17 @@ def values(words: Mapping[str, str]) -> dict[str, Any]:
 
 def _quote(word: str) -> str:
     """Quote a text for Hydra's grammar, so that a path may hold `=`, a comma or a space."""
-    from hydra.core.override_parser.types import Quote, QuotedString
-
     key, _, value = word.partition("=")
     if value in ("", "null") or value[0] in "'\"":
         return word
-    return f"{key}={QuotedString(text=value, quote=Quote.single).with_quotes()}"
+    return f"{key}={quote(value)}"
+
+
+def quote(text: str) -> str:
+    """Write a text so that Hydra's grammar reads it as it is."""
+    from hydra.core.override_parser.types import Quote, QuotedString
+
+    return QuotedString(text=text, quote=Quote.single).with_quotes()
 
 
 def _parse(word: str) -> object:

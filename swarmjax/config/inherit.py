@@ -1,6 +1,6 @@
 """What a command takes from a run or a policy, as words that come before those that were typed.
 
-Of a key that is given twice the last word counts, so that whatever is typed wins.
+The last word for a key counts, so that what is typed wins.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -13,7 +13,7 @@ from swarmjax.config.section import Section
 def group_words(
     cls: type[Section], group: str, held: Section, typed: Sequence[str], skip: Iterable[str] = ()
 ) -> list[str]:
-    """Write the values of a section as words, but for what a chosen file says otherwise.
+    """Write the values of a section as words, but not those that a typed choice of a file sets.
 
     Args:
         cls: the command's dataclass.
@@ -28,8 +28,8 @@ def group_words(
     words = files.split_words(cls, typed)
     own = files.read_choice(group, files.choice_of(words[group])) if group in words else {}
     left = {*skip, *own.get(group, own)}  # a file for the whole config nests its groups
-    default = section.to_dict(_default(type(held)))
-    derived = section.keys(type(held), derived=True)
+    cls_held = type(held)
+    default, derived = section.to_dict(cls_held()), section.keys(cls_held, derived=True)
     return [
         f"{group}.{key}={write(value)}"
         for key, value in _differences(section.to_dict(held), default)
@@ -59,16 +59,12 @@ def preset_words(cls: type[Section], group: str, held: Any, typed: Sequence[str]
 def write(value: object) -> str:
     """Write plain data so that Hydra's grammar reads the same value."""
     if isinstance(value, str):
-        return "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"
+        return files.quote(value)
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     if isinstance(value, list | tuple):
         return f"[{','.join(map(write, value))}]"
     return repr(value)
-
-
-def _default(cls: type[Section]) -> Section:
-    return cls()
 
 
 def _differences(held: Mapping[str, Any], other: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

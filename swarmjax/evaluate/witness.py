@@ -16,10 +16,11 @@ from swarmjax.evaluate.trials import Entrant
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import stage_files
-from swarmjax.task.config import TaskConfig
+from swarmjax.task.config import TaskConfig, describe
 
 # Of the task, what a judge asks for too; rewards and step limit are those of training.
 _TASK = ("control_step", "target_radius", "observations")
+_TOLD = ("robot", "task", "realism")  # what a line names that a word set otherwise
 
 
 class Trained(NamedTuple):
@@ -151,15 +152,8 @@ def _value(words: list[str], key: str) -> str:
 
 def _say(settings: Any, typed: Sequence[str]) -> str:
     """Says in one line what robot and task the policies are run with."""
-    robot, task = settings.robot, settings.task
     told = [word for word in typed if word.partition("=")[0].partition(".")[0] in _TOLD]
     levels = f"suite {settings.suite}" if settings.suite else f"stage {settings.stage.name}"
-    return (
-        f"as trained{f' but for {" ".join(told)}' if told else ''}: hull {robot.hull_radius:g} m, "
-        f"infrared to {task.sensor_range:g} m, at most {robot.max_speed:g} m/s and "
-        f"{robot.max_turn_rate:g} rad/s, control step {task.control_step:g} s, "
-        f"realism {settings.realism.name}; {robot.body} body, {levels}"
-    )
-
-
-_TOLD = ("robot", "task", "realism")
+    found = describe(settings.robot, settings.task, settings.realism)
+    but = f" but for {' '.join(told)}" if told else ""
+    return f"as trained{but}: {found}; {settings.robot.body} body, {levels}"

@@ -85,11 +85,11 @@ def _closing(run: Path, settings: TrainConfig, tally: Tally) -> str:
     if tally.update < settings.updates:
         return (
             f"stopped after update {tally.update:,} of {settings.updates:,}, saved; go on with: "
-            f"{command.line('train', command.word('resume', str(run)))}"
+            f"{command.line('train', f'resume={run}')}"
         )
     policy = seed_path(run / POLICY, settings, settings.seed)
-    arguments = [command.word("policy", str(policy))]
+    arguments = [f"policy={policy}"]
     if settings.extensions is not None:
-        arguments.append(command.word("extensions", settings.extensions))
+        arguments.append(f"extensions={settings.extensions}")
     what = "the policy" if settings.seeds == 1 else f"each of {settings.seeds} policies"
     return f"done; judge {what} with: {command.line('evaluate', *arguments)}"

@@ -23,6 +23,7 @@ from swarmjax.run.policy_export import POLICY, seed_path, write_policy
 from swarmjax.run.settings import TrainConfig
 from swarmjax.run.trainer import Built, Stop, Tally, begin_tally, compile_chunk, prepare, train
 from swarmjax.run.warm_start import Source
+from swarmjax.task.config import describe
 from swarmjax.training import program as programs
 from swarmjax.training import seeds
 from swarmjax.training.loop import TrainState
@@ -69,9 +70,10 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
         display.say(f"{sentence}: it was passed over.")
     if source is not None:
         updates = words.count(source.update, "update")
+        as_there = describe(settings.robot, settings.task, settings.realism)
         display.say(
             f"starting with what {source.run} had learned after {updates}; robot, task, realism "
-            f"and network as there, unless told otherwise: {_embodiment(settings)}"
+            f"and network as there, unless told otherwise: {as_there}"
         )
     for sentence in _short_budget(settings, schedule):
         display.say(sentence)
@@ -135,16 +137,6 @@ def _is_summed_up(run: Path, update: int) -> bool:
         return found["budget_spent"] is True and found["updates"] == update
     except (OSError, ValueError, KeyError, TypeError):
         return False
-
-
-def _embodiment(settings: TrainConfig) -> str:
-    """Says what a run takes from the one that it begins with, where no word says otherwise."""
-    robot, task = settings.robot, settings.task
-    return (
-        f"hull {robot.hull_radius:g} m, infrared to {task.sensor_range:g} m, at most "
-        f"{robot.max_speed:g} m/s and {robot.max_turn_rate:g} rad/s, realism "
-        f"{settings.realism.name}"
-    )
 
 
 def _load(settings: TrainConfig) -> tuple[Built, Schedule, Any, TrainState]:

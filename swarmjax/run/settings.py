@@ -243,7 +243,7 @@ _SHARED = ("policy", "network", "hidden_sizes", "activation", "mean_activation")
 def _inherited(typed: Sequence[str]) -> list[str]:
     """Return the words that a run with `init_from` takes from the run it begins with.
 
-    Robot, task, realism and the shape of the networks, but for what is typed.
+    These are robot, task, realism and the shape of the networks. What is typed comes after them.
     """
     source = files.values(files.split_words(TrainConfig, typed)).get("init_from")
     if not isinstance(source, str):
@@ -276,10 +276,11 @@ def settle(settings: TrainConfig) -> TrainConfig:
     network = resolve(settings.algo, found.networks)
     if settings.extensions is None:
         return settings
+    drawn = {stage.level for stage in settings.stage}
     chosen = found._replace(
         rewards=tuple(piece for piece, _ in used.terms),
         observations=used.observations,
-        levels=tuple(each for each in found.levels if each.name in _levels(settings)),
+        levels=tuple(each for each in found.levels if each.name in drawn),
         networks=tuple(each for each in found.networks if each.name == network),
     )
     return replace(
@@ -288,11 +289,6 @@ def settle(settings: TrainConfig) -> TrainConfig:
         algo=replace(settings.algo, network=network),
         pieces=chosen.digests(),
     )
-
-
-def _levels(settings: TrainConfig) -> set[str]:
-    """Return how the levels of the stages are drawn."""
-    return {stage.level for stage in settings.stage}
 
 
 def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainConfig:

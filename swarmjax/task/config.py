@@ -61,6 +61,15 @@ class TaskConfig(Section):
     reward: RewardConfig = field(default_factory=RewardConfig)
 
 
+def describe(robot: RobotConfig, task: TaskConfig, realism: RealismConfig) -> str:
+    """Say in part of a sentence which robot does the task, with which sensors."""
+    return (
+        f"hull {robot.hull_radius:g} m, infrared to {task.sensor_range:g} m, at most "
+        f"{robot.max_speed:g} m/s and {robot.max_turn_rate:g} rad/s, control step "
+        f"{task.control_step:g} s, realism {realism.name}"
+    )
+
+
 def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, steps: int) -> None:
     """Refuse realism that the robot or the length of an episode rules out.
 
