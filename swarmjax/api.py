@@ -97,10 +97,12 @@ def make_env(
         SwarmjaxError: something given is unsound.
     """
     from swarmjax import environment
+    from swarmjax.run.settings import load_train
 
     given = {"robot": robot, "task": task, "realism": realism, "sim": sim, "extensions": extensions}
     named = {key: value for key, value in given.items() if value is not None}
-    config = _train_config({"stage": stage, **named, "arenas": arenas, **_NOT_LEARNING})
+    words, stages = _given({"stage": stage, **named, "arenas": arenas, **_NOT_LEARNING})
+    config = load_train(words, stages=stages)
     most = {key: max(getattr(each, key) for each in config.stage) for key in _ROOM}
     told = _flat(named)
     left = {f"max_{key}": value for key, value in most.items() if f"sim.max_{key}" not in told}
@@ -137,14 +139,14 @@ def train_policy(
         SwarmjaxError: a setting is unsound, or the run broke.
     """
     from swarmjax.run import quiet
-    from swarmjax.run.settings import TrainConfig
+    from swarmjax.run.settings import TrainConfig, load_run
 
     if isinstance(settings, TrainConfig):
-        config = settings
+        config, auto = settings, False
     else:
         more = {} if extensions is None else {"extensions": extensions}
-        config = _train_config({**_mapping(settings), **more})
-    run, files = quiet.train(config, on_update or (lambda row: None), _signals)
+        config, auto = load_run(*_given({**_mapping(settings), **more}))
+    run, files = quiet.train(config, on_update or (lambda row: None), _signals, auto=auto)
     policies = [policy_file.read(file, config.extensions) for file in files]
     lines = (run / "metrics.jsonl").read_text().splitlines()
     return TrainResult(policies[0], policies, [json.loads(line) for line in lines], run)
@@ -194,11 +196,9 @@ def evaluate_policy(
         else Entrant(str(each), policy_file.read(each, word))
         for each in several
     ]
-    given: dict[str, Any] = {"workers": workers, "extensions": word, "suite": suite, **settings}
-    stages = None if stage is None or isinstance(stage, str | Path) else _stages(stage)
-    if stages is None and stage is not None:
-        given["stage"] = str(stage)
-    words = _words({key: value for key, value in given.items() if value is not None})
+    named = {"stage": stage, "suite": suite, "workers": workers, "extensions": word}
+    given: dict[str, Any] = {**named, **settings}
+    words, stages = _given({key: value for key, value in given.items() if value is not None})
     config, _ = witness.load(EvaluateConfig, words, entrants, stages[0] if stages else None)
     return evaluation.judge_entrants(config, entrants).result
 
@@ -222,17 +222,14 @@ def _is_one(policy: Any) -> bool:
     return isinstance(policy, str | Path | Policy)
 
 
-def _train_config(given: Mapping[str, Any]) -> "TrainConfig":
-    """Makes a config of settings by name."""
-    from swarmjax.run.settings import load_train
-
-    rest = dict(given)
+def _given(settings: Mapping[str, Any]) -> tuple[list[str], list[dict[str, Any]] | None]:
+    """Splits settings into words of a command line, and stages that no word can name."""
+    rest = dict(settings)
     stage = rest.get("stage")
-    stages = None if stage is None or isinstance(stage, str | Path) else _stages(stage)
-    if stages is not None:
-        del rest["stage"]
-    rest["extensions"] = extension.hand_over(rest.get("extensions"))
-    return load_train(_words(rest), stages=stages)
+    stages = None if stage is None or isinstance(stage, str | Path) else _stages(rest.pop("stage"))
+    if "extensions" in rest:
+        rest["extensions"] = extension.hand_over(rest["extensions"])
+    return [f"{key}={value}" for key, value in _flat(rest).items()], stages
 
 
 def _stages(given: Any) -> list[dict[str, Any]]:
@@ -258,11 +255,6 @@ def _mapping(settings: Settings) -> dict[str, Any]:
     if isinstance(settings, str):
         raise ConfigError(f"settings is {settings!r}: give a list of words, as in ['stage=s3'].")
     return {key: value for key, _, value in (word.partition("=") for word in settings)}
-
-
-def _words(given: Mapping[str, Any]) -> list[str]:
-    """Writes settings as words of a command line."""
-    return [f"{key}={value}" for key, value in _flat(given).items()]
 
 
 def _flat(given: Mapping[str, Any], where: str = "") -> dict[str, str]:

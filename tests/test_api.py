@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import chex
 import extensions
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ import pytest
 
 import swarmjax
 from swarmjax.environment import Swarm, SwarmState
+from swarmjax.run import memory
 from swarmjax.task.stage_config import StageConfig
 
 PAIR = StageConfig(name="pair", robots=2, side=0.5)
@@ -140,6 +142,21 @@ def test_every_seed_has_its_policy(tmp_path: Path) -> None:
     assert [each.meta["seed"] for each in result.policies] == [0, 1]
 
 
+def test_a_run_goes_on(tmp_path: Path) -> None:
+    settings = TINY | {"run.dir": tmp_path / "run", "budget": 32}
+    first = swarmjax.train_policy(settings, on_update=lambda row: row["update"] == 0)
+    second = swarmjax.train_policy({"resume": first.run})
+    whole = swarmjax.train_policy(settings | {"run.dir": tmp_path / "whole"})
+    assert first.policy.meta["update"] < second.policy.meta["update"]
+    chex.assert_trees_all_equal(second.policy.layers, whole.policy.layers)
+
+
+def test_as_many_arenas_as_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "fill", lambda settings, measure, limit: (settings, "why"))
+    settings = TINY | {"run.dir": tmp_path / "run", "budget": 16, "arenas": "auto"}
+    assert swarmjax.train_policy(settings).policy.meta["config"]["arenas"] == 2
+
+
 def test_words_of_the_command_line_are_settings_too(tmp_path: Path) -> None:
     words = ["stage=s1", "arenas=4", "algo.num_minibatches=2", "algo.rollout_length=4", "budget=16"]
     more = ["sim.impl=jax", "run.tensorboard=false", f"run.dir={tmp_path / 'run'}"]
@@ -173,6 +190,7 @@ def test_pieces_handed_over_are_trained_and_judged(tmp_path: Path) -> None:
         "cann"),
         (lambda: swarmjax.train_policy({"algo.hidden": [8]}), r"^algo\.hidden is called algo\.hid"),
         (lambda: swarmjax.train_policy("stage=s3"), r"^settings is 'stage=s3': give a list of wor"),
+        (lambda: swarmjax.train_policy({"run.dry": True}), r"^run\.dry is true, which is for"),
         (lambda: swarmjax.evaluate_policy("no.npz"), r"^no\.npz is no file: give the path of a po"),
         (lambda: swarmjax.load_policy("no.npz"), r"^no\.npz is no file: give the path of a policy"),
     ],

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from swarmjax import command, train
+from swarmjax import command
 from swarmjax.config import ConfigError, files, section, to_dict
 from swarmjax.config.section import Section
 from swarmjax.evaluate.config import EvaluateConfig
@@ -16,13 +16,13 @@ from swarmjax.export.config import ExportConfig
 from swarmjax.replay.config import ReplayConfig
 from swarmjax.report.config import ReportConfig
 from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.settings import TrainConfig, load_run, load_train
 from swarmjax.suite import SuiteConfig
 from swarmjax.task.stage_files import load_levels
 
 # The loader of each command and its settings.
 COMMANDS: dict[str, tuple[Callable[[Sequence[str]], object], type[Section]]] = {
-    "swarmjax.train": (train._settings, TrainConfig),
+    "swarmjax.train": (load_run, TrainConfig),
     "swarmjax.evaluate": (partial(load_levels, EvaluateConfig), EvaluateConfig),
     "swarmjax.export": (partial(files.load, ExportConfig), ExportConfig),
     "swarmjax.report": (partial(files.load, ReportConfig), ReportConfig),

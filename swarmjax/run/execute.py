@@ -30,18 +30,17 @@ def execute(settings: TrainConfig, *, auto: bool) -> int:
     """
     with compile_cache.use(settings.run.compile_cache):
         if auto:
-            settings = _fill(settings)
+            settings, why = fill(settings)
+            sys.stdout.write(f"{why}\n")
         with memory.refusal(settings):
             return _run(settings)
 
 
-def _fill(settings: TrainConfig) -> TrainConfig:
-    """Chooses the number of arenas, and says why it is that."""
+def fill(settings: TrainConfig) -> tuple[TrainConfig, str]:
+    """Chooses the number of arenas; returns the settings with it, and why it is that."""
     available = None if jax.default_backend() == "cpu" else memory.limit()
     with memory.refusal(settings), working("finding out how many arenas fit"):
-        settings, why = memory.fill(settings, measure, available)
-    sys.stdout.write(f"{why}\n")
-    return settings
+        return memory.fill(settings, measure, available)
 
 
 def _run(settings: TrainConfig) -> int:

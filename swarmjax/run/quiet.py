@@ -5,7 +5,8 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
-from swarmjax.run import compile_cache, memory
+from swarmjax.config import ConfigError
+from swarmjax.run import compile_cache, execute, memory
 from swarmjax.run.display import Display, Row
 from swarmjax.run.lifecycle import carry_out, find_run
 from swarmjax.run.policy_export import POLICY, seed_path
@@ -44,6 +45,8 @@ def train(
     settings: TrainConfig,
     on_update: Callable[[dict[str, Any]], object],
     listen: Callable[[Stop], AbstractContextManager[object]],
+    *,
+    auto: bool = False,
 ) -> tuple[Path, list[Path]]:
     """Trains as a config says.
 
@@ -51,6 +54,7 @@ def train(
       settings: the config.
       on_update: is called with each row of `metrics.jsonl`; True stops the run.
       listen: what to be in while it trains, such as `Stop` itself, which notices signals.
+      auto: whether its number of arenas is still to be chosen.
 
     Returns:
       The run directory, and the policy files of its seeds.
@@ -58,8 +62,12 @@ def train(
     Raises:
       ConfigError, CheckpointError, TrainingError: as `lifecycle.carry_out`.
     """
-    with compile_cache.use(settings.run.compile_cache), memory.refusal(settings):
-        run, stop = find_run(settings), Stop()
-        with listen(stop), _Listener(settings.updates, on_update, stop) as display:
-            carry_out(settings, run, stop, display)
+    if settings.run.dry:
+        raise ConfigError("run.dry is true, which is for the command line: leave it out.")
+    with compile_cache.use(settings.run.compile_cache):
+        settings = execute.fill(settings)[0] if auto else settings
+        with memory.refusal(settings):
+            run, stop = find_run(settings), Stop()
+            with listen(stop), _Listener(settings.updates, on_update, stop) as display:
+                carry_out(settings, run, stop, display)
     return run, [seed_path(run / POLICY, settings, seed) for seed in settings.numbers]

@@ -17,6 +17,7 @@ from swarmjax.training.config import ProgramConfig
 
 # Arenas of all seeds whose episodes are written down one by one: more end thousands a second.
 MOST_LOGGED = 8192
+AUTO = "auto"  # what `arenas` may be instead of a number
 
 
 # What may change when a run goes on; everything else fixes what it has computed so far.
@@ -221,7 +222,7 @@ def load_train(
     """
 
     def complete(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:
-        if auto and mapping.get("arenas") == "auto":
+        if auto and mapping.get("arenas") == AUTO:
             mapping["arenas"] = build(AlgoConfig, mapping.get("algo", {}), "algo.").num_minibatches
         if "init_from_std" in mapping and mapping.get("init_from") is None:
             raise ConfigError(
@@ -315,3 +316,29 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
     kept = to_dict(from_stored(stored, "stored "))
     run = kept["run"] | {"stop_after": None} | given.get("run", {})
     return settle(build(TrainConfig, kept | given | {"run": run}))
+
+
+def load_run(
+    overrides: Sequence[str], stages: Sequence[dict[str, Any]] | None = None
+) -> tuple[TrainConfig, bool]:
+    """Make the configuration of a run, a new one or with `resume=` one that goes on.
+
+    Args:
+        overrides: `key=value` words; with `resume` of what may be changed alone.
+        stages: plain data of the stages of a new run, in place of a file's.
+
+    Returns:
+        The configuration, and whether its number of arenas is still to be chosen.
+
+    Raises:
+        ConfigError: a word, a choice, a file or a value is unsound.
+    """
+    given = {key: value for key, _, value in (word.partition("=") for word in overrides)}
+    resumed = given.get("resume", "null").strip("'\"")
+    if resumed in ("", "null"):
+        auto = given.get("arenas", "").strip("'\"") == AUTO
+        return load_train(overrides, auto=auto, stages=stages), auto
+    settings = load_resume(read_config(Path(resumed)), overrides)
+    kept = given.get("run.dir", "null") in ("", "null") or settings.run.dir is None
+    directory = settings.resume if kept else settings.run.dir
+    return replace(settings, run=replace(settings.run, dir=directory)), False

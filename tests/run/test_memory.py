@@ -13,7 +13,7 @@ from swarmjax import train
 from swarmjax.config import ConfigError
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.run import execute, lifecycle, memory, trainer
-from swarmjax.run.settings import RunConfig, TrainConfig, load_train
+from swarmjax.run.settings import RunConfig, TrainConfig, load_run, load_train
 from swarmjax.task.stage_config import StageConfig
 
 GIB = 2**30
@@ -133,10 +133,10 @@ def test_training_begins_with_the_choice(
 
 
 def test_the_command_line_takes_auto() -> None:
-    settings, auto = train._settings(["arenas=auto", "algo.num_minibatches=4"])
+    settings, auto = load_run(["arenas=auto", "algo.num_minibatches=4"])
     assert auto
     assert settings.arenas == 4
-    settings, auto = train._settings(["arenas=auto", "arenas=64"])
+    settings, auto = load_run(["arenas=auto", "arenas=64"])
     assert not auto
     assert settings.arenas == 64
     with pytest.raises(ConfigError, match=r"^arenas is 'auto': give a whole number\.$"):
@@ -146,7 +146,7 @@ def test_the_command_line_takes_auto() -> None:
         match=r"^algo\.num_minibatches is 'many': give a whole "
         r"number\.$",
     ):
-        train._settings(["arenas=auto", "algo.num_minibatches=many"])
+        load_run(["arenas=auto", "algo.num_minibatches=many"])
 
 
 # Refusals
