@@ -69,7 +69,7 @@ class Memory(NamedTuple):
 
     Attributes:
       motor: commands under way.
-      infrared: [..., R, K] the last sample, as the policy observes it.
+      infrared: [..., R, K] the last sample, before it is scaled.
       seen: [..., D, R, O] observations under way, newest first.
     """
 
@@ -186,11 +186,12 @@ def begin(
       The memory, and the first observation [..., R, O].
     """
     robots = sight.ray.shape[-2]
-    fresh = _observe(electronics, None, factors, sight, clock, xp)
+    readings = _read(electronics, factors, sight, clock, xp)
+    fresh = observation.observe(readings, electronics.layout, xp)
     seen = None
     if electronics.latency:
         seen = xp.stack([fresh] * electronics.latency, axis=-3)
-    held = fresh[..., : observation.SENSORS] if factors.infrared_period is not None else None
+    held = None if factors.infrared_period is None else readings.infrared
     queue = motor.init(electronics.realism, robots, xp)
     leading = sight.distance.shape[:-1]
     if queue is not None:
@@ -261,9 +262,12 @@ def sense(
     Returns:
       The memory after, and the observation [..., R, O].
     """
-    fresh = _observe(electronics, memory.infrared, factors, sight, clock, xp)
+    readings = _read(electronics, factors, sight, clock, xp)
     if memory.infrared is not None:
-        memory = memory._replace(infrared=fresh[..., : observation.SENSORS])
+        due = _is_due(clock, factors.infrared_period, electronics.control_step, xp)
+        last = xp.where(due[..., None], readings.infrared, memory.infrared)
+        memory, readings = memory._replace(infrared=last), readings._replace(infrared=last)
+    fresh = observation.observe(readings, electronics.layout, xp)
     if memory.seen is None or factors.observation_latency is None:
         return memory, fresh
     seen = xp.concatenate([fresh[..., None, :, :], memory.seen], axis=-3)
@@ -272,24 +276,13 @@ def sense(
     return memory._replace(seen=seen[..., :-1, :, :]), found
 
 
-def _observe(
-    electronics: Electronics,
-    held: Array | None,
-    factors: Factors,
-    sight: Sight,
-    clock: Array,
-    xp: Any,
-) -> Array:
-    """Observes [..., R, O] what there is, infrared as of its last sample."""
+def _read(
+    electronics: Electronics, factors: Factors, sight: Sight, clock: Array, xp: Any
+) -> Readings:
+    """Reads what there is now."""
     sample = _read_infrared(electronics, factors, sight, clock, xp)
     distance, bearing = _find_target(electronics.realism, factors, sight, clock, xp)
-    readings = Readings(sample, distance, bearing, sight.own)
-    seen = observation.observe(readings, electronics.layout, xp)
-    if held is None:
-        return seen
-    due = _is_due(clock, factors.infrared_period, electronics.control_step, xp)
-    last = xp.where(due[..., None], seen[..., : observation.SENSORS], held)
-    return xp.concatenate([last, seen[..., observation.SENSORS :]], axis=-1)
+    return Readings(sample, distance, bearing, sight.own)
 
 
 def _is_due(clock: Array, period: Array, control_step: float, xp: Any) -> Array:
