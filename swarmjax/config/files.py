@@ -205,6 +205,19 @@ def read_preset(group: str, choice: str) -> dict[str, Any]:
     return read_file(f"{group}/{choice}")
 
 
+def preset_of(group: str, held: Section) -> str:
+    """Name the file of a group whose numbers a section has, or `custom` if there is none."""
+    derived = section.keys(type(held), derived=True)
+
+    def numbers(of: Section) -> dict[str, Any]:
+        return {key: value for key, value in section.to_dict(of).items() if key not in derived}
+
+    for name in choices(group):
+        if numbers(section.build(type(held), read_preset(group, name))) == numbers(held):
+            return name
+    return "custom"
+
+
 def suite_path(choice: str) -> Path:
     """Return the file of a suite: of this name in configs/suites/, or at this path.
 

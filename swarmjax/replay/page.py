@@ -8,6 +8,7 @@ from importlib import resources
 from string import Template
 
 from swarmjax import epuck, provenance
+from swarmjax.config import files
 from swarmjax.policy import Policy
 from swarmjax.replay import pack
 from swarmjax.replay.config import ReplayConfig
@@ -93,7 +94,8 @@ def _levels(settings: ReplayConfig) -> str:
 def _about(settings: ReplayConfig) -> str:
     """Says in a line what is seen; cells of a suite may have a realism of their own."""
     if settings.suite is None:
-        where = f"stage {_levels(settings)}, realism {settings.realism.name}"
+        realism = files.preset_of("realism", settings.realism)
+        where = f"stage {_levels(settings)}, realism {realism}"
     else:
         where = f"suite {_levels(settings)}"
     return f"{where}, {settings.robot.body} robots, simulated by MuJoCo C"

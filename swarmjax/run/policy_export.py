@@ -6,14 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from swarmjax import epuck, extension, policy_file, provenance
-from swarmjax.config import build, files, to_dict
+from swarmjax.config import files, to_dict
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import normalizer
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import CheckpointError, Leaves
 from swarmjax.run.settings import TrainConfig
-from swarmjax.sim.config import RobotConfig
 from swarmjax.task import observation, pieces
 from swarmjax.task.config import resolve_encoding
 from swarmjax.training import seeds
@@ -78,11 +77,11 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
             "high": [robot.max_speed, robot.max_turn_rate],
         },
         "robot": {
-            "preset": _robot_preset(robot),
+            "preset": files.preset_of("robot", robot),
             **to_dict(robot),
         },
         "sensors": {
-            "preset": trained.realism.name,
+            "preset": files.preset_of("realism", trained.realism),
             "response": trained.realism.infrared,
             "range": trained.task.sensor_range,
             "poses": [list(pose) for pose in epuck.SENSOR_POSES],
@@ -104,14 +103,6 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
 def _own_network(algo: AlgoConfig) -> dict[str, str]:
     """Names the network of an extension, if the policy has one."""
     return {} if algo.network in (None, "mlp") else {"network": algo.network}
-
-
-def _robot_preset(robot: RobotConfig) -> str:
-    """Names the file of configs/robot/ that a robot's numbers are those of, or `custom`."""
-    for name in files.choices("robot"):
-        if build(RobotConfig, files.read_preset("robot", name)) == robot:
-            return name
-    return "custom"
 
 
 def seed_path(path: Path, trained: TrainConfig, seed: int) -> Path:

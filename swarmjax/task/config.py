@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 from swarmjax import epuck
-from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.config import ConfigError, Section, about, files, show
 from swarmjax.config.section import MAX_COUNT, ByName
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
@@ -66,7 +66,7 @@ def describe(robot: RobotConfig, task: TaskConfig, realism: RealismConfig) -> st
     return (
         f"hull {robot.hull_radius:g} m, infrared to {task.sensor_range:g} m, at most "
         f"{robot.max_speed:g} m/s and {robot.max_turn_rate:g} rad/s, control step "
-        f"{task.control_step:g} s, realism {realism.name}"
+        f"{task.control_step:g} s, realism {files.preset_of('realism', realism)}"
     )
 
 

@@ -75,7 +75,16 @@ def test_a_cell_of_a_grid_is_judged_without_a_file(tmp_path: Path) -> None:
 def test_the_first_line_says_what_was_taken_and_what_was_told(odd: str) -> None:
     said = witness.load(EvaluateConfig, [odd, "task.sensor_range=0.05"])[1]
     assert said.startswith("as trained but for task.sensor_range=0.05: hull 0.044 m, infrared to ")
-    assert said.endswith("control step 0.016 s, realism real; wheeled body, stage s3")
+    assert said.endswith("control step 0.016 s, realism custom; wheeled body, stage s3")
+
+
+def test_the_first_line_does_not_take_a_file_of_realism_for_a_preset(tmp_path: Path) -> None:
+    file = tmp_path / "noisy.yaml"
+    file.write_text("infrared: real\nmass: [0.1, 0.2]\n")
+    word = _policy(tmp_path / "p.npz", f"realism={file}")
+    settings, said = witness.load(EvaluateConfig, [word])
+    assert settings.realism.mass == (0.1, 0.2)
+    assert "realism custom" in said
 
 
 def test_policies_that_were_trained_differently_need_a_word(tmp_path: Path) -> None:

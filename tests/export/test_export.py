@@ -107,6 +107,15 @@ def test_a_robot_is_named_by_the_file_that_has_its_numbers(words: list[str], nam
     assert policy_meta(trained, 0, 0)["robot"]["preset"] == name
 
 
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [([], "ideal"), (["realism=real"], "real"), (["realism=real", "realism.mass=null"], "custom")],
+)
+def test_realism_is_named_by_the_file_that_has_its_numbers(words: list[str], name: str) -> None:
+    trained = load_train(["stage=s1", *words])
+    assert policy_meta(trained, 0, 0)["sensors"]["preset"] == name
+
+
 def test_export_refuses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
