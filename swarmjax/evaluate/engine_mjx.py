@@ -37,6 +37,7 @@ from swarmjax.task.env import EnvState, World
 from swarmjax.task.level import Level, Spacing
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import rollout
+from swarmjax.training.program import ACTION_SIZE
 
 LARGEST_BOX = 0.3  # m; the largest that a stage takes
 _ACTIVATIONS = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}
@@ -250,9 +251,15 @@ def _dense(x: Array, layer: tuple[ArrayLike, ArrayLike], robots: slice) -> Array
 
 
 def outcomes(
-    world: World, config: AlgoConfig, learners: LearnerState, levels: Level, steps: int
+    world: World,
+    config: AlgoConfig,
+    learners: LearnerState,
+    levels: Level,
+    steps: int,
+    *,
+    sampled: bool = False,
 ) -> Outcomes:
-    """Runs an episode of each level, every robot driven by the mean of its policy.
+    """Runs an episode of each level by policies in training.
 
     Pure: `jit` it with `world`, `config` and `steps` bound, and `vmap` it over the seeds of
     `learners`. With `impl=warp` the world must be loaded for as many arenas as are judged together
@@ -265,19 +272,31 @@ def outcomes(
       learners: [L].
       levels: [E].
       steps: control steps of an episode, at least 1.
+      sampled: draw the actions from the policies; otherwise they are their means.
 
     Returns:
       [E] what they came to. An episode whose physics breaks ends there, its robots where they
       were.
     """
-    arenas, _, broken = _run(world, partial(_mode, config, learners), levels, steps)
+    act = partial(_choose, config, learners, sampled=sampled)
+    arenas, _, broken = _run(world, act, levels, steps)
     return _sum_up(arenas, broken, world.task.control_step)
 
 
-def _mode(config: AlgoConfig, learners: LearnerState, arenas: EnvState) -> Array:
-    """The learners' most likely actions [E, R, U]."""
-    seen = rollout.to_learners(arenas.observation, len(jax.tree.leaves(learners)[0]))
-    action = jax.vmap(partial(ppo.mode, config=config))(learners, observation=seen)
+def _choose(
+    config: AlgoConfig, learners: LearnerState, arenas: EnvState, *, sampled: bool
+) -> Array:
+    """The learners' actions [E, R, U], drawn as the judge draws them, or their means."""
+    count = len(jax.tree.leaves(learners)[0])
+    seen = rollout.to_learners(arenas.observation, count)
+    if not sampled:
+        action = jax.vmap(partial(ppo.mode, config=config))(learners, observation=seen)
+        return rollout.to_arenas(action)
+    shape = (arenas.observation.shape[-2], ACTION_SIZE)
+    drawn = noise.normal(arenas.level.seed, arenas.clock, Stream.ACTION, shape, jnp)
+    action, _ = jax.vmap(partial(ppo.act, config=config))(
+        learners, observation=seen, noise=rollout.to_learners(drawn, count)
+    )
     return rollout.to_arenas(action)
 
 
