@@ -116,7 +116,12 @@ def reward_term(weight: float, name: str | None = None) -> Callable[[Callable], 
     Args:
         weight: what it is multiplied by; `task.reward.extra.NAME` overrides it.
         name: of the term; None: the function's.
+
+    Raises:
+        TypeError: it stands without parentheses.
     """
+    if callable(weight):
+        raise TypeError("write @reward_term(weight=...), with a weight")
     return lambda function: RewardTerm(
         name=name or function.__name__, function=function, weight=weight
     )
@@ -137,7 +142,12 @@ def observation(
         offset: is subtracted, in that unit.
         scale: divides, in that unit.
         name: of the observation; None: the function's.
+
+    Raises:
+        TypeError: it stands without parentheses.
     """
+    if callable(size):
+        raise TypeError("write @observation(), with parentheses")
     return lambda function: Observation(
         name=name or function.__name__,
         function=function,

@@ -87,6 +87,10 @@ def test_an_edited_file_is_read_again(tmp_path: Path) -> None:
         ("@observation(size=0)\ndef a(view): return 0", r"a\.py: observation a has size 0: give 1 "
         ""),
         ("@observation(scale=0)\ndef a(view): return 0", r"a\.py: observation a has scale 0: "),
+        ("@reward_term\ndef a(step): return 0",
+         r"a\.py does not import: TypeError: write @reward_term\(weight=\.\.\.\), with a weight"),
+        ("@observation\ndef a(view): return 0",
+         r"a\.py does not import: TypeError: write @observation\(\), with parentheses"),
         ("@network\ndef a(x): return x", r"a\.py: network a is no class: decorate a flax"),
     ],
 )  # fmt: skip

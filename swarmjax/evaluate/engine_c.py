@@ -296,7 +296,7 @@ def _drive(
     Returns:
         Memory, new poses [A, R, 3], and impulses [A, R, 3] (N s) by kind of contact.
     """
-    wanted = sim_drive.command(_act(judge, arenas), judge.drive, np)
+    wanted = sim_drive.command(act(judge, arenas), judge.drive, np)
     memory, wheels = electronics.drive(
         judge.electronics,
         arenas.memory,
@@ -321,8 +321,16 @@ def _drive(
     return memory, body.pose(qpos, np), _impulses(judge, pushes, len(arenas.data))
 
 
-def _act(judge: Judge, arenas: Arenas) -> np.ndarray:
-    """Lets the policy act, [A, R, U]; what is drawn follows from the level and the clock."""
+def act(judge: Judge, arenas: Arenas) -> np.ndarray:
+    """Lets the policy act; what is drawn follows from the level and the clock.
+
+    Args:
+        judge: What the arenas share.
+        arenas: Their state.
+
+    Returns:
+        Actions [A, R, U], as drawn.
+    """
     if judge.config.action == "mean":
         return policy.act(judge.policy, arenas.observation)
     shape = (arenas.pose.shape[1], len(policy_file.ACTION_NAMES))

@@ -20,6 +20,7 @@ from swarmjax.task.config import TaskConfig, describe
 
 # Of the task, what a judge asks for too; rewards and step limit are those of training.
 _TASK = ("control_step", "target_radius", "observations")
+BODY = "wheeled"  # of a judge, unless a word or a file names another
 _TOLD = ("robot", "task", "realism")  # what a line names that a word set otherwise
 
 
@@ -121,7 +122,11 @@ def _paths(cls: type[Section], typed: Sequence[str]) -> list[str]:
 
 
 def _words(cls: type[Section], found: Trained, typed: Sequence[str]) -> list[str]:
+    """Writes what was trained as words; a robot file that says no body leaves the judge's."""
+    choice = files.split_words(cls, typed).get("robot")
+    own = {"body": BODY} if choice is None else files.read_choice("robot", files.choice_of(choice))
     return [
+        *([] if "body" in own.get("robot", own) else [f"robot.body={BODY}"]),
         *inherit.group_words(cls, "robot", found.robot, typed, skip=["body"]),
         *inherit.group_words(cls, "task", found.task, typed),
         *inherit.preset_words(cls, "realism", found.realism, typed),

@@ -177,14 +177,25 @@ def main(arguments: Sequence[str]) -> int:
             _write("video", video, lambda: replay_video.write(video, settings, episodes, report))
     sys.stdout.write(f"swarmjax.replay: {said}\n")
     for each in entrants:
-        left_out = ", ".join(each.policy.meta.get("extensions", {}).get("reward", {}))
-        if left_out:
-            sys.stdout.write(f"{each.path}: the rewards shown leave out {left_out} of extensions\n")
+        missing = _left_out(settings, each)
+        if missing:
+            sys.stdout.write(
+                f"{each.path}: the rewards leave out {missing}: to see them, give extensions=FILE, "
+                "the file that the policy was trained with\n"
+            )
     labels = "; ".join(episode.label for episode in episodes)
     sys.stdout.write(f"{out}: {labels}; {len(page) / 1e6:.2f} MB.\n")
     if video:
         sys.stdout.write(f"{video}: the same, {video.stat().st_size / 1e6:.2f} MB.\n")
     return 0
+
+
+def _left_out(settings: ReplayConfig, entrant: Entrant) -> str:
+    """Names the terms of the reward of training whose code is not at hand."""
+    earning = record.weights(entrant.policy, settings.task)
+    own = record.own_terms(entrant.policy, settings.extensions, earning)
+    found = {piece.name for piece, _ in own}
+    return ", ".join(name for name, weight in earning.extra.items() if weight and name not in found)
 
 
 def _check_file(key: str, path: Path) -> None:

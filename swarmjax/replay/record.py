@@ -6,10 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from swarmjax import extension
 from swarmjax.config import build, show
 from swarmjax.config.section import modernise
 from swarmjax.evaluate import engine_c
 from swarmjax.evaluate.engine_c import Arenas, Judge
+from swarmjax.extension import RewardTerm
 from swarmjax.policy import Policy, PolicyError
 from swarmjax.sim import gaps, infrared
 from swarmjax.task import electronics
@@ -84,6 +86,7 @@ class Frame(NamedTuple):
         touching: [A, R, 3] whether the robot touches something of each kind.
         arrived: [A, R] whether the robot has arrived.
         contacts: [A, R, 3] contacts so far of each kind.
+        action: [A, R, 2] that led here, clipped to -1..1; 0 at the start.
     """
 
     pose: np.ndarray
@@ -92,6 +95,7 @@ class Frame(NamedTuple):
     touching: np.ndarray
     arrived: np.ndarray
     contacts: np.ndarray
+    action: np.ndarray
 
 
 class Steps(NamedTuple):
@@ -170,12 +174,14 @@ def record(
         PolicyError: If the policy's task is none.
     """
     earning = weights(judge.policy, judge.config.task)
+    own = own_terms(judge.policy, judge.config.extensions, earning)
     arenas = engine_c.start(judge, levels)
     mount = electronics.mount(arenas.factors)
-    frames = [_look(judge, arenas)]
+    frames = [_look(judge, arenas, np.zeros_like(arenas.pose[..., :2]))]
     while len(frames) <= judge.config.steps and not frames[-1].arrived.all():
+        action = np.clip(engine_c.act(judge, arenas), -1.0, 1.0)
         arenas = engine_c.step(judge, arenas)
-        frames.append(_look(judge, arenas))
+        frames.append(_look(judge, arenas, action))
         report(1)
     every = Frame(*(np.stack(field) for field in zip(*frames, strict=True)))
     return [
@@ -184,12 +190,34 @@ def record(
             _scene(level, _of_arena(mount, i)),
             judge.config.task.sensor_range,
             earning,
+            own,
         )
         for i, level in enumerate(levels)
     ]
 
 
-def _look(judge: Judge, arenas: Arenas) -> Frame:
+def own_terms(
+    trained: Policy, extensions: str | None, earning: RewardConfig
+) -> tuple[tuple[RewardTerm, float], ...]:
+    """Finds the terms of an extension that a policy was trained with.
+
+    Args:
+        trained: The policy, whose file has the digest of each term.
+        extensions: As the key of that name.
+        earning: The policy's weights.
+
+    Returns:
+        Each term whose code is still the same, with its weight; none of weight 0.
+    """
+    digests = trained.meta.get("extensions", {}).get("reward", {})
+    return tuple(
+        (piece, earning.extra[piece.name])
+        for piece in extension.load(extensions).rewards
+        if digests.get(piece.name) == piece.digest and earning.extra.get(piece.name)
+    )
+
+
+def _look(judge: Judge, arenas: Arenas, action: np.ndarray) -> Frame:
     """Sees where everything is."""
     sight = engine_c.look(
         judge, arenas.data, arenas.factors, arenas.pose, arenas.target, arenas.obstacle
@@ -201,10 +229,17 @@ def _look(judge: Judge, arenas: Arenas) -> Frame:
         touching=engine_c.touching(judge, arenas.data),
         arrived=arenas.outcome.arrived,
         contacts=arenas.outcome.contacts,
+        action=action,
     )
 
 
-def _cut(frames: Frame, scene: ReplayScene, reach: float, earning: RewardConfig) -> Recording:
+def _cut(
+    frames: Frame,
+    scene: ReplayScene,
+    reach: float,
+    earning: RewardConfig,
+    own: Sequence[tuple[RewardTerm, float]],
+) -> Recording:
     """Makes a recording of the frames of one arena [N, ...], up to the end of its episode."""
     over = frames.arrived.all(axis=-1)
     frames = Frame(*(field[: over.argmax() + 1 if over.any() else None] for field in frames))
@@ -217,6 +252,7 @@ def _cut(frames: Frame, scene: ReplayScene, reach: float, earning: RewardConfig)
         arrives=active & frames.arrived[1:],
         contact_begins=np.diff(frames.contacts, axis=0),
     )
+    earned = terms(steps, earning) | _own(own, steps, frames)
     none = np.zeros_like(frames.distance[:1])
     return Recording(
         scene=scene,
@@ -225,12 +261,30 @@ def _cut(frames: Frame, scene: ReplayScene, reach: float, earning: RewardConfig)
         distance=frames.distance,
         reward={
             name: np.concatenate([none, np.where(active, term, 0.0)])
-            for name, term in terms(steps, earning).items()
+            for name, term in earned.items()
         },
         touching=frames.touching,
         contacts=frames.contacts,
         arrival=frames.arrived.argmax(axis=0),  # 0 also where there is none: no one starts there
     )
+
+
+def _own(
+    own: Sequence[tuple[RewardTerm, float]], steps: Steps, frames: Frame
+) -> dict[str, np.ndarray]:
+    """Works the terms of an extension out, [N, R] by name."""
+    if not own:
+        return {}
+    from swarmjax.task import extended  # pieces run on JAX
+
+    whole = steps._asdict() | {
+        "pose_before": frames.pose[:-1],
+        "pose": frames.pose[1:],
+        "action": frames.action[1:],
+        "present": np.ones(steps.distance.shape, bool),
+        "clock": np.arange(1, len(frames.pose), dtype=np.int32),
+    }
+    return {piece.name: weight * extended.earn(piece, whole) for piece, weight in own}
 
 
 def _scene(level: Level, mount: infrared.Mount | None) -> ReplayScene:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from swarmjax import provenance, words
+from swarmjax import extension, provenance, words
 from swarmjax.config import ConfigError, to_dict
 from swarmjax.curriculum import engine as curriculum
 from swarmjax.curriculum.engine import Schedule
@@ -23,6 +23,7 @@ from swarmjax.run.policy_export import POLICY, seed_path, write_policy
 from swarmjax.run.settings import TrainConfig
 from swarmjax.run.trainer import Built, Stop, Tally, begin_tally, compile_chunk, prepare, train
 from swarmjax.run.warm_start import Source
+from swarmjax.task import pieces
 from swarmjax.task.config import describe
 from swarmjax.training import program as programs
 from swarmjax.training import seeds
@@ -66,6 +67,8 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
         program, schedule, init, template = _load(settings)
         state, skipped = _first_state(program, lambda: init(schedule), template, source, kept)
     display.say(f"{_opening(program)}; into {run}")
+    if settings.extensions is not None:
+        display.say(f"from {settings.extensions}: {_own_pieces(settings)}")
     for sentence in skipped:
         display.say(f"{sentence}: it was passed over.")
     if source is not None:
@@ -239,6 +242,19 @@ def _opening(program: Built) -> str:
         f"{settings.robot.body} robots stepped by {engine.label}, "
         f"sim.solver={engine.solver} sim.impl={engine.impl}"
     )
+
+
+def _own_pieces(settings: TrainConfig) -> str:
+    """Names the pieces of an extension that are used."""
+    chosen = pieces.choose(extension.load(settings.extensions), settings.task, settings.stage)
+    used = {stage.level for stage in settings.stage}
+    found = [
+        *(f"reward {piece.name} times {weight:g}" for piece, weight in chosen.terms),
+        *(f"observation {piece.name}" for piece in chosen.observations),
+        *(f"level {piece.name}" for piece in chosen.drawings if piece.name in used),
+        *([] if settings.algo.network in (None, "mlp") else [f"network {settings.algo.network}"]),
+    ]
+    return ", ".join(found) or "nothing is used"
 
 
 def _short_budget(settings: TrainConfig, schedule: Schedule) -> list[str]:

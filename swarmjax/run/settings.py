@@ -29,7 +29,7 @@ class RunConfig(Section):
     """Where a run is written, and how often."""
 
     dir: str | None = field(
-        default=None, metadata=about("run directory; null: runs/<date>-<time>-<stage name>")
+        default=None, metadata=about("run directory; null: runs/<date>-<time>-<stage>-seed<seed>")
     )
     chunk: int | Literal["all", "auto"] = field(
         default="auto", metadata=about("updates per call of the compiled program", 1, MAX_COUNT)

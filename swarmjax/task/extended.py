@@ -1,7 +1,7 @@
 """What pieces of an extension compute in an arena, and whether they fit it."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -11,7 +11,7 @@ from jax import Array
 
 from swarmjax import epuck
 from swarmjax.config import ConfigError
-from swarmjax.extension import LevelDrawing, Observation, Piece, describe
+from swarmjax.extension import LevelDrawing, Observation, Piece, RewardTerm, describe
 from swarmjax.sim.gaps import KINDS
 from swarmjax.task import level
 from swarmjax.task.level import Level, Spacing
@@ -132,6 +132,21 @@ def redraw(piece: LevelDrawing, drawn: Level) -> Level:
             "and give the stage's obstacle_size."
         )
     return found
+
+
+def earn(piece: RewardTerm, steps: Mapping[str, Any]) -> np.ndarray:
+    """Computes a term of an extension over control steps of one arena, for a judge in NumPy.
+
+    Args:
+      piece: the term.
+      steps: the fields of `Step`, all but `sensor_range` with a leading axis N.
+
+    Returns:
+      [N, R], without its weight.
+    """
+    reach = np.full(len(steps["distance"]), steps["sensor_range"], np.float32)
+    each = Step(**{**steps, "sensor_range": reach})
+    return np.asarray(jax.jit(jax.vmap(piece.function))(each))
 
 
 @functools.lru_cache(maxsize=16)

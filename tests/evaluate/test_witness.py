@@ -62,6 +62,16 @@ def test_a_robot_that_is_typed_changes_what_its_file_says(odd: str) -> None:
     assert (found.hull_radius, found.mass) == (0.044, 0.14)
 
 
+def test_a_robot_file_without_a_body_leaves_that_of_the_judge(odd: str, tmp_path: Path) -> None:
+    file = tmp_path / "slim.yaml"
+    file.write_text("track: 0.05\n")
+    found = _load(odd, f"robot={file}").robot
+    assert (found.body, found.track, found.hull_radius) == ("wheeled", 0.05, 0.044)
+    assert _load(odd, f"robot={file}", "robot.body=planar").robot.body == "planar"
+    file.write_text("body: planar\n")
+    assert _load(odd, f"robot={file}").robot.body == "planar"
+
+
 def test_the_stage_of_training_may_be_changed(odd: str) -> None:
     found = _load(odd, "stage.side=1.1").stage
     assert (found.name, found.side) == ("s3", 1.1)

@@ -43,7 +43,10 @@ def test_the_policy_is_judged_by_the_command_as_printed(
 ) -> None:
     words = KINDS[kind]
     assert train.main([*words, "budget=32", f"run.dir={tmp_path / kind}"]) == 0
-    arguments = _pasted(capsys.readouterr().out, "evaluate")
+    printed = capsys.readouterr().out
+    used = "reward turning times -0.0005, observation nearest_robot, level ring, network residual"
+    assert (used in " ".join(printed.split())) == (kind == "own")
+    arguments = _pasted(printed, "evaluate")
     assert evaluate.main([*arguments, "episodes=2", "steps=3", "workers=1"]) == 0
     said = capsys.readouterr().out.splitlines()[0]
     assert ("hull 0.044 m, infrared to 0.1 m" in said) == (kind == "hull")
