@@ -10,6 +10,7 @@ INFRARED = slice(_FIRST, _FIRST + epuck.SENSORS)  # entries of one input lie sid
 DISTANCE = observation.NAMES.index("target_distance")
 BEARING = observation.NAMES.index("target_bearing")
 TARGET = np.array([DISTANCE, BEARING])
+KNOWN = np.array([*range(INFRARED.start, INFRARED.stop), *TARGET])
 
 
 def by_name(

@@ -192,7 +192,7 @@ def test_activations_against_float64(tmp_path: Path, activation: str, function: 
     x = np.clip((seen - exact["normalizer/mean"]) / exact["normalizer/std"], -10, 10)
     x = function(x @ exact["actor/hidden_0/kernel"] + exact["actor/hidden_0/bias"])
     expected = x @ exact["actor/mean/kernel"] + exact["actor/mean/bias"]
-    # Sums of up to 10 float32 terms of size 30 at most: 10 * 30 * 2**-24 = 1.8e-5.
+    # Sums of SIZE float32 terms of size 30 at most; for ten of them 10 * 30 * 2**-24 = 1.8e-5.
     np.testing.assert_allclose(policy.act(loaded, seen), expected, atol=2e-5)
 
 

@@ -16,6 +16,7 @@ from swarmjax.run.settings import TrainConfig
 from swarmjax.sim.config import SimConfig
 from swarmjax.task import env
 from swarmjax.task.config import TaskConfig
+from swarmjax.task.observation import SIZE
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import program as programs
 from swarmjax.training.program import Program
@@ -52,12 +53,12 @@ def test_it_is_the_environment_robot_by_robot(program: Program) -> None:
     random, ended, drawn = np.random.default_rng(0), 0, []
     for number in range(1, STEPS + 1):
         before = state.pipeline_state
-        np.testing.assert_array_equal(state.obs, before.now.observation.reshape(12, 10))
+        np.testing.assert_array_equal(state.obs, before.now.observation.reshape(12, SIZE))
         state, came = step(state, random.uniform(-1.0, 1.0, (12, 2)).astype(np.float32))
         over = np.asarray(came.done)[:, None, None]
         seen = np.where(over, before.starts.observation, came.observation)
         # The same numbers twice in one program, which XLA may add up in another order.
-        np.testing.assert_allclose(state.obs, seen.reshape(12, 10), rtol=0.0, atol=1e-5)
+        np.testing.assert_allclose(state.obs, seen.reshape(12, SIZE), rtol=0.0, atol=1e-5)
         np.testing.assert_allclose(state.reward, came.reward.ravel(), rtol=0.0, atol=1e-5)
         idle = np.asarray(came.truncated | ~came.valid).ravel()
         np.testing.assert_array_equal(state.info["truncation"], idle)
@@ -132,11 +133,11 @@ def test_the_judge_sees_the_policy_that_brax_trained(tiny_config: TrainConfig) -
     from brax.training.agents.ppo import networks
 
     made = race.network_factory(tiny_config)(
-        10, 2, preprocess_observations_fn=running_statistics.normalize
+        SIZE, 2, preprocess_observations_fn=running_statistics.normalize
     )
     random = np.random.default_rng(0)
-    seen = random.normal(0.2, 0.5, (6, 10)).astype(np.float32)
-    empty = running_statistics.init_state(jnp.zeros(10))
+    seen = random.normal(0.2, 0.5, (6, SIZE)).astype(np.float32)
+    empty = running_statistics.init_state(jnp.zeros(SIZE))
     moments = running_statistics.update(empty, jnp.asarray(seen))
     keys = jax.random.split(jax.random.key(1))
     params = (moments, made.policy_network.init(keys[0]), made.value_network.init(keys[1]))

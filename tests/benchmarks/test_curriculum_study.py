@@ -22,7 +22,7 @@ from swarmjax.evaluate import engine_mjx
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.run.settings import TrainConfig, load_train
-from swarmjax.task import level
+from swarmjax.task import level, observation
 from swarmjax.task import stage as task_stage
 from swarmjax.training import program as programs
 
@@ -170,7 +170,8 @@ def test_the_judge_gives_means_by_seed_and_stage(trained: TrainConfig) -> None:
     judged = {"goal": trained.stage[1], "first": trained.stage[0]}
     study = StudyConfig(levels=4, level_seed=5)
     keys = jax.random.split(jax.random.key(0), (2, 1))
-    start = jax.vmap(jax.vmap(lambda key: ppo.init(key, trained.algo, 10, 2, 1)))
+    sizes = (observation.SIZE, programs.ACTION_SIZE, 1)
+    start = jax.vmap(jax.vmap(lambda key: ppo.init(key, trained.algo, *sizes)))
     learners = start(keys)
     # Untrained policies hardly move: these drive ahead, at two speeds.
     learners.params["actor"]["mean"]["bias"] += np.array([[[1.0, 0.0]], [[0.5, 0.3]]], np.float32)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import steering
+from entries import INFRARED
 from sentences import refusal
 
 from benchmarks import cpu_paper_way, mujoco_arena
@@ -55,7 +56,7 @@ def test_rewards_are_those_of_the_task(settings: EvaluateConfig) -> None:
         start, end = (observation.to_target(x.pose, x.target, np)[0][0] for x in (before, after))
         active = ~before.outcome.arrived[0]
         begun = (after.outcome.contacts - before.outcome.contacts)[0]
-        rays = after.observation[0, :, :8]  # ideal sensors show metres
+        rays = after.observation[0, :, INFRARED]  # ideal sensors show metres
         step = reward.Step(start, end, rays, 0.04, after.outcome.arrived[0] & active, begun)
         expected = np.where(active, reward.total(step, weights), 0.0)
         # Here in float64, there in float32; a ray of exactly its range is rounded either way.

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 import steering
+from entries import BEARING, DISTANCE, INFRARED, KNOWN, TARGET
 from steering import AHEAD, SPEED, SPIN, STAY, STEER, STEP, STRIDE
 
 from swarmjax import policy
@@ -179,7 +180,7 @@ def test_an_arrived_robot_is_pushed_and_its_arrival_stands(tmp_path: Path) -> No
     assert _pose(arenas)[0, 0, 0] - before == pytest.approx(50 * STRIDE / 2, rel=0.1)
     assert arenas.outcome.arrival.tolist() == [[1, 0]]
     assert arenas.outcome.moving.tolist() == [[1, 110]]
-    assert arenas.observation[0, 0, observation.NAMES.index("target_distance")] > 0.05
+    assert arenas.observation[0, 0, DISTANCE] > 0.05
     assert arenas.outcome.contacts[0, :, 0].tolist() == [1, 1]
 
 
@@ -241,7 +242,7 @@ def test_the_walls_stand_where_the_level_says(tmp_path: Path) -> None:
         touched = engine_c.touching(judge, arenas.data)
         assert (touched.any(axis=(1, 2)) == (gap < 0)).all()
         if gap > 0:
-            nearest = arenas.observation[:, 0, :8].min(axis=-1)
+            nearest = arenas.observation[:, 0, INFRARED].min(axis=-1)
             assert ((nearest > 0.005) & (nearest < 0.04)).all()  # in range, and in all the same
             np.testing.assert_allclose(nearest, nearest[0], atol=1e-6)  # float32
 
@@ -339,10 +340,10 @@ def test_judge_and_training_see_the_same_and_count_the_same(engines: Engines) ->
     touched = False
     for state, found in zip(states, seen, strict=True):
         off = np.abs(found - arenas.observation[0])
-        off[:, 9] = np.minimum(off[:, 9], 2 * math.pi - off[:, 9])
+        off[:, BEARING] = np.minimum(off[:, BEARING], 2 * math.pi - off[:, BEARING])
         if touched:
             # Two solvers push alike to about a millimetre; a robot that pushes slips and turns.
-            assert off[:, 8].max() < 1e-3
+            assert off[:, DISTANCE].max() < 1e-3
         else:
             # Float32 against double: 1e-7 m and, near a target, 1e-5 rad. Where speeds are
             # quantised it may turn into 2 % of a wheel's for a step; in this episode it does not.
@@ -353,7 +354,7 @@ def test_judge_and_training_see_the_same_and_count_the_same(engines: Engines) ->
         touched = bool(arenas.outcome.contacts.any())
         arenas = engine_c.step(engines.judge, arenas)
     assert touched
-    assert (seen[-1][:, :8] < 0.04).any()
+    assert (seen[-1][:, INFRARED] < 0.04).any()
 
 
 def test_a_level_replays_exactly(engines: Engines) -> None:
@@ -461,17 +462,18 @@ def test_a_factor_of_the_sensors_changes_what_they_see_alone(
     path, seen = _tour(tmp_path, "planar")
     moved, felt = _tour(tmp_path, "planar", **{factor: value})
     np.testing.assert_array_equal(path, moved)
-    np.testing.assert_array_equal(seen[..., 8:], felt[..., 8:])
-    assert _robots_apart(seen[..., :8], felt[..., :8]) == robots
+    np.testing.assert_array_equal(seen[..., TARGET], felt[..., TARGET])
+    assert _robots_apart(seen[..., INFRARED], felt[..., INFRARED]) == robots
     if factor == "dead_sensor":
-        np.testing.assert_array_equal(felt[..., :8], np.float32(0.04))
+        np.testing.assert_array_equal(felt[..., INFRARED], np.float32(0.04))
     if factor.startswith("reflectance"):
-        assert (felt[..., :8] >= seen[..., :8]).all()  # what is darker seems further away
+        # What is darker seems further away.
+        assert (felt[..., INFRARED] >= seen[..., INFRARED]).all()
 
 
 @pytest.mark.parametrize(
     ("factor", "value", "entry"),
-    [("target_distance_noise", 0.005, 8), ("target_bearing_noise", 0.05, 9)],
+    [("target_distance_noise", 0.005, DISTANCE), ("target_bearing_noise", 0.05, BEARING)],
 )
 def test_noise_of_the_target_is_of_its_entry_alone(
     tmp_path: Path, factor: str, value: float, entry: int
@@ -479,7 +481,7 @@ def test_noise_of_the_target_is_of_its_entry_alone(
     path, seen = _tour(tmp_path, "planar")
     moved, felt = _tour(tmp_path, "planar", **{factor: value})
     np.testing.assert_array_equal(path, moved)
-    others = np.arange(observation.SIZE) != entry
+    others = KNOWN[entry != KNOWN]
     np.testing.assert_array_equal(seen[..., others], felt[..., others])
     assert (seen[..., entry] != felt[..., entry]).all()
 

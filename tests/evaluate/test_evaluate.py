@@ -343,9 +343,9 @@ def wrong(tmp_path: Path) -> None:
     steering.write(tmp_path / "policy.npz")
     steering.write(tmp_path / "three.npz", learners=3, policy="independent")
     layout = observation.describe("metric") | {"limit": 10.0}
-    names = [*observation.NAMES[:-1], "target_angle"]
+    names = ["target_angle" if name == "target_bearing" else name for name in observation.NAMES]
     steering.write(tmp_path / "other.npz", observation=layout | {"names": names})
-    scale = [*[2.0] * 8, 1.0, 1.0]
+    scale = [2.0] * observation.SIZE
     steering.write(tmp_path / "scaled.npz", observation=layout | {"scale": scale})
 
 
@@ -379,7 +379,7 @@ def wrong(tmp_path: Path) -> None:
         (
             ["policy=other.npz", "stage=s1"],
             "other.npz was trained on other observations than this robot makes: its "
-            "meta.observation.names is infrared_0, ",
+            f"meta.observation.names is {observation.NAMES[0]}, ",
         ),
         (
             ["policy=scaled.npz", "stage=s1"],

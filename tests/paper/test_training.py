@@ -13,6 +13,7 @@ from swarmjax.ppo import learner as ppo
 from swarmjax.run.checkpoint import to_leaves
 from swarmjax.run.policy_export import write_policy
 from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.task.observation import SIZE
 from swarmjax.training import loop, seeds
 from swarmjax.training import program as programs
 
@@ -88,7 +89,7 @@ def test_an_exported_policy_has_the_output_of_tanh(config: TrainConfig, tmp_path
     state = state.replace(learners=learners)
     leaves = {name: np.asarray(leaf) for name, leaf in to_leaves(state).items()}
     write_policy(tmp_path / "p.npz", leaves, config, update=0, seed=1)
-    observation = np.random.default_rng(0).uniform(0.0, 1.0, (5, 3, 10)).astype(np.float32)
+    observation = np.random.default_rng(0).uniform(0.0, 1.0, (5, 3, SIZE)).astype(np.float32)
     found = policy.act(policy.load(tmp_path / "p.npz"), observation)
     second = jax.tree.map(lambda x: x[1], learners)
     mode = jax.vmap(partial(ppo.mode, config=config.algo))

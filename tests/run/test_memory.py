@@ -14,6 +14,7 @@ from swarmjax.config import ConfigError
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.run import execute, lifecycle, memory, trainer
 from swarmjax.run.settings import RunConfig, TrainConfig, load_run, load_train
+from swarmjax.task.observation import SIZE
 from swarmjax.task.stage_config import StageConfig
 
 GIB = 2**30
@@ -30,9 +31,9 @@ def test_two_small_programs_tell_what_a_larger_one_takes(tiny_config: TrainConfi
     found = trainer.measure(replace(tiny_config, arenas=512, budget=512 * 8))
     # XLA lays its buffers out anew for each program: 1.0 % was seen.
     assert fixed + 512 * each == pytest.approx(found, rel=0.02)
-    # As much as each arena's part of the batch at least: 8 control steps of 3 robots, each with 10
-    # observed numbers, in float32.
-    assert each > 8 * 3 * 10 * 4
+    # As much as each arena's part of the batch at least: 8 control steps of 3 robots, each with all
+    # that it observes, in float32.
+    assert each > 8 * 3 * SIZE * 4
 
 
 def test_the_bytes_of_a_tree_are_those_of_its_arrays() -> None:

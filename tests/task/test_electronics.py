@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from entries import BEARING, DISTANCE, INFRARED, KNOWN, TARGET
 
 from swarmjax.run.settings import load_train
 from swarmjax.sim import drive as sim_drive
@@ -155,9 +156,10 @@ def test_with_all_factors_off_nothing_is_touched(xp: ModuleType, encoding: Encod
     np.testing.assert_array_equal(seen, again)
     assert seen.dtype == np.float32
     if encoding == "metric":
-        np.testing.assert_array_equal(seen[..., :8], np.minimum(np.float32(ray), np.float32(0.04)))
-        np.testing.assert_array_equal(seen[..., 8], np.float32(0.7))
-        np.testing.assert_array_equal(seen[..., 9], np.float32(-3.0))
+        expected = np.minimum(np.float32(ray), np.float32(0.04))
+        np.testing.assert_array_equal(seen[..., INFRARED], expected)
+        np.testing.assert_array_equal(seen[..., DISTANCE], np.float32(0.7))
+        np.testing.assert_array_equal(seen[..., BEARING], np.float32(-3.0))
 
 
 # --- what is observed
@@ -195,10 +197,11 @@ def test_what_is_observed_of_a_thing_nearby(xp: ModuleType, kind: Kind, encoding
     # The figures above are rounded: counts to 5e-3, lengths to 5e-8 m.
     rounding = 5e-3 / 1023 + ROUNDING if encoding == "webots" else 1e-7
     for sensor, expected in ((PS2, ps2), (PS5, ps5), (NOTHING, nothing)):
-        np.testing.assert_allclose(seen[..., sensor], expected, rtol=0, atol=rounding)
+        found = seen[..., INFRARED][..., sensor]
+        np.testing.assert_allclose(found, expected, rtol=0, atol=rounding)
     # 0.3 m, and a quarter turn to the left.
     target = (0.3, math.pi / 2) if encoding == "metric" else (0.3 / 1.5, 0.75)
-    np.testing.assert_allclose(seen[..., 8:], np.broadcast_to(target, (ARENAS, ROBOTS, 2)))
+    np.testing.assert_allclose(seen[..., TARGET], np.broadcast_to(target, (ARENAS, ROBOTS, 2)))
 
 
 @MODULES
@@ -211,10 +214,11 @@ def test_a_dead_sensor_sees_nothing(xp: ModuleType, kind: Kind, encoding: Encodi
     sound = _first(electronics, Factors(), sight, xp)
     seen = _first(electronics, _factors(xp, dead=dead), sight, xp).copy()
     nothing = 0.04 if encoding == "metric" else FREE / 1023
-    np.testing.assert_allclose(seen[1, 2, PS5], nothing, rtol=1e-6)  # float32
-    assert sound[1, 2, PS5] != seen[1, 2, PS5]
-    seen[1, 2, PS5] = sound[1, 2, PS5]
-    np.testing.assert_array_equal(seen, sound)
+    entry = (1, 2, INFRARED.start + PS5)
+    np.testing.assert_allclose(seen[entry], nothing, rtol=1e-6)  # float32
+    assert sound[entry] != seen[entry]
+    seen[entry] = sound[entry]
+    np.testing.assert_array_equal(seen[..., KNOWN], sound[..., KNOWN])
 
 
 @MODULES
@@ -225,10 +229,10 @@ def test_wear_of_the_sensors(xp: ModuleType) -> None:
     sight = _sight(xp, 0.024)
     seen = _first(electronics, _factors(xp, infrared_gain=gain), sight, xp)
     expected = (FREE + gain * (319.652 - FREE)) / 1023
-    np.testing.assert_allclose(seen[..., :8], expected, rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(seen[..., INFRARED], expected, rtol=0, atol=ROUNDING)
     seen = _first(electronics, _factors(xp, infrared_offset=10 * gain), sight, xp)
     expected = (319.652 + 10 * gain) / 1023
-    np.testing.assert_allclose(seen[..., :8], expected, rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(seen[..., INFRARED], expected, rtol=0, atol=ROUNDING)
 
 
 @MODULES
@@ -243,7 +247,7 @@ def test_noise_of_the_sensors_is_drawn_at_every_control_step(xp: ModuleType) -> 
         # Free space has a deviation of 0.04897 of its counts, here twice that.
         expected = FREE * (1.0 + 2 * 0.04897 * drawn) / 1023
         # 1e-6 of it: float32, and the rounding of log and cos.
-        np.testing.assert_allclose(found[..., :8], expected, rtol=2e-6)
+        np.testing.assert_allclose(found[..., INFRARED], expected, rtol=2e-6)
 
 
 # --- the sensors' period
@@ -262,14 +266,14 @@ def test_a_sample_is_held_until_the_next(xp: ModuleType, encoding: Encoding) -> 
     # Whatever the arena: slow, fast, and in step with the control.
     slow = _factors(xp, infrared_period=[0.05, 0.01, 0.032])
     rays = 0.001 * np.arange(STEPS + 1) + 0.01
-    fresh = [_first(electronics, Factors(), _sight(xp, ray), xp)[0, 0, 3] for ray in rays]
+    fresh = [_first(electronics, Factors(), _sight(xp, ray), xp)[0, 0, INFRARED][3] for ray in rays]
     memory, seen = task_electronics.begin(electronics, slow, _sight(xp, rays[0]), _clock(xp, 0), xp)
     found, bearing = [seen], [0.1 * n for n in range(STEPS + 1)]
     for n in range(1, STEPS + 1):
         sight = _sight(xp, rays[n], bearing=bearing[n])
         memory, seen = task_electronics.sense(electronics, memory, slow, sight, _clock(xp, n), xp)
         found.append(seen)
-    ray = np.stack(found)[..., :8]  # [T, A, R, K]
+    ray = np.stack(found)[..., INFRARED]  # [T, A, R, K]
     last = [max([m for m in DUE_50 if m <= n], default=0) for n in range(STEPS + 1)]
     held = np.array([fresh[n] for n in last])[:, None, None]
     np.testing.assert_array_equal(ray[:, :, 0], np.broadcast_to(held, (STEPS + 1, ARENAS, SENSORS)))
@@ -278,7 +282,7 @@ def test_a_sample_is_held_until_the_next(xp: ModuleType, encoding: Encoding) -> 
     # The target comes from elsewhere, and waits for no sample.
     turned = np.array(bearing[1:])
     turned = turned if encoding == "metric" else (turned + math.pi) / (2 * math.pi)
-    found = np.stack(found)[1:, :, 0, 9]
+    found = np.stack(found)[1:, :, 0, BEARING]
     np.testing.assert_allclose(found, np.stack([turned] * ARENAS, axis=-1), rtol=1e-6)  # float32
 
 
@@ -289,7 +293,8 @@ def _due(clock: Any, period: Any, xp: Any) -> Any:
     none = xp.zeros((count, robots, SENSORS), xp.float32)
     sight = Sight(none + 0.02, None, none[..., 0], none[..., 0])
     found, memory = Factors(infrared_period=period), Memory(None, none, None)
-    return task_electronics.sense(electronics, memory, found, sight, clock, xp)[1][..., 0] > 0.0
+    _, seen = task_electronics.sense(electronics, memory, found, sight, clock, xp)
+    return seen[..., INFRARED.start] > 0.0
 
 
 @MODULES
@@ -326,7 +331,7 @@ def test_an_observation_arrives_after_its_latency(xp: ModuleType) -> None:
     memory, seen = task_electronics.begin(
         electronics, found, _sight(xp, distance=1.0), _clock(xp, 0), xp
     )
-    np.testing.assert_array_equal(seen[..., 8], 1.0)
+    np.testing.assert_array_equal(seen[..., DISTANCE], 1.0)
     assert memory.seen is not None
     assert memory.seen.shape == (ARENAS, 2, ROBOTS, observation.SIZE)
     arrived = []
@@ -334,13 +339,14 @@ def test_an_observation_arrives_after_its_latency(xp: ModuleType) -> None:
         sight = _sight(xp, distance=1.0 + n)
         memory, seen = task_electronics.sense(electronics, memory, found, sight, _clock(xp, n), xp)
         assert seen.shape == (ARENAS, ROBOTS, observation.SIZE)
-        arrived.append(np.asarray(seen[..., 8]))
+        arrived.append(np.asarray(seen[..., DISTANCE]))
     # Of distances 1, 2, .. 6; the first has been seen all along.
     at_once, next_, second = [2, 3, 4, 5, 6], [1, 2, 3, 4, 5], [1, 1, 2, 3, 4]
     expected = [[at_once, next_, second], [second, second, at_once]]
     np.testing.assert_array_equal(np.moveaxis(arrived, 0, -1), expected)
     assert memory.seen is not None
-    np.testing.assert_array_equal(memory.seen[..., 8], np.full((ARENAS, 2, ROBOTS), [[6], [5]]))
+    kept = memory.seen[..., DISTANCE]
+    np.testing.assert_array_equal(kept, np.full((ARENAS, 2, ROBOTS), [[6], [5]]))
 
 
 @MODULES
@@ -353,7 +359,7 @@ def test_a_latency_of_zero_keeps_nothing(xp: ModuleType) -> None:
     _, seen = task_electronics.sense(
         electronics, memory, found, _sight(xp, distance=2.0), _clock(xp, 1), xp
     )
-    np.testing.assert_array_equal(seen[..., 8], 2.0)
+    np.testing.assert_array_equal(seen[..., DISTANCE], 2.0)
 
 
 @MODULES
@@ -366,7 +372,7 @@ def test_a_late_sample_is_both_held_and_late(xp: ModuleType) -> None:
     for n in range(1, 7):
         sight = _sight(xp, 0.010 + 0.001 * n)
         memory, seen = task_electronics.sense(electronics, memory, found, sight, _clock(xp, n), xp)
-        arrived.append(round(1000 * float(seen[1, 2, 3])))
+        arrived.append(round(1000 * float(seen[1, 2, INFRARED][3])))
     # Sampled in steps 0, 2, 4, 6.
     assert arrived == [10, 10, 12, 12, 14, 14]
 
@@ -381,9 +387,8 @@ def _targets(xp: ModuleType, distance: float, bearing: float, **realism: Any) ->
     found = Factors(seed=xp.arange(MANY, dtype=xp.uint32))
     sight = _sight(xp, 1.0, distance, bearing, arenas=MANY)
     clock = xp.zeros(MANY, xp.int32)
-    return np.asarray(task_electronics.begin(_electronics(**realism), found, sight, clock, xp)[1])[
-        ..., 8:
-    ]
+    _, seen = task_electronics.begin(_electronics(**realism), found, sight, clock, xp)
+    return np.asarray(seen)[..., TARGET]
 
 
 @MODULES
@@ -408,8 +413,8 @@ def test_noise_of_the_target_is_drawn_at_every_control_step(xp: ModuleType) -> N
     _, seen = task_electronics.sense(electronics, memory, found, sight, _clock(xp, 9), xp)
     drawn = noise.normal(SEED, np.array(9), Stream.TARGET_DISTANCE, (ROBOTS,), np)
     # Float32, and the rounding of log and cos.
-    np.testing.assert_allclose(seen[..., 8], 0.3 + 0.01 * drawn, rtol=1e-6)
-    np.testing.assert_array_equal(seen[..., 9], np.float32(math.pi / 2))
+    np.testing.assert_allclose(seen[..., DISTANCE], 0.3 + 0.01 * drawn, rtol=1e-6)
+    np.testing.assert_array_equal(seen[..., BEARING], np.float32(math.pi / 2))
 
 
 @MODULES
@@ -555,5 +560,5 @@ def test_a_real_robot_is_the_same_in_numpy_and_jax(encoding: Encoding) -> None:
         lambda mine, theirs: np.testing.assert_equal(mine.shape, theirs.shape), judged, trained
     )
     rows = np.stack(rows)
-    assert (rows[..., :8] < rows[..., :8].max()).mean() > 0.5  # most see something
+    assert (rows[..., INFRARED] < rows[..., INFRARED].max()).mean() > 0.5  # most see something
     assert (rows[1:] != rows[:-1]).mean() > 0.5  # and something new

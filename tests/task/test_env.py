@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from entries import BEARING, DISTANCE, INFRARED, KNOWN
 
 from swarmjax.run.settings import load_train
 from swarmjax.sim import gaps, infrared, physics
@@ -238,9 +239,10 @@ def test_observation_is_of_the_state_after_the_step_before_any_reset(episode: Ep
             expected = observation.observe(Readings(seen, distance, bearing), METRIC, np)
             found = episode.came.observation[t, a]
             # 1e-5 m: float32, where a glancing ray multiplies its rounding.
-            np.testing.assert_allclose(found[:, :9], expected[:, :9], atol=1e-5)
+            rest = KNOWN[KNOWN != BEARING]
+            np.testing.assert_allclose(found[:, rest], expected[:, rest], atol=1e-5)
             # Where the target is near, so is its rounding in rad; half a turn is either sign.
-            turn = np.abs(np.exp(1j * found[:, 9]) - np.exp(1j * expected[:, 9]))
+            turn = np.abs(np.exp(1j * found[:, BEARING]) - np.exp(1j * expected[:, BEARING]))
             present = level.present[0, a]
             assert (turn < 1e-5)[present].all()
 
@@ -252,16 +254,16 @@ def test_first_observation(tiny_world: World, start: EnvState) -> None:
     expected = infrared.distances(
         level.start[STANDING], level.side[STANDING], level.obstacle[STANDING], HULL, RANGE, np
     )
-    np.testing.assert_allclose(found[:, :8], expected, atol=1e-6)  # float32
+    np.testing.assert_allclose(found[:, INFRARED], expected, atol=1e-6)  # float32
     # The first robot looks at the wall, 60 mm ahead of its centre: ps7 sits 30 mm ahead and
     # looks 0.2992 rad to the left, ps0 0.30081 rad to the right.
-    assert found[0, 7] == pytest.approx(0.03 / np.cos(0.2992), abs=1e-6)
-    assert found[0, 0] == pytest.approx(0.03 / np.cos(0.30081), abs=1e-6)
+    assert found[0, INFRARED][7] == pytest.approx(0.03 / np.cos(0.2992), abs=1e-6)
+    assert found[0, INFRARED][0] == pytest.approx(0.03 / np.cos(0.30081), abs=1e-6)
     # Its target is 0.34 m back and 0.3 m to the left.
-    assert found[0, 8] == pytest.approx(np.hypot(0.34, 0.3), abs=1e-6)
-    assert found[0, 9] == pytest.approx(np.arctan2(0.3, -0.34), abs=1e-6)
+    assert found[0, DISTANCE] == pytest.approx(np.hypot(0.34, 0.3), abs=1e-6)
+    assert found[0, BEARING] == pytest.approx(np.arctan2(0.3, -0.34), abs=1e-6)
     assert int(state.clock) == 0
-    np.testing.assert_array_equal(state.distance, found[:, 8])
+    np.testing.assert_array_equal(state.distance, found[:, DISTANCE])
     assert not state.arrived.any()
 
 
@@ -270,7 +272,7 @@ def test_first_observation(tiny_world: World, start: EnvState) -> None:
 
 def test_a_robot_that_stands_in_range_pays_every_step_once(episode: Episode) -> None:
     # Two rays of the first see the wall; the others see nothing.
-    assert (episode.came.observation[:, STANDING, 0, :8] < RANGE).sum(axis=-1).min() == 2
+    assert (episode.came.observation[:, STANDING, 0, INFRARED] < RANGE).sum(axis=-1).min() == 2
     expected = np.broadcast_to(np.float32([-0.001, 0.0, 0.0]), (LIMIT, ROBOTS))
     # 1e-7 m: its distance to the target is computed anew at every step.
     np.testing.assert_allclose(episode.came.reward[:, STANDING], expected, atol=1e-7)
@@ -285,7 +287,7 @@ def test_rewards_of_an_episode_add_up_to_the_way_made(episode: Episode) -> None:
     )
     last = np.take_along_axis(episode.state.distance[1:], ended[None], axis=0)[0]
     progress = episode.state.distance[0] - last
-    sensed = episode.came.observation[..., :8].min(axis=-1) < RANGE
+    sensed = episode.came.observation[..., INFRARED].min(axis=-1) < RANGE
     steps = np.sum(sensed & episode.came.valid, axis=0)
     expected = np.where(present, progress - 0.001 * steps, 0.0)
     assert (steps[RANDOM] > 0).any()
@@ -478,4 +480,4 @@ def test_a_restarted_arena_has_the_robots_of_its_new_episode(real: Drawn) -> Non
     assert not motor.queue[new].any()
     assert not motor.held[new].any()
     np.testing.assert_array_equal(seen[new, 0], after.observation[new])
-    np.testing.assert_array_equal(infrared[new], after.observation[new][..., :8])
+    np.testing.assert_array_equal(infrared[new], after.observation[new][..., INFRARED])

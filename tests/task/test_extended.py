@@ -15,7 +15,7 @@ from swarmjax import extension
 from swarmjax.evaluate import judge
 from swarmjax.sim import physics
 from swarmjax.sim.config import SimConfig
-from swarmjax.task import env, extended, level
+from swarmjax.task import env, extended, level, observation
 from swarmjax.task import stage as task_stage
 from swarmjax.task.config import RewardConfig, TaskConfig
 from swarmjax.task.env import World
@@ -98,7 +98,7 @@ def test_a_term_of_weight_0_is_not_computed() -> None:
 
 
 def test_observations_may_be_left_out() -> None:
-    assert _world(str(extensions.OWN), observations=()).observation_size == 10
+    assert _world(str(extensions.OWN), observations=()).observation_size == observation.SIZE
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from entries import DISTANCE, INFRARED
 
 from swarmjax.ppo import gae
 from swarmjax.ppo import learner as ppo
@@ -169,7 +170,7 @@ def _random_trajectory(shape: tuple[int, int, int, int]) -> Trajectory:
     random = np.random.default_rng(0)
     end = random.random(shape)
     trajectory = Trajectory(
-        observation=random.random((*shape, 10)),
+        observation=random.random((*shape, observation.SIZE)),
         action=random.random((*shape, 2)),
         log_prob=random.random(shape),
         value=random.random(shape),
@@ -287,7 +288,8 @@ def test_the_rollout_is_what_single_steps_make(run: Run, replay: Replay) -> None
     for name in ("terminated", "truncated", "valid"):
         np.testing.assert_array_equal(getattr(trajectory, name)[:, 0], getattr(came, name), name)
     np.testing.assert_allclose(trajectory.reward[:, 0], came.reward, atol=DRIFT)
-    present = replay.seen[..., 8] > 0.0  # the parked stand on their targets, whose bearing is any
+    # The parked stand on their targets, whose bearing is any.
+    present = replay.seen[..., DISTANCE] > 0.0
     np.testing.assert_allclose(
         trajectory.observation[:, 0][present], replay.seen[present], atol=20 * DRIFT
     )  # 20: a bearing turns by 1 / 0.05 m as fast as its robot
@@ -315,7 +317,7 @@ def test_value_after_an_episode_is_of_what_it_came_to_not_of_the_next_start(
     value = _values(tiny_config, run.learners, replay.seen)
     next_value = _values(tiny_config, run.learners, replay.came.observation)
     start = _values(tiny_config, run.learners, np.asarray(run.starts.observation))
-    present = replay.seen[..., 8] > 0.0  # as above
+    present = replay.seen[..., DISTANCE] > 0.0  # as above
     # 1e-5: the drift of a bearing (2e-4) through a network whose slope is about 0.01 at first.
     np.testing.assert_allclose(found.value[:, 0][present], value[present], atol=1e-5)
     np.testing.assert_allclose(found.next_value[:, 0][present], next_value[present], atol=1e-5)
@@ -409,7 +411,7 @@ def _recount(run: Run, replay: Replay, arena: int) -> dict[int, dict[str, object
     found, begin, clock, cohort, level = {}, 0, CLOCK[arena], NOW, _at(run.before.level, arena)
     for end in np.flatnonzero(replay.fresh[:, arena]):
         came = _at(replay.came, (slice(begin, end + 1), arena))
-        sensed = came.valid & (came.observation[..., :8].min(axis=-1) < RANGE)
+        sensed = came.valid & (came.observation[..., INFRARED].min(axis=-1) < RANGE)
         found[int(end)] = {
             "episodes": 1,
             "stage": arena % 2,
