@@ -77,13 +77,13 @@ class AlgoConfig(Section):
         default=32, metadata=about("control steps per update", 1, MAX_COUNT)
     )
     epochs: int = field(
-        default=4, metadata=about("passes over each rollout: 'PPO K epochs'", 1, MAX_COUNT)
+        default=1, metadata=about("passes over each rollout: 'PPO K epochs'", 1, MAX_COUNT)
     )
     num_minibatches: int = field(
         default=8, metadata=about("gradient steps per pass; divides arenas", 1, MAX_COUNT)
     )
     discount: float = field(
-        default=0.99, metadata=about("per control step: 'discount factor (gamma)'", 0.0, 1.0)
+        default=0.998, metadata=about("per control step: 'discount factor (gamma)'", 0.0, 1.0)
     )
     advantage: Literal["gae", "monte_carlo"] = field(
         default="gae",

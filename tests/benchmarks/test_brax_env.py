@@ -78,7 +78,7 @@ def test_brax_is_given_our_numbers(tiny_config: TrainConfig) -> None:
     assert found["num_timesteps"] == 20 * 24 * 8
     assert (found["num_envs"], found["batch_size"], found["num_minibatches"]) == (24, 12, 2)
     assert (found["unroll_length"], found["num_updates_per_batch"]) == (8, 2)
-    assert (found["discounting"], found["learning_rate"]) == (0.99, 3e-4)
+    assert (found["discounting"], found["learning_rate"]) == (tiny_config.algo.discount, 3e-4)
     assert race.points(race.RaceConfig(points=6), tiny_config).tolist() == [3, 6, 9, 12, 15, 18]
 
 

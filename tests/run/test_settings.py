@@ -251,11 +251,11 @@ def test_import_needs_neither_jax_nor_hydra():
         (["arenas=100"], "arenas is 100, but algo.num_minibatches is 8: give a multiple of 8."),
         (["budget=4095"], "budget is 4095, but one update takes arenas x algo.rollout_length = "
          "4096 control steps: give at least 4096."),
-        # 1e15 // 4096 = 244140625000; 4 epochs of 8 minibatches: (2**31 - 1) // 32 = 67108863, and
-        # 67108863 * 4096 = 274877902848.
+        # 1e15 // 4096 = 244140625000; 1 epoch of 8 minibatches: (2**31 - 1) // 8 = 268435455, and
+        # 268435455 * 4096 = 1099511623680.
         (["budget=1e15"], "budget is 1000000000000000, which is 244140625000 updates of 4096 "
-         "control steps, and the gradient steps of no more than 67108863 are counted in 32 bits: "
-         "give at most 274877902848."),
+         "control steps, and the gradient steps of no more than 268435455 are counted in 32 bits: "
+         "give at most 1099511623680."),
     ],
 )  # fmt: skip
 def test_train_refuses(words, sentence):
