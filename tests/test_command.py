@@ -70,7 +70,7 @@ def test_a_section_is_listed_alone() -> None:
 
 def test_a_key_is_listed_alone() -> None:
     (line,) = command.help_text(TrainConfig, "swarmjax.train", ["algo.discount"]).splitlines()
-    assert line.startswith("  algo.discount=0.99 ")
+    assert line.startswith("  algo.discount=0.998 ")
 
 
 def test_every_section_says_how_it_is_listed() -> None:
