@@ -25,6 +25,7 @@ from benchmarks.mujoco_arena import MujocoArena
 from swarmjax import provenance
 from swarmjax.config import ConfigError, Section, about, to_dict
 from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.ppo import optimizer
 from swarmjax.run.settings import load_train
 from swarmjax.task import observation
 
@@ -146,7 +147,8 @@ def vectorised(workers: Workers) -> Any:
 
 def ppo_settings(robots: int) -> dict[str, Any]:
     """Numbers of `algo=ppo` under the names of Stable-Baselines3, for so many robots in all."""
-    algo = load_train(["stage=s6"]).algo
+    trained = load_train(["stage=s6"])
+    algo = trained.algo
     return {
         "n_steps": algo.rollout_length,
         "batch_size": robots * algo.rollout_length // algo.num_minibatches,
@@ -154,7 +156,7 @@ def ppo_settings(robots: int) -> dict[str, Any]:
         "gamma": algo.discount,
         "gae_lambda": algo.gae_lambda,
         "clip_range": algo.clip_epsilon,
-        "learning_rate": algo.actor_learning_rate,
+        "learning_rate": optimizer.learning_rates(algo, trained.updates)["actor"],
         "vf_coef": algo.value_cost,
         "ent_coef": algo.entropy_cost,
         "max_grad_norm": algo.max_grad_norm,

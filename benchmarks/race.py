@@ -36,6 +36,7 @@ from benchmarks.curriculum_arms import StudyConfig
 from swarmjax.config import ConfigError, Section, about, to_dict
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.ppo import learner as ppo
+from swarmjax.ppo import optimizer
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.run.settings import TrainConfig, load_train
 from swarmjax.task import observation
@@ -185,7 +186,7 @@ def _our_settings(trained: TrainConfig) -> dict[str, Any]:
         "clipping_epsilon": algo.clip_epsilon,
         "entropy_cost": algo.entropy_cost,
         "vf_loss_coefficient": algo.value_cost,
-        "learning_rate": algo.actor_learning_rate,
+        "learning_rate": optimizer.learning_rates(algo, trained.updates)["actor"],
         "max_grad_norm": algo.max_grad_norm,
     }
 

@@ -4,8 +4,10 @@
 numbers of arenas with commas between them, as in `arenas=1024,65536`. It prints a JSON line for
 each of the three at every number of arenas, the median of `timing.REPEATS` timed calls after one
 that is not counted; compile time is apart. All robots of the last stage act at random (physics and
-environment) or by the policy that is being trained. Speeds are those of all `seeds` together. What
-a device has no memory for gives a line that says so, as `failed`.
+environment) or by the policy that is being trained. Before environment and physics are timed, the
+environment steps for a whole episode from clocks spread over the step limit, so that arenas have
+all ages and reset in every timed call; `episodes_ended` counts those of the last. Speeds are those of all
+`seeds` together. What a device has no memory for gives a line that says so, as `failed`.
 """
 
 import json
@@ -90,7 +92,12 @@ def prepare(settings: TrainConfig) -> Prepared:
 
 
 def physics_alone(program: Program, arenas: EnvState, key: Array) -> tuple[EnvState, Array]:
-    """Moves all arenas with random commands; returns them and a number that depends on all."""
+    """Moves all arenas with random commands.
+
+    Returns:
+      The arenas as they were, so that each timed call does the same work, and a number that
+      depends on all of it.
+    """
     world = program.world
     move = jax.vmap(partial(physics.step, world.physics))
     level = arenas.level
@@ -103,35 +110,39 @@ def physics_alone(program: Program, arenas: EnvState, key: Array) -> tuple[EnvSt
 
     steps = CONTROL_STEPS[program.config.robot.body]
     data, _ = jax.lax.scan(body, data, jax.random.split(key, steps))
-    packed = jax.vmap(physics.pack)(data)
-    return replace(arenas, sim=packed), jnp.sum(packed.qpos)
+    return arenas, jnp.sum(jax.vmap(physics.pack)(data).qpos)
 
 
 def environment(
     program: Program, schedule: Schedule, arenas: EnvState, key: Array
-) -> tuple[EnvState, Array]:
-    """Steps all arenas with random actions, resets and all; returns them and the reward."""
+) -> tuple[EnvState, dict[str, Array]]:
+    """Steps all arenas with random actions, resets and all.
+
+    Returns:
+      The arenas, and the sums of `reward` (with the observations, so that none is left out) and of
+      `resets`.
+    """
     world = program.world
     step = jax.vmap(partial(env.step, world))
     unpack = jax.vmap(partial(physics.unpack, world.physics))
 
-    def body(arenas: EnvState, key: Array, starts: EnvState) -> tuple[EnvState, Array]:
+    def body(arenas: EnvState, key: Array, starts: EnvState) -> tuple[EnvState, dict[str, Array]]:
         arenas, came = step(arenas, _actions(program, key))
         reward = jnp.sum(came.reward) + jnp.sum(came.observation)
-        return rollout.restart(arenas, starts, came.done), reward
+        sums = {"reward": reward, "episodes_ended": jnp.sum(came.done, dtype=jnp.int32)}
+        return rollout.restart(arenas, starts, came.done), sums
 
-    def rolled(arenas: EnvState, key: Array) -> tuple[EnvState, Array]:
+    def rolled(arenas: EnvState, key: Array) -> tuple[EnvState, dict[str, Array]]:
         level_key, key = jax.random.split(key)
         index = jnp.zeros(program.config.arenas, jnp.int32)
         starts = rollout.draw_starts(world, schedule.stages, index, jnp.int32(0), level_key)
         keys = jax.random.split(key, program.config.algo.rollout_length)
-        arenas, reward = jax.lax.scan(partial(body, starts=starts), arenas, keys)
-        return arenas, jnp.sum(reward)
+        return jax.lax.scan(partial(body, starts=starts), arenas, keys)
 
     arenas = replace(arenas, sim=unpack(arenas.sim))
     keys = jax.random.split(key, _rollouts(program.config))
-    arenas, reward = jax.lax.scan(rolled, arenas, keys)
-    return replace(arenas, sim=jax.vmap(physics.pack)(arenas.sim)), jnp.sum(reward)
+    arenas, sums = jax.lax.scan(rolled, arenas, keys)
+    return replace(arenas, sim=jax.vmap(physics.pack)(arenas.sim)), jax.tree.map(jnp.sum, sums)
 
 
 def _rollouts(settings: TrainConfig) -> int:
@@ -183,6 +194,7 @@ def about(settings: TrainConfig, impl: str | None = None) -> dict[str, Any]:
     """
     return {
         "robot": settings.robot.body,
+        "solver": settings.sim.solver,
         "impl": dispatch.resolve_impl(settings.sim.impl) if impl is None else impl,
         "arenas": settings.arenas,
         "seeds": settings.seeds,
@@ -205,21 +217,38 @@ def made_with() -> dict[str, Any]:
     }
 
 
-def time_physics(prepared: Prepared) -> dict[str, Any]:
-    """Times the physics alone; returns the line."""
-    arenas = prepared.start(prepared.schedule).arenas
+def settle(prepared: Prepared) -> EnvState:
+    """Steps the environment until its arenas have all ages.
+
+    Returns:
+      The arenas, after a step limit that they began with clocks spread evenly over it.
+    """
+    settings = prepared.program.config
+    arenas: EnvState = prepared.start(prepared.schedule).arenas
+    spread = jnp.linspace(0, settings.task.step_limit, arenas.clock.size, endpoint=False)
+    clock = jax.random.permutation(jax.random.key(0), spread.astype(arenas.clock.dtype))
+    arenas = replace(arenas, clock=clock.reshape(arenas.clock.shape))
+    steps = _rollouts(settings) * settings.algo.rollout_length
+    for _ in range(-(-settings.task.step_limit // steps)):
+        arenas, _ = prepared.environment.call(arenas, (prepared.schedule, prepared.keys))
+    return arenas
+
+
+def time_physics(prepared: Prepared, arenas: EnvState) -> dict[str, Any]:
+    """Times the physics alone; returns the line. The arenas are used up."""
     calls_s, _ = timing.time_program(prepared.physics, arenas, prepared.keys)
     steps = CONTROL_STEPS[prepared.program.config.robot.body]
     return _line(prepared, "physics", steps, calls_s)
 
 
-def time_environment(prepared: Prepared) -> dict[str, Any]:
-    """Times the environment; returns the line."""
+def time_environment(prepared: Prepared, arenas: EnvState) -> dict[str, Any]:
+    """Times the environment; returns the line. The arenas are used up."""
     settings = prepared.program.config
-    arenas, argument = prepared.start(prepared.schedule).arenas, (prepared.schedule, prepared.keys)
-    calls_s, _ = timing.time_program(prepared.environment, arenas, argument)
+    argument = prepared.schedule, prepared.keys
+    calls_s, sums = timing.time_program(prepared.environment, arenas, argument)
     steps = _rollouts(settings) * settings.algo.rollout_length
-    return _line(prepared, "environment", steps, calls_s)
+    line = _line(prepared, "environment", steps, calls_s)
+    return line | {"episodes_ended": int(np.sum(sums["episodes_ended"]))}
 
 
 def time_training(prepared: Prepared, arena_steps_per_s: float) -> dict[str, Any]:
@@ -244,9 +273,10 @@ def time_training(prepared: Prepared, arena_steps_per_s: float) -> dict[str, Any
 
 def results(prepared: Prepared) -> list[dict[str, Any]]:
     """Runs the three benchmarks of one size; returns their lines."""
-    environment = time_environment(prepared)
+    environment = time_environment(prepared, settle(prepared))
+    alone = time_physics(prepared, settle(prepared))
     training = time_training(prepared, environment["arena_steps_per_s"])
-    return [time_physics(prepared), environment, training]
+    return [alone, environment, training]
 
 
 def sweep(points: Sequence[TrainConfig]) -> Iterator[list[dict[str, Any]]]:
@@ -274,7 +304,7 @@ def _physics(program: Program, arenas: EnvState, keys: Array) -> tuple[EnvState,
 
 def _environments(
     program: Program, arenas: EnvState, argument: tuple[Schedule, Array]
-) -> tuple[EnvState, Array]:
+) -> tuple[EnvState, dict[str, Array]]:
     """`environment` for all seeds."""
     schedule, keys = argument
     step = partial(environment, program, schedule)

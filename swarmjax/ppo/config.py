@@ -105,13 +105,22 @@ class AlgoConfig(Section):
     clip_epsilon: float = field(
         default=0.2, metadata=about("of the probability ratio: 'PPO epsilon clip'", above=0.0)
     )
-    actor_learning_rate: float = field(
-        default=3e-4,
-        metadata=about("of the policy: 'optimizer learning rate actor'", above=0.0, high=1.0),
+    actor_learning_rate: float | None = field(
+        default=None,
+        metadata=about(
+            "of the policy: 'optimizer learning rate actor'; null: 3e-4, and less in proportion "
+            "in a run of more than 15000 gradient steps",
+            above=0.0,
+            high=1.0,
+        ),
     )
-    critic_learning_rate: float = field(
-        default=1e-3,
-        metadata=about("of the value: 'optimizer learning rate critic'", above=0.0, high=1.0),
+    critic_learning_rate: float | None = field(
+        default=None,
+        metadata=about(
+            "of the value: 'optimizer learning rate critic'; null: 1e-3, and less likewise",
+            above=0.0,
+            high=1.0,
+        ),
     )
     learning_rate_schedule: Literal["constant", "linear"] = field(
         default="linear", metadata=about("linear falls to 0 at the end of the budget")

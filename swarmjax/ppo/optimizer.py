@@ -21,6 +21,44 @@ METRICS = (
 
 Progress = tuple[Params, optax.OptState]
 
+# The rule of `learning_rates`. Runs of 128 to 8,192 arenas end well if their rates, summed over the
+# gradient steps, are those of 6,000 to 15,000 steps at 3e-4 that fall to 0; larger sums end worse
+# (docs/results.md, "Why more training made the swarm worse").
+_RATES = {"actor": 3e-4, "critic": 1e-3}
+_FULL_RATE_STEPS = 15_000
+# Mean over the run of what a schedule makes of a rate.
+_MEAN_OF_SCHEDULE = {"constant": 1.0, "linear": 0.5}
+
+
+def gradient_steps(config: AlgoConfig, updates: int) -> int:
+    """Counts the gradient steps of a run, those without a valid sample among them.
+
+    Args:
+        config: Passes over each rollout, and minibatches of each pass.
+        updates: Number of updates of the whole run.
+    """
+    return updates * config.epochs * config.num_minibatches
+
+
+def learning_rates(config: AlgoConfig, updates: int) -> dict[str, float]:
+    """Chooses the learning rates that a run begins with.
+
+    A rate that the config leaves open is `_RATES`, times what keeps the sum of rates over the run
+    at or below that of `_FULL_RATE_STEPS` steps that fall linearly to 0.
+
+    Args:
+        config: Learning rates, or None for the rule; their schedule.
+        updates: Number of updates of the whole run.
+
+    Returns:
+        The rate of the `actor` and of the `critic`.
+    """
+    mean = _MEAN_OF_SCHEDULE[config.learning_rate_schedule]
+    most = _FULL_RATE_STEPS * _MEAN_OF_SCHEDULE["linear"]
+    share = min(1.0, most / max(1.0, mean * gradient_steps(config, updates)))
+    given = {"actor": config.actor_learning_rate, "critic": config.critic_learning_rate}
+    return {name: _RATES[name] * share if rate is None else rate for name, rate in given.items()}
+
 
 def make(config: AlgoConfig, updates: int) -> optax.GradientTransformation:
     """Makes the optimiser: one clip over all gradients, if any, then Adam for each network.
@@ -32,7 +70,7 @@ def make(config: AlgoConfig, updates: int) -> optax.GradientTransformation:
     Returns:
         An optimiser of `{"actor": .., "critic": ..}`.
     """
-    steps = updates * config.epochs * config.num_minibatches
+    rates, steps = learning_rates(config, updates), gradient_steps(config, updates)
 
     def adam(learning_rate: float) -> optax.GradientTransformation:
         schedule = {
@@ -42,7 +80,7 @@ def make(config: AlgoConfig, updates: int) -> optax.GradientTransformation:
         return optax.adam(schedule, eps=config.adam_epsilon)
 
     adams = optax.partition(
-        {"actor": adam(config.actor_learning_rate), "critic": adam(config.critic_learning_rate)},
+        {name: adam(rate) for name, rate in rates.items()},
         {"actor": "actor", "critic": "critic"},
     )
     if config.max_grad_norm is None:

@@ -16,6 +16,7 @@ from swarmjax import extension, provenance, words
 from swarmjax.config import ConfigError, to_dict
 from swarmjax.curriculum import engine as curriculum
 from swarmjax.curriculum.engine import Schedule
+from swarmjax.ppo import optimizer
 from swarmjax.run import checkpoint, memory, warm_start
 from swarmjax.run.checkpoint import Checkpoints, Leaves
 from swarmjax.run.display import Display, working
@@ -240,7 +241,16 @@ def _opening(program: Built) -> str:
         f"of {words.count(steps, 'arena control step')} "
         f"({words.count(settings.arenas, 'arena')}){several} on {provenance.device()}; "
         f"{settings.robot.body} robots stepped by {engine.label}, "
-        f"sim.solver={engine.solver} sim.impl={engine.impl}"
+        f"sim.solver={engine.solver} sim.impl={engine.impl}; {_learning(settings)}"
+    )
+
+
+def _learning(settings: TrainConfig) -> str:
+    """Says how many gradient steps a run takes, and with which learning rates it begins."""
+    steps = words.count(optimizer.gradient_steps(settings.algo, settings.updates), "gradient step")
+    rates = optimizer.learning_rates(settings.algo, settings.updates)
+    return (
+        f"{steps}, learning rates {rates['actor']:.2g} (actor) and {rates['critic']:.2g} (critic)"
     )
 
 

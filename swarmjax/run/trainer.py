@@ -20,6 +20,7 @@ import numpy as np
 from swarmjax import provenance, words
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.curriculum.log import log
+from swarmjax.ppo import optimizer
 from swarmjax.run import memory, recorder
 from swarmjax.run.checkpoint import Checkpoints
 from swarmjax.run.display import Display, summarize
@@ -394,13 +395,15 @@ def _decisions(settings: TrainConfig, rows: list[Row]) -> list[Row]:
 
 def _check_finite(settings: TrainConfig, rows: list[Row]) -> None:
     """Stops a run whose networks have broken, before it is saved."""
+    rates = optimizer.learning_rates(settings.algo, settings.updates)
     for row in rows:
         where = f" of seed {row['seed']}" if settings.seeds > 1 else ""
         for name in ("policy_loss", "value_loss", "grad_norm"):
             if row[name] is None:
                 raise TrainingError(
                     f"{name} is no longer finite at update {row['update']}{where}: try lower "
-                    "algo.actor_learning_rate and algo.critic_learning_rate."
+                    "algo.actor_learning_rate and algo.critic_learning_rate than "
+                    f"{rates['actor']:.2g} and {rates['critic']:.2g}."
                 )
 
 

@@ -74,7 +74,10 @@ def calls(program: Program, pass_time: Callable[[float], None]) -> Calls:
     def call(state: Any, argument: Any) -> tuple[Any, Any]:
         arguments.append(argument)
         pass_time(next(taken))
-        return state, {"transitions": np.full((SEEDS, 1000), 7.0)}
+        return state, {
+            "transitions": np.full((SEEDS, 1000), 7.0),
+            "episodes_ended": np.full(SEEDS, 3),
+        }
 
     stub = timing.TimedProgram(call, compile_s=0.0, size=0)
     prepared = Prepared(
@@ -101,9 +104,9 @@ def _assert_speeds(line: Line, control_steps: int) -> None:
     "measure", [steps_per_second.time_physics, steps_per_second.time_environment]
 )
 def test_speeds_are_the_steps_of_a_call_by_its_seconds(
-    measure: Callable[[Prepared], Line], calls: Calls
+    measure: Callable[[Prepared, Any], Line], calls: Calls
 ) -> None:
-    line = measure(calls.prepared)
+    line = measure(calls.prepared, ())
     assert line["calls_s"] == CALLS[1:]
     _assert_speeds(line, CONTROL_STEPS)
 
@@ -151,8 +154,18 @@ def test_a_call_of_the_physics_makes_the_steps_that_are_counted(
     monkeypatch.setattr(physics, "step", step)
     arenas = _begun(program)
     call = jax.jit(functools.partial(steps_per_second.physics_alone, program))
-    after, _ = call(arenas, jax.random.key(1))
-    np.testing.assert_array_equal(after.sim.qpos, np.full_like(after.sim.qpos, CONTROL_STEPS))
+    _, total = call(arenas, jax.random.key(1))
+    assert total == CONTROL_STEPS * arenas.sim.qpos.size
+
+
+def test_resets_fall_into_the_calls_that_are_timed(tiny_config: TrainConfig) -> None:
+    prepared = steps_per_second.prepare(tiny_config)
+    arenas = steps_per_second.settle(prepared)
+    # Ages that are spread evenly make each arena reset once in a step limit; the tiny one is
+    # shorter than the control steps of a call.
+    assert tiny_config.task.step_limit < CONTROL_STEPS
+    line = steps_per_second.time_environment(prepared, arenas)
+    assert line["episodes_ended"] >= tiny_config.arenas
 
 
 class _State(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 
-from swarmjax.ppo import dispatch, learner, losses, networks
+from swarmjax.ppo import dispatch, learner, losses, networks, optimizer
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch, LearnerState
 
@@ -234,8 +234,9 @@ def test_actor_and_critic_move_at_their_own_learning_rates() -> None:
     moves = _step_sizes(state.params, updated.params)
     # Adam's first step is rate * g / (|g| + 1e-5): the rate, less 1e-5 / |g| of it, where the
     # largest |g| of each network is at least 1e-3 here.
-    np.testing.assert_allclose(moves["actor"], ONE_STEP.actor_learning_rate, rtol=1e-2)
-    np.testing.assert_allclose(moves["critic"], ONE_STEP.critic_learning_rate, rtol=1e-2)
+    rates = optimizer.learning_rates(ONE_STEP, UPDATES)
+    np.testing.assert_allclose(moves["actor"], rates["actor"], rtol=1e-2)
+    np.testing.assert_allclose(moves["critic"], rates["critic"], rtol=1e-2)
 
 
 def test_one_norm_clips_the_gradient_of_both_networks() -> None:
@@ -361,8 +362,9 @@ def test_adam_takes_its_epsilon_from_the_config() -> None:
     updated, metrics = _update(state, _batch(state, 0, config), jax.random.key(1), config=config)
     # rate * g / (|g| + 10), at most a tenth of rate * the norm of g: far below the rate itself.
     move = _step_sizes(state.params, updated.params)["critic"]
-    assert 0.0 < move < 0.1 * config.critic_learning_rate * float(metrics["grad_norm"])
-    assert move < 0.5 * config.critic_learning_rate
+    rate = optimizer.learning_rates(config, UPDATES)["critic"]
+    assert 0.0 < move < 0.1 * rate * float(metrics["grad_norm"])
+    assert move < 0.5 * rate
 
 
 def test_observations_may_be_left_as_they_are() -> None:
