@@ -6,8 +6,8 @@ each of the three at every number of arenas, the median of `timing.REPEATS` time
 that is not counted; compile time is apart. All robots of the last stage act at random (physics and
 environment) or by the policy that is being trained. Before environment and physics are timed, the
 environment steps for a whole episode from clocks spread over the step limit, so that arenas have
-all ages and reset in every timed call; `episodes_ended` counts those of the last. Speeds are those of all
-`seeds` together. What a device has no memory for gives a line that says so, as `failed`.
+all ages and reset in every timed call; `episodes_ended` counts those of the last. Speeds are those
+of all `seeds` together. What a device has no memory for gives a line that says so, as `failed`.
 """
 
 import json
@@ -120,7 +120,7 @@ def environment(
 
     Returns:
       The arenas, and the sums of `reward` (with the observations, so that none is left out) and of
-      `resets`.
+      `episodes_ended`.
     """
     world = program.world
     step = jax.vmap(partial(env.step, world))

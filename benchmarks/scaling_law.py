@@ -1,0 +1,236 @@
+"""What more arenas and more training make of the default recipe.
+
+`python -m benchmarks.scaling_law dir=DIR do=train|judge|table [key=value ...]` takes the keys of
+`ScalingConfig`, and those of `swarmjax.train` for `do=train`.
+
+- `train` trains every point of `arenas` x `transitions`, `seeds` policies each, into `DIR`. A
+  transition is a control step of one of the five robots of an arena; `budget` follows from it. A
+  point of less than one update is passed over and said.
+- `judge` tries the policies on wheels in MuJoCo C, with drawn and with mean actions, on the suite
+  `scaling`: the cells of `headline`, and `crowd_dense`, on which none was trained.
+- `table` prints a JSON line for each point, cell and kind of action, with what changed from the
+  next smaller number of arenas and of transitions, level by level.
+
+All three go on with what `DIR` holds, so that they may be stopped, and judged on another machine.
+"""
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+import swarmjax
+from swarmjax import atomic_file, command, provenance
+from swarmjax.config import ConfigError, Section, about, build, show
+from swarmjax.config.section import MAX_COUNT, names
+from swarmjax.evaluate import cells, statistics, trials
+from swarmjax.evaluate.cells import Cell
+from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.task.stage_files import load_levels
+
+MEASURES = ("targets_reached", "all_reached", "contacts_per_robot", "episode_time_s")
+ACTIONS = ("sampled", "mean")
+_ROBOTS = 5  # of an arena, which a transition is counted by
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScalingConfig(Section):
+    """Which points are trained, and how they are judged."""
+
+    dir: str = field(metadata=about("folder of the runs and of what was judged"))
+    do: Literal["train", "judge", "table"] = field(metadata=about("what is done"))
+    arenas: tuple[int, ...] = field(
+        default=(128, 1024, 8192, 65_536), metadata=about("numbers of arenas", 1, 2**20)
+    )
+    transitions: tuple[float, ...] = field(
+        default=(1e7, 1e8, 1e9), metadata=about("robot steps of a seed", 1, 10**15)
+    )
+    seeds: int = field(default=5, metadata=about("policies of a point", 3, 4096))
+    seed: int = field(default=700, metadata=about("first of them", 0, MAX_COUNT))
+
+
+class Point(NamedTuple):
+    """A number of arenas and of transitions."""
+
+    arenas: int
+    transitions: float
+
+    def __str__(self) -> str:
+        return f"a{self.arenas}-t{self.transitions:.0e}".replace("+", "")
+
+
+def points(config: ScalingConfig) -> list[Point]:
+    """Lists the points, the quickest to train first."""
+    every = [Point(*each) for each in product(config.arenas, config.transitions)]
+    return sorted(every, key=lambda point: (point.transitions, -point.arenas))
+
+
+def training(config: ScalingConfig, point: Point, words: Sequence[str]) -> TrainConfig | None:
+    """Makes the settings of a point's run; None if it has no whole update.
+
+    Raises:
+      ConfigError: a word is unsound.
+    """
+    base = load_train(words)
+    if point.transitions < _ROBOTS * point.arenas * base.algo.rollout_length:
+        return None
+    given = [
+        f"arenas={point.arenas}",
+        f"budget={round(point.transitions / _ROBOTS)}",
+        f"seeds={config.seeds}",
+        f"seed={config.seed}",
+        f"run.dir={Path(config.dir) / str(point)}",
+    ]
+    return load_train([*words, *given])
+
+
+def train(config: ScalingConfig, words: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Trains the points that have no policies yet; yields a line each."""
+    for point in points(config):
+        place = Path(config.dir) / str(point)
+        if (place / "summary.json").exists():
+            continue
+        settings = training(config, point, words)
+        line = {"benchmark": "scaling_law.train", **point._asdict(), "words": list(words)}
+        if settings is None:
+            yield line | {"skipped": "less than one update"}
+            continue
+        swarmjax.train_policy(settings)
+        summary = json.loads((place / "summary.json").read_text())
+        told = ("updates", "train_s", "compile_s", "device", "commit")
+        line |= {name: summary.get(name) for name in told}
+        yield line | {"trained_on": summary.get("transitions")}
+
+
+def policies(config: ScalingConfig, point: Point) -> list[str]:
+    """Lists the policies of a point, by seed; none if it was not trained."""
+    return sorted(str(file) for file in (Path(config.dir) / str(point)).glob("policy-seed*.npz"))
+
+
+def judged_file(config: ScalingConfig, point: Point, cell: str, action: str) -> Path:
+    """Names the file that holds a point's measures [seeds, levels]."""
+    return Path(config.dir) / "judged" / f"{point}-{cell}-{action}.npz"
+
+
+def judge(config: ScalingConfig) -> Iterator[dict[str, Any]]:
+    """Judges the points that were not judged yet, all of them cell by cell; yields short lines."""
+    trained = {point: policies(config, point) for point in points(config)}
+    some = next((files[0] for files in trained.values() if files), None)
+    if some is None:
+        raise ConfigError(f"dir is {show(config.dir)}, which holds no policies: do=train first.")
+    settings = load_levels(EvaluateConfig, [f"policy={some}", "suite=scaling", "robot=wheeled"])
+    for cell, action in product(cells.load(settings).cells, ACTIONS):
+        places = {point: judged_file(config, point, cell.name, action) for point in trained}
+        left = {point: files for point, files in trained.items() if not places[point].exists()}
+        for point, found in _try(replace(settings, action=action), left, cell).items():
+            with atomic_file.replacing(places[point]) as temporary:
+                np.savez(temporary, allow_pickle=False, **found)
+            means = {name: round(float(x.mean()), 5) for name, x in found.items()}
+            yield {"point": str(point), "cell": cell.name, "action": action, **means}
+
+
+def _try(
+    settings: EvaluateConfig, trained: dict[Point, list[str]], cell: Cell
+) -> dict[Point, dict[str, np.ndarray]]:
+    """Tries the policies of points on a cell; returns [seeds, levels] of each measure."""
+    files = [file for each in trained.values() for file in each]
+    if not files:
+        return {}
+    (trial,) = trials.run(settings, [cell], trials.read_policies(files))
+    ends = np.cumsum([len(each) for each in trained.values()])[:-1]
+    split = {name: np.split(trial.found[name], ends) for name in MEASURES}
+    found = [dict(zip(split, each, strict=True)) for each in zip(*split.values(), strict=True)]
+    return {point: each for (point, own), each in zip(trained.items(), found, strict=True) if own}
+
+
+def table(config: ScalingConfig) -> Iterator[dict[str, Any]]:
+    """Yields the line of every point, cell and kind of action that was judged."""
+    for path in sorted((Path(config.dir) / "judged").glob("*-sampled.npz")):
+        head = path.name.removesuffix("-sampled.npz")
+        for point in points(config):
+            if head.startswith(f"{point}-"):
+                cell = head.removeprefix(f"{point}-")
+                yield from (_line(config, point, cell, action) for action in ACTIONS)
+
+
+def _line(config: ScalingConfig, point: Point, cell: str, action: str) -> dict[str, Any]:
+    found = _load(config, point, cell, action)
+    assert found is not None  # the file of its drawn actions is there
+    line: dict[str, Any] = {
+        "benchmark": "scaling_law",
+        **point._asdict(),
+        "cell": cell,
+        "action": action,
+        "seeds": list(range(config.seed, config.seed + len(found["all_reached"]))),
+        "levels": found["all_reached"].shape[1],
+    }
+    for name, values in found.items():
+        estimate, low, high = statistics.bootstrap(values, np.mean, draw="runs_and_tasks")
+        line |= {name: estimate, f"{name}_interval": [low, high]}
+        line[f"{name}_by_seed"] = values.mean(axis=1).round(5).tolist()
+    for what, smaller in _smaller(config, point).items():
+        before = _load(config, smaller, cell, action)
+        for name in found if before else ():
+            assert before is not None
+            change = statistics.paired(before[name], found[name], np.mean, draw="runs_and_tasks")
+            line[f"{name}_by_{what}"] = list(change)
+    return line | {"versions": provenance.versions(), "commit": provenance.commit()}
+
+
+def _smaller(config: ScalingConfig, point: Point) -> dict[str, Point]:
+    """Names the next smaller points of a row and of a column."""
+    arenas = [each for each in config.arenas if each < point.arenas]
+    transitions = [each for each in config.transitions if each < point.transitions]
+    found = {}
+    if arenas:
+        found["arenas"] = point._replace(arenas=max(arenas))
+    if transitions:
+        found["transitions"] = point._replace(transitions=max(transitions))
+    return found
+
+
+def _load(
+    config: ScalingConfig, point: Point, cell: str, action: str
+) -> dict[str, np.ndarray] | None:
+    place = judged_file(config, point, cell, action)
+    if not place.exists():
+        return None
+    with np.load(place) as file:
+        return {name: file[name] for name in MEASURES}
+
+
+def parse(words: Sequence[str]) -> tuple[ScalingConfig, list[str]]:
+    """Takes the benchmark's own words out of those of training.
+
+    Raises:
+      ConfigError: a word is unsound.
+    """
+    mine, given = set(names(ScalingConfig)), {}
+    for key, _, value in (word.partition("=") for word in words):
+        if key in mine:
+            given[key] = value.split(",") if key in ("arenas", "transitions") else value
+    return build(ScalingConfig, given), [w for w in words if w.partition("=")[0] not in mine]
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    config, words = parse(arguments)
+    lines = {
+        "train": lambda: train(config, words),
+        "judge": lambda: judge(config),
+        "table": lambda: table(config),
+    }[config.do]()
+    for line in lines:
+        sys.stdout.write(json.dumps(line) + "\n")
+        sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("scaling_law", main, TrainConfig))
