@@ -11,14 +11,16 @@ from swarmjax import command
 from swarmjax.run.display import working
 from swarmjax.run.errors import CheckpointError
 from swarmjax.run.settings import TrainConfig, load_run
+from swarmjax.run.signals import Stop
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    with working("starting"):
-        settings, auto = load_run(arguments)
-        from swarmjax.run.execute import execute
-    return execute(settings, auto=auto)
+    with Stop() as stop:
+        with working("starting"):
+            settings, auto = load_run(arguments)
+            from swarmjax.run.execute import execute
+        return execute(settings, stop, auto=auto)
 
 
 if __name__ == "__main__":

@@ -25,8 +25,9 @@ from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
 from swarmjax.reproduce.judge import Task
 from swarmjax.reproduce.rows import EVALUATION, FACTS, FORMAT
 from swarmjax.run.checkpoint import CheckpointError
+from swarmjax.run.errors import TrainingError
 from swarmjax.run.policy_export import POLICY
-from swarmjax.run.trainer import Stop, TrainingError
+from swarmjax.run.signals import Stop, StoppedError
 
 FAILED = 1
 _PLATFORMS = {"cpu": "cpu", "gpu": "cuda,cpu"}  # as JAX calls them
@@ -51,11 +52,13 @@ def main(arguments: Sequence[str]) -> int:
             except TrainingError as error:
                 sys.stderr.write(f"swarmjax.reproduce: error: {arm}: {error}\n")
                 return FAILED
+            except StoppedError:
+                break
             _write(out, given)
     missing = set(given.arms) - arms.summaries(out).keys()
     if stop.asked:
         sys.stdout.write(_stopped(out, given, len(missing)))
-        return command.INTERRUPTED if stop.signalled else 0
+        return stop.code or 0
     _judge(out, given)
     page = reproduce_page.write(out)
     sys.stdout.write(f"done; the report is {page}\n")

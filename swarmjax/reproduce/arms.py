@@ -14,7 +14,7 @@ from swarmjax.run import checkpoint, compile_cache, lifecycle, memory
 from swarmjax.run.checkpoint import CheckpointError
 from swarmjax.run.display import Display
 from swarmjax.run.settings import TrainConfig, from_stored, load_train, read_config
-from swarmjax.run.trainer import Stop
+from swarmjax.run.signals import Stop
 
 _EXPANDED, _MODERN = "_expanded", "modern_"
 _STAGES = {"curriculum": "paper_curriculum", "baseline": "paper6"}

@@ -1,16 +1,22 @@
 """Checkpoints: everything that changes in a run, and a digest of it. Resuming is exact.
 
-Orbax writes and keeps the steps; what it lacks is added here: a digest that notices damage (one
-flipped bit restores silently otherwise), and going back to the newest step that is sound.
+Orbax writes the steps; what it lacks is added here: a digest that notices damage (one flipped bit
+restores silently otherwise), a binding to update, config and run that notices a swapped, renamed or
+foreign step, and going back to the newest step that is sound.
 A checkpoint is a flat dictionary from names such as `learners/params/actor/mean/kernel` to
 arrays, so that it can be read without the program that wrote it. Those of a run have a leading
 axis of seeds.
 """
 
 import functools
+import hashlib
+import json
 import logging
+import shutil
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +24,8 @@ import numpy as np
 from absl import logging as absl_logging
 
 from swarmjax.policy import digest
-from swarmjax.run.errors import CheckpointError
+from swarmjax.run import directory
+from swarmjax.run.errors import CheckpointError, TrainingError
 
 # Orbax takes half a second to import, which a run spends while it compiles (`trainer`).
 if TYPE_CHECKING:
@@ -26,9 +33,59 @@ if TYPE_CHECKING:
 
 Leaves = dict[str, np.ndarray]
 
+FOLDER = "checkpoints"
+SAVED = "checkpoints.jsonl"  # a row for each checkpoint that was written, of those removed too
+_OLD_META = {"digest", "update"}  # all that checkpoints held before they were bound to their run
+_UNFINISHED = "*.orbax-checkpoint-tmp*"  # what Orbax renames when it is whole
+
+
+class Binding(NamedTuple):
+    """What a checkpoint is of.
+
+    Attributes:
+      run: Id of the run; None before runs had one.
+      config: Digest of what the run's config fixes.
+    """
+
+    run: str | None
+    config: str
+
+
+class Kept(NamedTuple):
+    """A sound checkpoint.
+
+    Attributes:
+      leaves: As `to_leaves` gave them.
+      update: Updates that were done.
+      logs: Bytes of each log that belong to it, by name; empty in older checkpoints.
+      rate_scale: What the learning rates were multiplied by.
+      skipped: A sentence for each newer checkpoint that is damaged.
+      notes: Sentences about what is not known of this one.
+    """
+
+    leaves: Leaves
+    update: int
+    logs: dict[str, int]
+    rate_scale: float
+    skipped: list[str]
+    notes: list[str]
+
+
+def binding(run: Path) -> Binding | None:
+    """Reads what the checkpoints of a run directory must be of; None without a config."""
+    try:
+        stored = json.loads((run / directory.CONFIG).read_text())
+        return Binding(stored.get("run", {}).get("id"), directory.config_digest(stored))
+    except (OSError, ValueError, AttributeError, RecursionError):
+        return None
+
 
 class Checkpoints:
-    """The checkpoints of one run directory, for writing. Close it, or use `with`."""
+    """The checkpoints of one run directory, for writing. Close it, or use `with`.
+
+    A thread writes them while the run goes on. The newest are kept, and the one with the highest
+    score.
+    """
 
     def __init__(self, run: Path, keep: int, update: int | None = None) -> None:
         """Opens `run`/checkpoints, keeping the `keep` newest.
@@ -37,35 +94,101 @@ class Checkpoints:
         over as damaged, and Orbax would save nothing before them. Otherwise nothing is done until
         the first is saved, so that a run need not wait for Orbax before it begins.
         """
-        self._folder, self._keep = (run / "checkpoints").resolve(), keep
+        self._run, self._keep = run, keep
+        self._folder = (run / FOLDER).resolve()
+        self._thread = ThreadPoolExecutor(1)
+        self._pending: Future[None] | None = None
         if update is not None:
+            for left in self._folder.glob(_UNFINISHED):
+                shutil.rmtree(left, ignore_errors=True)
             for step in self._manager.all_steps():
                 if step > update:
                     self._manager.delete(step)
+            directory.cut_rows(run / SAVED, update + 1)
 
     @functools.cached_property
     def _manager(self) -> "ocp.CheckpointManager":
         import orbax.checkpoint as ocp
 
-        absl_logging.set_verbosity(absl_logging.ERROR)  # Orbax tells every step of its own
-        logging.getLogger("absl").setLevel(logging.ERROR)
-        options = ocp.CheckpointManagerOptions(max_to_keep=self._keep, create=True)
+        _quieten()
+        options = ocp.CheckpointManagerOptions(create=True, enable_async_checkpointing=False)
         return ocp.CheckpointManager(self._folder, options=options)
 
-    def save(self, state: Any, update: int) -> None:
-        """Writes a state; an update that is there already is left as it is."""
+    @functools.cached_property
+    def _binding(self) -> Binding | None:
+        return binding(self._run)
+
+    def save(
+        self,
+        state: Any,
+        update: int,
+        logs: Mapping[str, int] | None = None,
+        score: float | None = None,
+        rate_scale: float = 1.0,
+    ) -> None:
+        """Begins to write a state; an update that is there already is left as it is.
+
+        Args:
+          state: What changes in the run; it is copied before this returns.
+          update: Updates that are done.
+          logs: Bytes of each log that belong to it, by name.
+          score: How good it is; None if that is not known.
+          rate_scale: What the learning rates were multiplied by.
+
+        Raises:
+          TrainingError: If the checkpoint before could not be written.
+        """
+        self.wait()
+        meta = {"update": update, "logs": dict(logs or {}), "rate_scale": rate_scale}
+        # The next call of the program writes over the state, which NumPy may share on a CPU.
+        leaves = {name: np.array(leaf) for name, leaf in to_leaves(state).items()}
+        self._pending = self._thread.submit(self._write, leaves, meta, score)
+
+    def wait(self) -> None:
+        """Waits until what was begun is written.
+
+        Raises:
+          TrainingError: If it could not be written.
+        """
+        pending, self._pending = self._pending, None
+        if pending is not None:
+            pending.result()
+
+    def _write(self, leaves: Leaves, meta: dict[str, Any], score: float | None) -> None:
+        update = meta["update"]
+        try:
+            if update not in self._manager.all_steps():
+                self._write_step(leaves, meta, score)
+        except Exception as error:  # whatever a full disk makes Orbax raise
+            reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
+            raise TrainingError(f"checkpoint {update} cannot be written: {reason}.") from None
+
+    def _write_step(self, leaves: Leaves, meta: dict[str, Any], score: float | None) -> None:
         import orbax.checkpoint as ocp
 
-        if update in self._manager.all_steps():
-            return
-        leaves = to_leaves(state)
+        update = meta["update"]
+        meta |= {"digest": digest(leaves), "of": None if self._binding is None else self._binding}
         self._manager.save(
             update,
             args=ocp.args.Composite(
                 state=ocp.args.StandardSave(leaves),
-                meta=ocp.args.JsonSave({"digest": digest(leaves), "update": update}),
+                meta=ocp.args.JsonSave(meta | {"seal": _seal(meta)}),
             ),
         )
+        with directory.Log(self._run / SAVED) as log:
+            log.write([{"update": update, "digest": meta["digest"], "score": score}])
+        self._prune()
+
+    def _prune(self) -> None:
+        """Removes all but the newest and the best."""
+        steps = sorted(self._manager.all_steps())
+        rows = directory.read_rows(self._run / SAVED, None, whole=False)
+        scores = {row["update"]: row["score"] for row in rows if row.get("score") is not None}
+        rated = [step for step in steps if step in scores]
+        best = max(rated, key=lambda step: (scores[step], step), default=None)
+        for step in steps[: -self._keep]:
+            if step != best:
+                self._manager.delete(step)
 
     def __enter__(self) -> "Checkpoints":
         """Returns itself."""
@@ -73,8 +196,23 @@ class Checkpoints:
 
     def __exit__(self, *_: object) -> None:
         """Waits until everything is written."""
-        if "_manager" in self.__dict__:
-            self._manager.close()
+        try:
+            self.wait()
+        finally:
+            self._thread.shutdown()
+            if "_manager" in self.__dict__:
+                self._manager.close()
+
+
+def _quieten() -> None:
+    """Keeps Orbax from telling every step of its own, and its errors beside our sentence."""
+    absl_logging.set_verbosity(absl_logging.FATAL)
+    logging.getLogger("absl").setLevel(logging.CRITICAL)
+
+
+def _seal(meta: Mapping[str, Any]) -> str:
+    """Returns the SHA-256 of what a checkpoint holds besides arrays, in hexadecimal."""
+    return hashlib.sha256(json.dumps(meta, sort_keys=True).encode()).hexdigest()
 
 
 def to_leaves(state: Any) -> Leaves:
@@ -144,40 +282,62 @@ def of_seed(leaves: Leaves, lane: int, seeds: int) -> Leaves:
 
 
 def restore(run: Path, update: int | None = None) -> tuple[Leaves, int, list[str]]:
+    """Reads the newest sound checkpoint of a run, or the one of `update`, as `find` does.
+
+    Returns:
+      The leaves, the update, and the sentences about what was skipped.
+    """
+    kept = find(run, update)
+    return kept.leaves, kept.update, kept.skipped
+
+
+def steps(run: Path) -> list[int]:
+    """Lists the updates that a run directory has checkpoints of, sound or not, newest first."""
+    try:
+        found = [path.name for path in (run / FOLDER).iterdir() if path.is_dir()]
+    except OSError:
+        return []
+    return sorted((int(name) for name in found if name.isdecimal()), reverse=True)
+
+
+def find(run: Path, update: int | None = None) -> Kept:
     """Reads the newest sound checkpoint of a run, or the one of `update`.
 
     Args:
-      run: the run directory.
-      update: which; None for the newest.
-
-    Returns:
-      The leaves, the update, and a sentence for each newer checkpoint that was skipped.
+      run: The run directory.
+      update: Which; None for the newest.
 
     Raises:
-      CheckpointError: if there is none that is sound.
+      CheckpointError: If there is none that is sound.
     """
     import orbax.checkpoint as ocp
 
-    folder = (run / "checkpoints").resolve()
-    if not folder.is_dir():
+    _quieten()
+    there = steps(run)
+    if not there:
         raise CheckpointError(f"{run} holds no checkpoints: give a run directory that has some.")
-    with ocp.CheckpointManager(folder) as manager:
-        steps = sorted(manager.all_steps(), reverse=True)
-        if update is not None and update not in steps:
-            raise CheckpointError(f"{run} has no checkpoint of update {update}: it has {steps}.")
-        skipped = []
-        for step in [update] if update is not None else steps:
+    if update is not None and update not in there:
+        raise CheckpointError(f"{run} has no checkpoint of update {update}: it has {there}.")
+    skipped, bound = [], binding(run)
+    with ocp.CheckpointManager((run / FOLDER).resolve()) as manager:
+        for step in [update] if update is not None else there:
             try:
-                return _read(manager, step), step, skipped
-            except Exception as error:
-                reason = str(error).splitlines()[0][:120]
-                skipped.append(f"checkpoint {step} of {run} is damaged ({reason})")
-    found = "; ".join(skipped) or "there is none"
-    raise CheckpointError(f"{run} has no sound checkpoint: {found}.")
+                leaves, meta = _read(manager, step, bound)
+            except Exception as error:  # whatever a damaged one makes Orbax raise
+                reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
+                skipped.append(f"checkpoint {step} of {run} cannot be used ({reason})")
+                continue
+            told = "seal" in meta
+            notes = [] if told else [f"checkpoint {step} of {run} does not say which run it is of"]
+            scale = meta.get("rate_scale", 1.0)
+            return Kept(leaves, step, meta.get("logs", {}), scale, skipped, notes)
+    raise CheckpointError(f"{run} has no sound checkpoint: {'; '.join(skipped)}.")
 
 
-def _read(manager: "ocp.CheckpointManager", step: int) -> Leaves:
-    """Reads one step and checks its digest."""
+def _read(
+    manager: "ocp.CheckpointManager", step: int, bound: Binding | None
+) -> tuple[Leaves, dict[str, Any]]:
+    """Reads one step and checks its digest, and that it is of this update, config and run."""
     import orbax.checkpoint as ocp
 
     found = manager.restore(
@@ -185,9 +345,28 @@ def _read(manager: "ocp.CheckpointManager", step: int) -> Leaves:
         args=ocp.args.Composite(state=ocp.args.StandardRestore(), meta=ocp.args.JsonRestore()),
     )
     leaves = {name: np.asarray(leaf) for name, leaf in found["state"].items()}
-    if digest(leaves) != found["meta"]["digest"]:
+    meta = dict(found["meta"])
+    seal = meta.pop("seal", None)
+    if (seal is None and set(meta) != _OLD_META) or (seal is not None and seal != _seal(meta)):
+        raise CheckpointError("what it says of itself does not match its digest")
+    if digest(leaves) != meta["digest"]:
         raise CheckpointError("its contents do not match its digest")
-    return leaves
+    if meta["update"] != step or np.any(leaves.get("update", step) != step):
+        raise CheckpointError(f"it is of update {meta['update']}")
+    if seal is None:
+        return leaves, meta
+    _check_binding(meta["of"], bound)
+    return leaves, meta | {"seal": seal}
+
+
+def _check_binding(found: list[Any] | None, bound: Binding | None) -> None:
+    """Refuses a checkpoint of another run or of another config."""
+    if bound is None or found is None:
+        return
+    if found[0] != bound.run:
+        raise CheckpointError(f"it is of run {found[0]}, and this is run {bound.run}")
+    if found[1] != bound.config:
+        raise CheckpointError("it was written with another config.json")
 
 
 def _name(path: tuple) -> str:

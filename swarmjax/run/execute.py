@@ -13,16 +13,18 @@ from swarmjax.run.errors import TrainingError
 from swarmjax.run.lifecycle import carry_out, dry_run, find_run
 from swarmjax.run.policy_export import POLICY, seed_path
 from swarmjax.run.settings import TrainConfig
-from swarmjax.run.trainer import Stop, Tally, measure
+from swarmjax.run.signals import Stop, StoppedError
+from swarmjax.run.trainer import Tally, measure
 
 FAILED = 1
 
 
-def execute(settings: TrainConfig, *, auto: bool) -> int:
+def execute(settings: TrainConfig, stop: Stop, *, auto: bool) -> int:
     """Trains as the settings say.
 
     Args:
       settings: of the run.
+      stop: notices signals.
       auto: whether its number of arenas is still to be chosen.
 
     Returns:
@@ -33,7 +35,7 @@ def execute(settings: TrainConfig, *, auto: bool) -> int:
             settings, why = fill(settings)
             sys.stdout.write(f"{why}\n")
         with memory.refusal(settings):
-            return _run(settings)
+            return _run(settings, stop)
 
 
 def fill(settings: TrainConfig) -> tuple[TrainConfig, str]:
@@ -43,20 +45,23 @@ def fill(settings: TrainConfig) -> tuple[TrainConfig, str]:
         return memory.fill(settings, measure, available)
 
 
-def _run(settings: TrainConfig) -> int:
+def _run(settings: TrainConfig, stop: Stop) -> int:
     """Does what the config says; returns the exit code."""
     if settings.run.dry:
         with Display(settings.updates) as display:
             return dry_run(settings, display)
     run = find_run(settings)
-    with Stop() as stop, Display(settings.updates) as display:
+    with Display(settings.updates) as display:
         try:
             tally = carry_out(settings, run, stop, display)
         except TrainingError as error:
             display.say(f"swarmjax.train: error: {error} What was saved before is in {run}.")
             return FAILED
+        except StoppedError:
+            display.say("stopped before the first update: nothing was trained, and nothing is lost")
+            return stop.code or command.INTERRUPTED
     sys.stdout.write(f"{_success(settings, tally)}\n{_closing(run, settings, tally)}\n")
-    return command.INTERRUPTED if stop.asked else 0
+    return stop.code or 0
 
 
 def _success(settings: TrainConfig, tally: Tally) -> str:

@@ -3,12 +3,12 @@
 import json
 import math
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 
@@ -17,12 +17,14 @@ from swarmjax.config import ConfigError, to_dict
 from swarmjax.curriculum import engine as curriculum
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.ppo import optimizer
-from swarmjax.run import checkpoint, memory, warm_start
-from swarmjax.run.checkpoint import Checkpoints, Leaves
+from swarmjax.run import checkpoint, directory, memory, warm_start
+from swarmjax.run.checkpoint import Checkpoints, Kept, Leaves
 from swarmjax.run.display import Display, working
+from swarmjax.run.errors import TrainingError
 from swarmjax.run.policy_export import POLICY, seed_path, write_policy
-from swarmjax.run.settings import TrainConfig
-from swarmjax.run.trainer import Built, Stop, Tally, begin_tally, compile_chunk, prepare, train
+from swarmjax.run.settings import TrainConfig, read_config
+from swarmjax.run.signals import Stop
+from swarmjax.run.trainer import Built, Tally, begin_tally, compile_chunk, prepare, train
 from swarmjax.run.warm_start import Source
 from swarmjax.task import pieces
 from swarmjax.task.config import describe
@@ -30,16 +32,7 @@ from swarmjax.training import program as programs
 from swarmjax.training import seeds
 from swarmjax.training.loop import TrainState
 
-SUMMARY = "summary.json"
 _PRICE = "learners/price/"  # of checkpoints written while algo.contact_limit was a key
-
-
-class Kept(NamedTuple):
-    """The newest sound checkpoint of a run that is resumed, as `checkpoint.restore` returns it."""
-
-    leaves: Leaves
-    update: int
-    skipped: list[str]
 
 
 def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) -> Tally:
@@ -56,47 +49,76 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
       What came of the run.
 
     Raises:
-      ConfigError: if it cannot begin as the config says, or needs more memory than there is.
+      ConfigError: if it cannot begin as the config says, or needs more memory than there is, or
+        another process writes the directory.
       CheckpointError: if what it goes on with is damaged.
-      TrainingError: if a loss is no longer finite.
+      TrainingError: if a loss is no longer finite, or the directory cannot be written any more.
+      StoppedError: if somebody asked to stop before there was anything to save.
     """
+    with directory.locked(run):
+        check_free(run, settings)
+        name = settings.run.id or directory.new_id()
+        settings = replace(settings, run=replace(settings.run, id=name))
+        try:
+            return _carry_out(settings, run, stop, display)
+        except OSError as error:
+            raise TrainingError(f"{run} cannot be written: {error.strerror or error}.") from None
+
+
+def _carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) -> Tally:
     with working("building the arenas"):
-        source, kept = warm_start.read(settings), _read_kept(settings)
+        kept = _read_kept(settings)
+        source = warm_start.read(settings) if kept is None else None
     if kept is not None and kept.update == settings.updates:
         return _complete(run, settings, kept, display)
+    stop.check()
     with working("building the arenas"):
         program, schedule, init, template = _load(settings)
         state, skipped = _first_state(program, lambda: init(schedule), template, source, kept)
-    display.say(f"{_opening(program)}; into {run}")
-    if settings.extensions is not None:
-        display.say(f"from {settings.extensions}: {_own_pieces(settings)}")
-    for sentence in skipped:
-        display.say(f"{sentence}: it was passed over.")
-    if source is not None:
-        updates = words.count(source.update, "update")
-        as_there = describe(settings.robot, settings.task, settings.realism)
-        display.say(
-            f"starting with what {source.run} had learned after {updates}; robot, task, realism "
-            f"and network as there, unless told otherwise: {as_there}"
-        )
+    for sentence in _first_sentences(program, run, source, kept, skipped):
+        display.say(sentence)
     for sentence in _short_budget(settings, schedule):
         display.say(sentence)
+    stop.check()
     with display.working("compiling"):
         compiled, state = prepare(program, schedule, state, memory.limit())
     display.say(f"compiled in {words.duration(compiled.seconds)}")
-    _open_run(run, settings)
-    state, tally = train(run, program, schedule, compiled, state, display, stop)
+    _open_run(run, settings, kept)
+    state, tally = train(run, program, schedule, compiled, state, display, stop, kept)
     leaves = checkpoint.to_leaves(state)
     _write_policies(run, settings, leaves, tally.update)
     _write_summary(run, program, tally)
     return tally
 
 
+def _first_sentences(
+    program: Built, run: Path, source: Source | None, kept: Kept | None, skipped: list[str]
+) -> Iterator[str]:
+    """Says what is trained, by what, and what it begins with."""
+    settings = program.config
+    yield f"{_opening(program)}; into {run}"
+    if settings.extensions is not None:
+        yield f"from {settings.extensions}: {_own_pieces(settings)}"
+    for sentence in skipped:
+        yield f"{sentence}: it was passed over."
+    for sentence in [] if kept is None else kept.notes:
+        yield f"{sentence}."
+    if settings.resume is not None and kept is None:
+        yield f"{settings.resume} has no checkpoint yet: it begins from its seed."
+    if source is not None:
+        updates = words.count(source.update, "update")
+        as_there = describe(settings.robot, settings.task, settings.realism)
+        yield (
+            f"starting with what {source.run} had learned after {updates}; robot, task, realism "
+            f"and network as there, unless told otherwise: {as_there}"
+        )
+
+
 def _read_kept(settings: TrainConfig) -> Kept | None:
-    """Reads the newest sound checkpoint of the run that is resumed, if one is."""
-    if settings.resume is None:
+    """Reads the newest sound checkpoint of the run that is resumed, if it has any."""
+    if settings.resume is None or not checkpoint.steps(Path(settings.resume)):
         return None
-    kept = Kept(*checkpoint.restore(Path(settings.resume)))
+    kept = checkpoint.find(Path(settings.resume))
     if kept.update > settings.updates:
         spent = kept.update * settings.arenas * settings.algo.rollout_length
         raise ConfigError(
@@ -110,9 +132,9 @@ def _complete(run: Path, settings: TrainConfig, kept: Kept, display: Display) ->
     """Writes what the directory of a run lacks whose budget is spent; trains nothing."""
     current = _is_summed_up(run, kept.update)
     if not current:
-        _open_run(run, settings)
+        _open_run(run, settings, kept)
         with Checkpoints(run, settings.run.keep_checkpoints) as checkpoints:
-            checkpoints.save(kept.leaves, kept.update)
+            checkpoints.save(kept.leaves, kept.update, kept.logs)
     _write_policies(run, settings, kept.leaves, kept.update, only_missing=current)
     steps = words.count(
         kept.update * settings.arenas * settings.algo.rollout_length, "arena control step"
@@ -123,7 +145,7 @@ def _complete(run: Path, settings: TrainConfig, kept: Kept, display: Display) ->
         f"nothing left to train: {settings.resume} has spent its budget of {steps} "
         f"({words.count(kept.update, 'update')}); for more, give a larger budget"
     )
-    tally = begin_tally(settings, kept.update, compile_s=0.0)
+    tally = begin_tally(settings, kept.update, 0.0, kept)
     if not current:
         with working("building the arenas"):
             program, *_ = _load(settings)
@@ -137,7 +159,7 @@ def _is_summed_up(run: Path, update: int) -> bool:
     It is the last file that is written, so the others are then as new.
     """
     try:
-        found = json.loads((run / SUMMARY).read_text())
+        found = json.loads((run / directory.SUMMARY).read_text())
         return found["budget_spent"] is True and found["updates"] == update
     except (OSError, ValueError, KeyError, TypeError):
         return False
@@ -181,32 +203,37 @@ def find_run(settings: TrainConfig) -> Path:
     seed = f"seed{every[0]}" if len(every) == 1 else f"seeds{every[0]}-{every[-1]}"
     name = f"{datetime.now():%Y%m%d-%H%M%S}-{settings.stage_name}-{seed}"
     run = Path(settings.run.dir) if settings.run.dir else Path("runs") / name
+    check_free(run, settings)
+    try:
+        there = next(path for path in (run, *run.resolve().parents) if path.exists())
+        tempfile.TemporaryFile(dir=there).close()
+    except (OSError, ValueError) as error:
+        raise directory.unwritable(run, error) from None
+    return run
+
+
+def check_free(run: Path, settings: TrainConfig) -> None:
+    """Refuses a directory that holds a run, unless it is the one that goes on."""
     resumed = settings.resume is not None and Path(settings.resume).resolve() == run.resolve()
-    if (run / "config.json").exists() and not resumed:
+    if (run / directory.CONFIG).exists() and not resumed:
         raise ConfigError(
             f"run.dir is {run}, which holds a run already: give another directory, or "
             f"resume={run} to go on with it."
         )
+
+
+def _open_run(run: Path, settings: TrainConfig, kept: Kept | None) -> None:
+    """Writes `config.json`, and brings the logs of a run that goes on in another directory."""
+    stored = to_dict(replace(settings, resume=None))
+    if settings.resume is not None:
+        source = Path(settings.resume)
+        stored = directory.kept_config(read_config(source), stored)
+        if kept is not None:
+            directory.bring(source, run, kept.logs)
     try:
-        there = next(path for path in (run, *run.resolve().parents) if path.exists())
-        tempfile.TemporaryFile(dir=there).close()
+        directory.write_json(run / directory.CONFIG, stored)
     except OSError as error:
-        raise _unwritable(run, error) from None
-    return run
-
-
-def _open_run(run: Path, settings: TrainConfig) -> None:
-    """Makes the run directory and writes `config.json` into it."""
-    try:
-        run.mkdir(parents=True, exist_ok=True)
-        stored = to_dict(replace(settings, resume=None))
-        (run / "config.json").write_text(json.dumps(stored, indent=2) + "\n")
-    except OSError as error:
-        raise _unwritable(run, error) from None
-
-
-def _unwritable(run: Path, error: OSError) -> ConfigError:
-    return ConfigError(f"run.dir is {run}, which cannot be written: {error.strerror or error}.")
+        raise directory.unwritable(run, error) from None
 
 
 def dry_run(settings: TrainConfig, display: Display) -> int:
@@ -325,4 +352,4 @@ def _write_summary(run: Path, program: Built, tally: Tally) -> None:
         "versions": provenance.versions(),
         "commit": provenance.commit(),
     }
-    (run / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n")
+    directory.write_json(run / directory.SUMMARY, summary)

@@ -11,7 +11,7 @@ from swarmjax.run.display import Display, Row
 from swarmjax.run.lifecycle import carry_out, find_run
 from swarmjax.run.policy_export import POLICY, seed_path
 from swarmjax.run.settings import TrainConfig
-from swarmjax.run.trainer import Stop
+from swarmjax.run.signals import Stop
 
 
 class _Listener(Display):

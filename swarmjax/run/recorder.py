@@ -1,26 +1,24 @@
 """What a run writes while it trains: metrics, decisions, episodes (all JSONL) and TensorBoard."""
 
-import json
+import contextlib
 import math
 import sys
+import time
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from swarmjax.run import directory
+from swarmjax.run.directory import DECISIONS, EPISODES, METRICS, Log, Row
 from swarmjax.sim import gaps
 
-if TYPE_CHECKING:
-    from tensorboardX import SummaryWriter
-
-METRICS, DECISIONS, EPISODES = "metrics.jsonl", "curriculum.jsonl", "episodes.jsonl"
+_READ = (METRICS, DECISIONS)
 BOARDS = 16  # seeds that TensorBoard is written for: a board holds three files open
 MOST_PENDING = 100  # calls whose rows TensorBoard may be behind
-
-Row = dict[str, Any]
 
 
 def rows(
@@ -87,7 +85,7 @@ def _share(part: float, whole: float) -> float | None:
 
 
 class Recorder:
-    """Appends to the files of a run directory. Use it with `with`."""
+    """Appends to the logs of a run directory. Use it with `with`."""
 
     def __init__(
         self,
@@ -98,18 +96,23 @@ class Recorder:
         update: int,
         arena_steps: int = 0,
         episodes: bool = False,
+        logs: Mapping[str, int] | None = None,
     ) -> None:
-        """Opens the files, dropping what a stopped run wrote after the checkpoint `update`.
+        """Opens the logs, dropping what a stopped run wrote after the checkpoint `update`.
 
-        `arena_steps` is where that checkpoint stands, on TensorBoard's axis. Of several seeds the
-        first `BOARDS` have a folder of TensorBoard each. `episodes` opens a file for them.
+        `logs` has the bytes of each log that the checkpoint counts; without them, as in a
+        checkpoint of an older version, rows are dropped by their update. `arena_steps` is where
+        that checkpoint stands, on TensorBoard's axis. Of several seeds the first `BOARDS` have a
+        folder of TensorBoard each. `episodes` opens a log for them.
         """
         run.mkdir(parents=True, exist_ok=True)
-        for name in (METRICS, DECISIONS, EPISODES):
-            _truncate(run / name, update)
-        self._metrics = (run / METRICS).open("a")
-        self._decisions = (run / DECISIONS).open("a")
-        self._episodes = (run / EPISODES).open("a") if episodes else None
+        for name in directory.LOGS:
+            if not logs:
+                directory.cut_rows(run / name, update)
+            else:
+                directory.cut(run / name, logs.get(name, 0))
+        names = [METRICS, DECISIONS, *([EPISODES] if episodes else [])]
+        self._logs = {name: Log(run / name) for name in names}
         purge = arena_steps + 1 if update else None  # TensorBoard hides what it has from here on
         folder = run / "tensorboard"
         folders = {k: folder / f"seed{k}" if len(seeds) > 1 else folder for k in seeds[:BOARDS]}
@@ -117,31 +120,30 @@ class Recorder:
 
     def write(self, found: Sequence[Row], decisions: Iterable[Row], speeds: Row) -> None:
         """Writes the rows of a call; the speeds, of all seeds together, to TensorBoard's first."""
-        self._metrics.writelines(json.dumps(row) + "\n" for row in found)
-        self._decisions.writelines(json.dumps(row) + "\n" for row in decisions)
-        self._metrics.flush()
-        self._decisions.flush()
+        self._logs[METRICS].write(found)
+        self._logs[DECISIONS].write(decisions)
         if self._boards is not None:
             self._boards.write(found, speeds)
 
     def write_episodes(self, found: Iterable[Row]) -> None:
-        """Writes the episodes of a call, where there is a file for them."""
-        if self._episodes is not None:
-            self._episodes.writelines(json.dumps(row) + "\n" for row in found)
-            self._episodes.flush()
+        """Writes the episodes of a call, where there is a log for them."""
+        if EPISODES in self._logs:
+            self._logs[EPISODES].write(found)
+
+    def sync(self) -> dict[str, int]:
+        """Makes sure that the disk has all rows; returns the bytes of each log, by name."""
+        return {name: log.sync() for name, log in self._logs.items()}
 
     def __enter__(self) -> "Recorder":
         """Returns itself."""
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+    def __exit__(self, *_: object) -> None:
         """Closes the files."""
-        self._metrics.close()
-        self._decisions.close()
-        if self._episodes is not None:
-            self._episodes.close()
+        for log in self._logs.values():
+            log.close()
         if self._boards is not None:
-            self._boards.close(at_once=kind is KeyboardInterrupt)
+            self._boards.close()
 
 
 class Boards:
@@ -155,7 +157,7 @@ class Boards:
     def __init__(self, folders: Mapping[int, Path], purge: int | None) -> None:
         """Opens nothing yet; what lies at arena step `purge` and after is to be hidden."""
         self._folders, self._purge = folders, purge
-        self._open: dict[int, SummaryWriter] = {}
+        self._open: dict[int, Board] = {}
         self._thread = ThreadPoolExecutor(1)
         self._pending: deque[Future] = deque()
         self._lost = False
@@ -168,70 +170,95 @@ class Boards:
         """
         while self._pending and (self._pending[0].done() or len(self._pending) > MOST_PENDING):
             self._pending.popleft().result()
-        self._pending.append(self._thread.submit(self._write, found, speeds))
+        self._pending.append(self._thread.submit(self._try, self._add, found, speeds))
 
-    def close(self, *, at_once: bool = False) -> None:
-        """Waits until everything is written, unless that is to be `at_once`."""
-        self._thread.shutdown(wait=not at_once, cancel_futures=at_once)
-        if at_once:
-            return
-        for board in self._open.values():
-            board.close()
+    def close(self) -> None:
+        """Waits until everything is written."""
+        self._thread.shutdown()
         for write in self._pending:
             write.result()
+        for board in self._open.values():
+            with contextlib.suppress(OSError):  # which was said when it was lost
+                board.close()
 
-    def _write(self, found: Sequence[Row], speeds: Row) -> None:
+    def _try(self, what: Callable[..., None], *arguments: Any) -> None:
+        """Does something with the boards, unless they were lost; loses them if it fails."""
         if self._lost:
             return
         try:
-            self._add(found, speeds)
+            what(*arguments)
         except (ImportError, OSError) as error:
             self._lost = True
             sys.stderr.write(f"swarmjax: TensorBoard is not written from here on: {error}.\n")
 
     def _add(self, found: Sequence[Row], speeds: Row) -> None:
-        from tensorboardX import SummaryWriter
-
         if not self._open:
-            self._open = {
-                seed: SummaryWriter(str(folder), purge_step=self._purge)
-                for seed, folder in self._folders.items()
-            }
+            self._open = {seed: Board(path, self._purge) for seed, path in self._folders.items()}
         for row in found:
             if row["seed"] in self._open and row["update"] % len(self._open) == 0:
-                _add_scalars(self._open[row["seed"]], row, row["arena_steps"])
-        _add_scalars(next(iter(self._open.values())), speeds, found[-1]["arena_steps"])
+                self._open[row["seed"]].add(row, row["arena_steps"])
+        next(iter(self._open.values())).add(speeds, found[-1]["arena_steps"])
 
 
-def _add_scalars(board: "SummaryWriter", row: Row, arena_steps: int) -> None:
-    """Writes the numbers of a row to TensorBoard."""
-    for name, value in row.items():
-        if isinstance(value, int | float):
-            board.add_scalar(name, value, arena_steps)
+class Board:
+    """One folder of TensorBoard.
+
+    TensorBoardX's own `SummaryWriter` has a thread that dies on a full disk and leaves its queue
+    full, so that whoever writes next waits for ever. Its writer of events has none.
+    """
+
+    def __init__(self, folder: Path, purge: int | None) -> None:
+        """Makes the folder and its file; TensorBoard hides what it has from step `purge` on."""
+        from tensorboardX.event_file_writer import EventsWriter
+
+        folder.mkdir(parents=True, exist_ok=True)
+        self._writer = EventsWriter(str(folder / "events"), f".{time.time_ns()}")
+        if purge is not None:
+            event = _event(purge)
+            event.session_log.status = event.session_log.START
+            self._writer.write_event(event)
+
+    def add(self, row: Row, arena_steps: int) -> None:
+        """Writes the numbers of a row."""
+        event = _event(arena_steps)
+        for name, value in row.items():
+            if isinstance(value, int | float):
+                event.summary.value.add(tag=name, simple_value=value)
+        self._writer.write_event(event)
+
+    def close(self) -> None:
+        """Writes what is left."""
+        self._writer.close()
 
 
-def history(run: Path, update: int) -> tuple[list[Row], list[Row]]:
-    """Reads what a run had written down before `update`: its metrics and its decisions."""
-    return _kept(run / METRICS, update), _kept(run / DECISIONS, update)
+def _event(arena_steps: int) -> Any:
+    """Makes an event of TensorBoard's that holds nothing yet."""
+    from tensorboardX.proto import event_pb2
+
+    made: Any = event_pb2  # whose messages are made when it is imported
+    return made.Event(wall_time=time.time(), step=arena_steps)
 
 
-def _kept(path: Path, update: int) -> list[Row]:
-    """Reads the rows before `update`."""
-    if not path.exists():
-        return []
-    found = map(_parsed, path.read_text().splitlines())
-    return [row for row in found if row.get("update", math.inf) < update]
+def history(
+    run: Path, update: int, logs: Mapping[str, int] | None = None
+) -> tuple[list[Row], list[Row]]:
+    """Reads what a run had written down before a checkpoint: its metrics and its decisions.
+
+    Args:
+      run: The run directory.
+      update: Of the checkpoint.
+      logs: Bytes of each log that it counts; without them rows are taken by their update.
+
+    Raises:
+      CheckpointError: If a log is damaged.
+    """
+    if logs:
+        metrics, decisions = (directory.read_rows(run / k, logs.get(k, 0)) for k in _READ)
+        return metrics, decisions
+    metrics, decisions = (directory.read_rows(run / k, None, whole=False) for k in _READ)
+    return _earlier(metrics, update), _earlier(decisions, update)
 
 
-def _truncate(path: Path, update: int) -> None:
-    """Keeps the rows before `update`."""
-    if path.exists():
-        path.write_text("".join(json.dumps(row) + "\n" for row in _kept(path, update)))
-
-
-def _parsed(line: str) -> Row:
-    """Reads a row; one that a crash cut off is empty."""
-    try:
-        return json.loads(line)
-    except json.JSONDecodeError:
-        return {}
+def _earlier(rows: Sequence[Row], update: int) -> list[Row]:
+    """Takes the rows before `update`."""
+    return [row for row in rows if directory.is_before(row, update)]

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from swarmjax import extension
-from swarmjax.config import ConfigError, Section, about, build, files, inherit, to_dict
+from swarmjax.config import ConfigError, Section, about, build, files, inherit, show, to_dict
 from swarmjax.config.section import MAX_COUNT, modernise
 from swarmjax.ppo.config import AlgoConfig, resolve
+from swarmjax.run.directory import MAY_CHANGE
 from swarmjax.task import pieces, stage_files
 from swarmjax.task.config import check_realism
 from swarmjax.task.stage_config import make_room
@@ -20,7 +21,8 @@ MOST_LOGGED = 8192
 AUTO = "auto"  # what `arenas` may be instead of a number
 
 
-# What may change when a run goes on; everything else fixes what it has computed so far.
+# What may change when a run goes on; everything else fixes what it has computed so far. The same
+# keys, as they are stored, are `directory.MAY_CHANGE`.
 _RESUME_KEYS = ("budget", "resume", "run.*")
 
 
@@ -28,6 +30,9 @@ _RESUME_KEYS = ("budget", "resume", "run.*")
 class RunConfig(Section):
     """Where a run is written, and how often."""
 
+    id: str | None = field(
+        default=None, metadata=about("of the run, drawn when it begins", derived=True)
+    )
     dir: str | None = field(
         default=None, metadata=about("run directory; null: runs/<date>-<time>-<stage>-seed<seed>")
     )
@@ -35,10 +40,15 @@ class RunConfig(Section):
         default="auto", metadata=about("updates per call of the compiled program", 1, MAX_COUNT)
     )
     checkpoint_minutes: float = field(
-        default=5.0, metadata=about("minutes between checkpoints; 0: after every chunk", 0.0)
+        default=1.0, metadata=about("minutes between checkpoints; 0: after every chunk", 0.0)
+    )
+    checkpoint_share: float = field(
+        default=0.1,
+        metadata=about("of the budget, after which one is written too; 0: by time alone", 0.0, 1.0),
     )
     keep_checkpoints: int = field(
-        default=2, metadata=about("checkpoints that are kept", 1, MAX_COUNT)
+        default=2,
+        metadata=about("newest checkpoints that are kept, besides the best", 1, MAX_COUNT),
     )
     stop_after: int | None = field(
         default=None,
@@ -67,7 +77,10 @@ class TrainConfig(ProgramConfig):
     renamed: ClassVar[Mapping[str, str]] = {"start": "init_from", "start_std": "init_from_std"}
 
     run: RunConfig = field(default_factory=RunConfig)
-    resume: str | None = field(default=None, metadata=about("run directory to go on with"))
+    resume: str | None = field(
+        default=None,
+        metadata=about("run directory to go on with; auto: that of run.dir if it holds a run"),
+    )
     init_from: str | None = field(
         default=None,
         metadata=about("run directory whose networks and normaliser a new run begins with"),
@@ -335,6 +348,8 @@ def load_run(
     """
     given = {key: value for key, _, value in (word.partition("=") for word in overrides)}
     resumed = given.get("resume", "null").strip("'\"")
+    if resumed == AUTO:
+        return _go_on_or_begin(overrides, given, stages)
     if resumed in ("", "null"):
         auto = given.get("arenas", "").strip("'\"") == AUTO
         return load_train(overrides, auto=auto, stages=stages), auto
@@ -342,3 +357,46 @@ def load_run(
     kept = given.get("run.dir", "null") in ("", "null") or settings.run.dir is None
     directory = settings.resume if kept else settings.run.dir
     return replace(settings, run=replace(settings.run, dir=directory)), False
+
+
+def _go_on_or_begin(
+    overrides: Sequence[str], given: Mapping[str, str], stages: Sequence[dict[str, Any]] | None
+) -> tuple[TrainConfig, bool]:
+    """Make the configuration of `resume=auto`: of the run in `run.dir`, or of a new one there."""
+    if given.get("run.dir", "null") in ("", "null"):
+        raise ConfigError("resume is auto, but there is no run.dir: give run.dir=DIR with it.")
+    begun = [word for word in overrides if word.partition("=")[0] != "resume"]
+    auto = given.get("arenas", "").strip("'\"") == AUTO
+    typed = load_train(begun, auto=auto, stages=stages)
+    run = Path(typed.run.dir or "")
+    if not (run / "config.json").exists():
+        return typed, auto
+    stored = from_stored(read_config(run), "stored ")
+    if auto:
+        typed = replace(typed, arenas=stored.arenas)
+    _check_unchanged(run, to_dict(typed), to_dict(stored))
+    kept = replace(typed.run, id=stored.run.id)
+    return settle(replace(stored, budget=typed.budget, resume=str(run), run=kept)), False
+
+
+def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
+    """Refuse to go on with a run by other settings than its own, key by key."""
+    mine, its = (
+        _leaves({k: v for k, v in each.items() if k not in MAY_CHANGE}) for each in (typed, stored)
+    )
+    changed = [key for key in mine if mine[key] != its.get(key)]
+    if changed:
+        shown = ", ".join(f"{k} is {show(mine[k])} and not {show(its.get(k))}" for k in changed[:3])
+        raise ConfigError(
+            f"resume is auto, but {run} holds a run of other settings: {shown}. Of a run that goes "
+            "on, budget and run.* may change: give its own settings, or another run.dir."
+        )
+
+
+def _leaves(found: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+    """Flatten nested settings to dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in found.items():
+        inner = isinstance(value, Mapping)
+        flat |= _leaves(value, f"{where}{key}.") if inner else {f"{where}{key}": value}
+    return flat

@@ -2,9 +2,6 @@
 
 import contextlib
 import importlib
-import math
-import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -22,11 +19,13 @@ from swarmjax.curriculum.engine import Schedule
 from swarmjax.curriculum.log import log
 from swarmjax.ppo import optimizer
 from swarmjax.run import memory, recorder
-from swarmjax.run.checkpoint import Checkpoints
+from swarmjax.run.checkpoint import Checkpoints, Kept
+from swarmjax.run.directory import EPISODES, Row
 from swarmjax.run.display import Display, summarize
 from swarmjax.run.errors import TrainingError
-from swarmjax.run.recorder import Recorder, Row
+from swarmjax.run.recorder import Recorder
 from swarmjax.run.settings import TrainConfig
+from swarmjax.run.signals import Stop
 from swarmjax.sim import physics
 from swarmjax.sim.config import physics_substeps
 from swarmjax.training import episodes, loop, seeds
@@ -37,6 +36,8 @@ from swarmjax.training.program import Program
 Built = Program[TrainConfig]  # the program of a run
 
 CALL_SECONDS = 1.0  # what a call should take when run.chunk is auto: the display's pace
+ALL_SECONDS = 10.0  # likewise, when it is all: how long a signal may have to wait
+FIRST_UPDATES = 32  # of the first call then, by which the others are measured
 GROWTH = 4  # a call is at most this many times as long as the one before
 
 
@@ -85,37 +86,6 @@ class Tally:
     earlier_s: float = 0.0
     seconds: float = 0.0
     decisions: list[dict] = field(default_factory=list)
-
-
-class Stop:
-    """Notices SIGINT and SIGTERM while in a `with`, so that the run can save before it stops."""
-
-    def __init__(self, until: float = math.inf) -> None:
-        """Nobody has asked yet; it stops by itself at `until`, of `time.monotonic`."""
-        self.signalled = False
-        self._until = until
-
-    @property
-    def asked(self) -> bool:
-        """Whether to stop, because of a signal or of the time."""
-        return self.signalled or time.monotonic() >= self._until
-
-    def __enter__(self) -> "Stop":
-        """Begins to listen."""
-        signals = (signal.SIGINT, signal.SIGTERM)
-        self._before = {number: signal.signal(number, self._ask) for number in signals}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Gives the signals back."""
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _ask(self, *_: object) -> None:
-        if self.signalled:  # asked twice: not even to wait for the end of the call
-            raise KeyboardInterrupt
-        self.signalled = True
-        sys.stderr.write("stopping after this call, to save; once more stops at once\n")
 
 
 def compile_chunk(
@@ -213,8 +183,12 @@ def train(
     state: TrainState,
     display: Display,
     stop: Stop,
+    kept: Kept | None = None,
 ) -> tuple[TrainState, Tally]:
     """Trains until the budget is spent, `run.stop_after` is reached or somebody asks to stop.
+
+    A checkpoint is written before the first update, by time, by share of the budget, and at the
+    end; a thread writes it while training goes on.
 
     Args:
       run: the run directory.
@@ -224,21 +198,25 @@ def train(
       state: [N] where to start; donated.
       display: shows the run.
       stop: notices signals.
+      kept: the checkpoint that the state is of; None for a run that begins.
 
     Returns:
       The last state, which is saved, and what came of the run.
 
     Raises:
-      TrainingError: if a loss of any seed is no longer finite; the checkpoint before that is kept.
+      TrainingError: if a loss of any seed is no longer finite, or the directory cannot be written;
+        the checkpoint before that is kept.
     """
-    settings, resumed = program.config.run, program.config.resume is not None
-    done = int(state.update[0])
-    tally = begin_tally(program.config, done, compiled.seconds)
-    saved_at = time.monotonic()
+    settings, done = program.config, int(state.update[0])
+    tally = begin_tally(settings, done, compiled.seconds, kept)
+    keep, resumed = settings.run.keep_checkpoints, None if kept is None else done
     with (
-        _recorder(run, program, done) as record,
-        Checkpoints(run, settings.keep_checkpoints, done if resumed else None) as checkpoints,
+        _recorder(run, program, done, kept) as record,
+        Checkpoints(run, keep, resumed) as checkpoints,
     ):
+        saves = Saves(settings, done)
+        if kept is None:
+            checkpoints.save(state, done, record.sync())
         for n in _calls(program, tally, stop):
             began = time.perf_counter()
             state, metrics = compiled.call(schedule, state, np.int32(n))
@@ -247,23 +225,62 @@ def train(
             _report(program, tally, metrics, n, time.perf_counter() - began, record, display)
             if log is not None:
                 _log_episodes(program.config, log, np.arange(tally.update)[-n:], record, display)
-            if time.monotonic() - saved_at >= 60.0 * settings.checkpoint_minutes:
-                checkpoints.save(state, tally.update)
-                saved_at = time.monotonic()
-        checkpoints.save(state, tally.update)
+            if saves.due(tally.update):
+                checkpoints.save(state, tally.update, record.sync(), score(settings, tally))
+        checkpoints.save(state, tally.update, record.sync(), score(settings, tally))
     return state, tally
 
 
-def begin_tally(settings: TrainConfig, done: int, compile_s: float) -> Tally:
+class Saves:
+    """Says when a checkpoint is due: by time, and by share of the budget."""
+
+    def __init__(self, settings: TrainConfig, done: int) -> None:
+        """Begins to count where `done` updates are done."""
+        self._minutes = settings.run.checkpoint_minutes
+        self._every = settings.run.checkpoint_share * settings.updates
+        self._saved_at, self._saved = time.monotonic(), done
+
+    def due(self, update: int) -> bool:
+        """Tells whether to save after this update; if so, the next is counted from here."""
+        by_time = time.monotonic() - self._saved_at >= 60.0 * self._minutes
+        by_share = self._every > 0 and update - self._saved >= self._every
+        if by_time or by_share:
+            self._saved_at, self._saved = time.monotonic(), update
+        return by_time or by_share
+
+
+def score(settings: TrainConfig, tally: Tally) -> float | None:
+    """Rates what a run has learned, so that its best checkpoint can be kept.
+
+    Returns:
+      The mean over the seeds of the furthest stage measured, counted from 0, plus the share of
+      its targets that were reached; None before every seed was measured.
+    """
+    names = [stage.name for stage in settings.stage]
+    found = [
+        max((names.index(name) + share for name, share in of_seed.items()), default=None)
+        for of_seed in tally.targets_reached.values()
+    ]
+    rated = [each for each in found if each is not None]
+    return None if len(rated) < len(found) else sum(rated) / len(rated)
+
+
+def begin_tally(
+    settings: TrainConfig, done: int, compile_s: float, kept: Kept | None = None
+) -> Tally:
     """Begins to add up, from what a resumed run had come to.
 
     Args:
       settings: of the run.
       done: updates of every seed that are done.
       compile_s: that compiling took.
+      kept: the checkpoint that the run goes on from, if one.
 
     Returns:
       The tally before the first update of this process.
+
+    Raises:
+      CheckpointError: if a log of the run that goes on is damaged.
     """
     numbers = seeds.numbers(settings)
     tally = Tally(
@@ -273,9 +290,9 @@ def begin_tally(settings: TrainConfig, done: int, compile_s: float) -> Tally:
         transitions=dict.fromkeys(numbers, 0),
         targets_reached={seed: {} for seed in numbers},
     )
-    if settings.resume is None:
+    if settings.resume is None or kept is None:
         return tally
-    rows, decisions = recorder.history(Path(settings.resume), done)
+    rows, decisions = recorder.history(Path(settings.resume), done, kept.logs)
     _add(settings, tally, rows, decisions)
     tally.earlier_s = rows[-1]["train_s"] if rows else 0.0
     return tally
@@ -292,7 +309,7 @@ def _add(settings: TrainConfig, tally: Tally, rows: list[Row], decisions: list[R
     tally.decisions += [entry for entry in decisions if "to" in entry]
 
 
-def _recorder(run: Path, program: Built, done: int) -> Recorder:
+def _recorder(run: Path, program: Built, done: int, kept: Kept | None) -> Recorder:
     """Opens what the run writes, where `done` updates are done."""
     settings = program.config
     return Recorder(
@@ -302,6 +319,7 @@ def _recorder(run: Path, program: Built, done: int) -> Recorder:
         episodes=settings.run.episodes,
         update=done,
         arena_steps=done * settings.arenas * settings.algo.rollout_length,
+        logs=None if kept is None else kept.logs,
     )
 
 
@@ -323,8 +341,10 @@ def _calls(program: Built, tally: Tally, stop: Stop) -> Iterator[int]:
     n = 1
     while tally.update < goal and not stop.asked:
         left = min(goal - tally.update, program.rows)
-        if settings.run.chunk == "all":
-            n = left
+        if settings.run.chunk == "all" and not tally.seconds:
+            n = min(left, FIRST_UPDATES)
+        elif settings.run.chunk == "all":
+            n = min(left, max(1, int(ALL_SECONDS * (tally.update - tally.first) / tally.seconds)))
         elif settings.run.chunk != "auto":
             n = settings.run.chunk
         elif tally.seconds:
@@ -377,7 +397,7 @@ def _log_episodes(
     record.write_episodes(rows)
     if lost:
         display.say(
-            f"{recorder.EPISODES} lacks {words.count(lost, 'episode')} up to update "
+            f"{EPISODES} lacks {words.count(lost, 'episode')} up to update "
             f"{updates[-1]:,}: more ended than there was room for."
         )
 

@@ -46,8 +46,6 @@ class Source:
 def read(settings: TrainConfig) -> Source | None:
     """Reads the newest sound checkpoint of the run that a config starts from.
 
-    A run that is resumed has started already, and reads nothing.
-
     Args:
       settings: the config of the new run.
 
@@ -57,7 +55,7 @@ def read(settings: TrainConfig) -> Source | None:
     Raises:
       ConfigError: if there is none, or its networks are not those of the config.
     """
-    if settings.init_from is None or settings.resume is not None:
+    if settings.init_from is None:
         return None
     run, stored = Path(settings.init_from), _read_config(settings.init_from)
     _check_alike(settings.init_from, stored, settings)

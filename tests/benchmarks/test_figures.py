@@ -17,6 +17,7 @@ from benchmarks import steps_per_second, timing
 from benchmarks.steps_per_second import Prepared
 from swarmjax.run import trainer
 from swarmjax.run.settings import TrainConfig
+from swarmjax.run.signals import Stop
 from swarmjax.sim import physics
 from swarmjax.task import env
 from swarmjax.task.env import EnvState, TimeStep, World
@@ -196,7 +197,7 @@ def test_speeds_of_a_run_are_its_steps_by_the_seconds_of_a_call(
     )
     compiled: Any = trainer.Compiled(call, seconds=0.0, state_bytes=0, work_bytes=0)
     begun: Any = _State(jnp.zeros(SEEDS, jnp.int32))
-    trainer.train(tmp_path / "run", program, schedule, compiled, begun, display, trainer.Stop())
+    trainer.train(tmp_path / "run", program, schedule, compiled, begun, display, Stop())
     (speeds,) = shown
     assert speeds["arena_steps_per_s"] == 2 * SEEDS * ARENAS * ROLLOUT / MEDIAN
     assert speeds["robot_steps_per_s"] == 2 * SEEDS * 20 * ROLLOUT / MEDIAN

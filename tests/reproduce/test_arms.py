@@ -11,7 +11,7 @@ from swarmjax.config import build, to_dict
 from swarmjax.reproduce import arms as reproduce_arms
 from swarmjax.reproduce.config import ARMS, ReproduceConfig
 from swarmjax.run.settings import TrainConfig, load_train
-from swarmjax.run.trainer import Stop
+from swarmjax.run.signals import Stop
 
 OUT = Path("somewhere") / "a=b, c"
 MADE = {arm: reproduce_arms.settings(ReproduceConfig(), arm, OUT) for arm in ARMS}

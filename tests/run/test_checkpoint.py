@@ -1,6 +1,8 @@
 """Checkpoints: exact, checked, and forgiving of the newest one being damaged."""
 
 import gc
+import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +13,7 @@ import pytest
 
 from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import CheckpointError, Checkpoints
+from swarmjax.run.errors import TrainingError
 
 # Where a restore fails, Orbax leaves an event loop that complains when it is collected.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -128,3 +131,111 @@ def test_going_on_replaces_what_was_damaged(tmp_path: Path, sound: int) -> None:
         checkpoints.save(_state(5.0), 5)
     assert checkpoint.restore(tmp_path)[1:] == (5, [])
     assert checkpoint.restore(tmp_path, 3)[0]["weights"][0, 0] == 3.0
+
+
+# What a checkpoint is of
+
+
+def _bind(run: Path, name: str, epochs: int = 1) -> None:
+    run.mkdir(parents=True, exist_ok=True)
+    stored = {"algo": {"epochs": epochs}, "budget": 5, "run": {"id": name}}
+    (run / "config.json").write_text(json.dumps(stored))
+
+
+def _steps(run: Path) -> Path:
+    return run / "checkpoints"
+
+
+def test_a_renamed_checkpoint_is_passed_over(tmp_path: Path) -> None:
+    _save(tmp_path, 1, 2)
+    (_steps(tmp_path) / "2").rename(_steps(tmp_path) / "7")
+    _, update, skipped = checkpoint.restore(tmp_path)
+    assert update == 1
+    assert "checkpoint 7" in skipped[0]
+    assert "it is of update 2" in skipped[0]
+
+
+def test_swapped_checkpoints_are_both_passed_over(tmp_path: Path) -> None:
+    _save(tmp_path, 1, 2)
+    (_steps(tmp_path) / "2").rename(_steps(tmp_path) / "3")
+    (_steps(tmp_path) / "1").rename(_steps(tmp_path) / "2")
+    (_steps(tmp_path) / "3").rename(_steps(tmp_path) / "1")
+    with pytest.raises(CheckpointError, match="no sound checkpoint"):
+        checkpoint.restore(tmp_path)
+
+
+def test_a_checkpoint_of_another_run_is_passed_over(tmp_path: Path) -> None:
+    mine, other = tmp_path / "mine", tmp_path / "other"
+    for run, name in ((mine, "a"), (other, "b")):
+        _bind(run, name)
+        _save(run, 1)
+    _save(other, 2)
+    shutil.copytree(_steps(other) / "2", _steps(mine) / "2")
+    _, update, skipped = checkpoint.restore(mine)
+    assert update == 1
+    assert "it is of run b, and this is run a" in skipped[0]
+
+
+def test_a_checkpoint_of_another_config_is_refused(tmp_path: Path) -> None:
+    _bind(tmp_path, "a", epochs=1)
+    _save(tmp_path, 1)
+    _bind(tmp_path, "a", epochs=2)
+    with pytest.raises(CheckpointError, match=r"it was written with another config\.json"):
+        checkpoint.restore(tmp_path)
+
+
+def test_a_checkpoint_that_no_longer_says_what_it_is_of_is_refused(tmp_path: Path) -> None:
+    _save(tmp_path, 1)
+    meta = _steps(tmp_path) / "1" / "meta" / "metadata"
+    found = json.loads(meta.read_text())
+    meta.write_text(json.dumps(found | {"rate_scale": 0.5}))
+    with pytest.raises(CheckpointError, match="does not match its digest"):
+        checkpoint.restore(tmp_path)
+    del found["seal"]
+    meta.write_text(json.dumps(found))
+    with pytest.raises(CheckpointError, match="does not match its digest"):
+        checkpoint.restore(tmp_path)
+
+
+def test_a_checkpoint_of_an_older_version_loads_with_a_sentence(tmp_path: Path) -> None:
+    _save(tmp_path, 1)
+    meta = _steps(tmp_path) / "1" / "meta" / "metadata"
+    found = json.loads(meta.read_text())
+    meta.write_text(json.dumps({key: found[key] for key in ("digest", "update")}))
+    kept = checkpoint.find(tmp_path)
+    assert kept.update == 1
+    assert kept.logs == {}
+    assert kept.notes == [f"checkpoint 1 of {tmp_path} does not say which run it is of"]
+
+
+def test_the_best_is_kept_besides_the_newest(tmp_path: Path) -> None:
+    with Checkpoints(tmp_path, keep=1) as checkpoints:
+        for update, score in ((1, 0.5), (2, 0.9), (3, 0.7), (4, None)):
+            checkpoints.save(_state(1.0), update, score=score)
+    assert checkpoint.steps(tmp_path) == [4, 2]
+
+
+def test_the_bytes_of_the_logs_come_back(tmp_path: Path) -> None:
+    with Checkpoints(tmp_path, keep=1) as checkpoints:
+        checkpoints.save(_state(1.0), 1, {"metrics.jsonl": 17}, rate_scale=0.1)
+    kept = checkpoint.find(tmp_path)
+    assert kept.logs == {"metrics.jsonl": 17}
+    assert kept.rate_scale == 0.1
+
+
+def test_a_state_is_copied_before_the_run_goes_on(tmp_path: Path) -> None:
+    state = {"weights": np.zeros((1000, 1000))}
+    with Checkpoints(tmp_path, keep=1) as checkpoints:
+        checkpoints.save(state, 1)
+        state["weights"][:] = 1.0  # as the next call of the program does with a donated state
+    assert not checkpoint.restore(tmp_path)[0]["weights"].any()
+
+
+def test_what_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "checkpoints").write_text("a file in the place of the folder")
+    with (
+        pytest.raises(TrainingError, match="checkpoint 1 cannot be written: ") as error,
+        Checkpoints(tmp_path, keep=1) as checkpoints,
+    ):
+        checkpoints.save(_state(1.0), 1)
+    assert "\n" not in str(error.value)

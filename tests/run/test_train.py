@@ -19,6 +19,7 @@ from swarmjax.export import __main__ as export
 from swarmjax.export.config import ExportConfig
 from swarmjax.run import checkpoint, execute, lifecycle
 from swarmjax.run.checkpoint import CheckpointError, Checkpoints, digest
+from swarmjax.run.directory import LOCK
 from swarmjax.run.settings import TrainConfig, load_train
 from swarmjax.training import program as programs
 
@@ -150,7 +151,7 @@ def _forbid_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def _contents(run: Path) -> dict[Path, tuple[bytes, int]]:
     """What every file of a run holds, and when it was written."""
-    files = [path for path in run.rglob("*") if path.is_file()]
+    files = [path for path in run.rglob("*") if path.is_file() and path.name != LOCK]
     return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
 
 
@@ -404,10 +405,23 @@ def test_foreign_and_missing_runs_are_refused(
     assert "cannot be read" in _refusal(capsys, "export", f"run={tmp_path}")
     stored = to_dict(load_train(TINY))
     (tmp_path / "config.json").write_text(json.dumps(stored))
-    assert "no checkpoints" in _refusal(capsys, "train", f"resume={tmp_path}")
+    (tmp_path / "checkpoints" / "4").mkdir(parents=True)
+    assert "no sound checkpoint" in _refusal(capsys, "train", f"resume={tmp_path}")
 
 
-def test_a_checkpoint_of_another_shape_is_refused(
+def test_a_run_that_was_killed_before_it_saved_begins_from_its_seed(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(whole / "config.json", tmp_path)
+    (tmp_path / "metrics.jsonl").write_text('{"update": 0, "arena')
+    assert train.main([f"resume={tmp_path}"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"{tmp_path} has no checkpoint yet: it begins from its seed." in said
+    assert _digest(tmp_path) == _digest(whole)
+    assert [row["update"] for row in _rows(tmp_path)] == list(range(9))
+
+
+def test_a_checkpoint_of_another_config_is_refused(
     whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stored = json.loads((whole / "config.json").read_text())
@@ -415,8 +429,7 @@ def test_a_checkpoint_of_another_shape_is_refused(
     (tmp_path / "config.json").write_text(json.dumps(stored))
     (tmp_path / "checkpoints").symlink_to(whole / "checkpoints")
     sentence = _refusal(capsys, "train", f"resume={tmp_path}", "budget=160")
-    assert "this run's config needs" in sentence
-    assert "it is of another run" in _refusal(capsys, "train", f"resume={tmp_path}")
+    assert "it was written with another config.json" in sentence
 
 
 @pytest.mark.parametrize(

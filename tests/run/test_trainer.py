@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmjax.run import trainer
+from swarmjax.run.signals import Stop
 
 
 def test_groups_are_called_at_once_and_keep_their_order() -> None:
@@ -28,8 +29,8 @@ def test_groups_are_called_at_once_and_keep_their_order() -> None:
 
 
 def test_a_stop_has_a_time_of_its_own() -> None:
-    assert not trainer.Stop().asked
-    assert not trainer.Stop(until=time.monotonic() + 3600.0).asked
-    over = trainer.Stop(until=time.monotonic())
+    assert not Stop().asked
+    assert not Stop(until=time.monotonic() + 3600.0).asked
+    over = Stop(until=time.monotonic())
     assert over.asked
     assert not over.signalled

@@ -14,6 +14,7 @@ from sentences import refusal
 from swarmjax.run import checkpoint, trainer
 from swarmjax.run.display import Display
 from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.signals import Stop
 from swarmjax.task.episode import Ended, Robots
 from swarmjax.training import episodes, seeds
 from swarmjax.training import program as programs
@@ -111,7 +112,7 @@ def train_for(tiny_config: TrainConfig) -> Train:
         if resume:
             state = checkpoint.from_leaves(checkpoint.restore(run)[0], state)
         mine = replace(program, config=settings)
-        with trainer.Stop() as stop, Display(6) as display:
+        with Stop() as stop, Display(6) as display:
             trainer.train(run, mine, schedule, compiled, state, display, stop)
 
     return train_for

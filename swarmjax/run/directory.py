@@ -1,0 +1,255 @@
+"""How a run directory is written: one process at a time, whole files, and logs that only grow.
+
+- A lock that dies with its process keeps a second one out.
+- `config.json` and `summary.json` are replaced whole or not at all.
+- Logs (JSON lines) are appended to. A checkpoint counts their bytes; a run that goes on cuts them
+  to that length, in one step, before it adds to them.
+- A run has an id. Its checkpoints hold it, with a digest of what its config fixes.
+"""
+
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import secrets
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from swarmjax.atomic_file import replacing
+from swarmjax.config import ConfigError
+from swarmjax.run.errors import CheckpointError
+
+CONFIG, SUMMARY, LOCK = "config.json", "summary.json", ".lock"
+METRICS, DECISIONS, EPISODES = "metrics.jsonl", "curriculum.jsonl", "episodes.jsonl"
+LOGS = (METRICS, DECISIONS, EPISODES)
+# Keys of a stored config that may change when its run goes on: they fix nothing that was computed.
+MAY_CHANGE = ("budget", "resume", "run")
+
+Row = dict[str, Any]
+
+
+def new_id() -> str:
+    """Draws the id of a new run."""
+    return secrets.token_hex(8)
+
+
+@contextmanager
+def locked(run: Path) -> Iterator[None]:
+    """Keeps other processes out of a run directory, which is made if it is missing.
+
+    Args:
+      run: The directory.
+
+    Raises:
+      ConfigError: If another process writes it, or it cannot be written.
+    """
+    made = _make(run)
+    try:
+        file = (run / LOCK).open("a+")
+    except OSError as error:
+        raise unwritable(run, error) from None
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            file.seek(0)
+            holder = file.read().strip() or "another process"
+            raise ConfigError(
+                f"run.dir is {run}, which {holder} is writing: wait for its end, or give another "
+                "directory."
+            ) from None
+        _sign(file)
+        try:
+            yield
+        finally:
+            _remove_empty(run, made)
+
+
+def _make(run: Path) -> list[Path]:
+    """Makes a directory; returns what had to be made, the innermost first."""
+    missing = [path for path in (run, *run.parents) if not path.exists()]
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise unwritable(run, error) from None
+    return missing
+
+
+def _sign(file: IO[str]) -> None:
+    """Writes down who holds the lock, for the sentence that refuses the next one."""
+    try:
+        file.truncate(0)
+        file.write(f"process {os.getpid()}")
+        file.flush()
+    except OSError:  # a full disk: the lock holds without a name
+        pass
+
+
+def _remove_empty(run: Path, made: list[Path]) -> None:
+    """Removes the directories that were made for a run which then wrote nothing."""
+    try:
+        if made and os.listdir(run) == [LOCK]:
+            (run / LOCK).unlink()
+            for path in made:
+                path.rmdir()
+    except OSError:  # gone, or somebody else's by now
+        pass
+
+
+def unwritable(run: Path, error: OSError | ValueError) -> ConfigError:
+    """Says why a run directory cannot be written."""
+    reason = getattr(error, "strerror", None) or error
+    return ConfigError(f"run.dir is {run}, which cannot be written: {reason}.")
+
+
+def write_json(path: Path, found: Mapping[str, Any]) -> None:
+    """Replaces a file of JSON, whole or not at all.
+
+    Raises:
+      OSError: If it cannot be written.
+    """
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(found, indent=2) + "\n")
+
+
+def kept_config(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
+    """Makes the config that a run which goes on writes.
+
+    Args:
+      before: What its `config.json` holds, which any version may have written.
+      now: The config that it goes on with.
+
+    Returns:
+      `before` with what may change as it is now, so that the digest stays that of the checkpoints.
+    """
+    return {**before, **{key: now[key] for key in MAY_CHANGE if key in now}}
+
+
+def config_digest(stored: Mapping[str, Any]) -> str:
+    """Returns the SHA-256 of what a stored config fixes, in hexadecimal."""
+    fixed = {key: value for key, value in stored.items() if key not in MAY_CHANGE}
+    return hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()
+
+
+class Log:
+    """A file of JSON lines that is appended to."""
+
+    def __init__(self, path: Path) -> None:
+        """Opens the file, which is made if it is missing."""
+        # Without a buffer, which a full disk would leave for `close` to fail on once more.
+        self._file = path.open("ab", buffering=0)
+
+    def write(self, rows: Iterable[Row]) -> None:
+        """Appends rows, and hands them to the system.
+
+        Raises:
+          OSError: If the disk has no room for them.
+        """
+        lines = "".join(json.dumps(row) + "\n" for row in rows).encode()
+        if self._file.write(lines) != len(lines):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def sync(self) -> int:
+        """Makes sure that the disk has all rows; returns the length of the file, bytes."""
+        os.fsync(self._file.fileno())
+        return self._file.tell()
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._file.close()
+
+    def __enter__(self) -> "Log":
+        """Returns itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Closes the file."""
+        self.close()
+
+
+def cut(path: Path, length: int) -> None:
+    """Cuts a log to the length that a checkpoint counts.
+
+    Args:
+      path: Of the log.
+      length: In bytes, at the end of a line.
+
+    Raises:
+      CheckpointError: If the log is shorter, or no line ends there.
+    """
+    if not path.exists():
+        return
+    with path.open("rb+") as file:
+        found = file.seek(0, os.SEEK_END)
+        file.seek(max(0, length - 1))
+        if found < length or (length and file.read(1) != b"\n"):
+            raise CheckpointError(
+                f"{path} has {found} bytes, and not the {length} with whole lines that its "
+                "checkpoint counts: put the file back, or delete it to go on without its rows."
+            )
+        file.truncate(length)
+
+
+def bring(source: Path, run: Path, logs: Mapping[str, int]) -> None:
+    """Copies the logs of a run that goes on in another directory.
+
+    Args:
+      source: The directory of the run.
+      run: The other one; what it has already is left as it is.
+      logs: Bytes of each log that belong to the run, by name; without them all are copied.
+    """
+    for name in LOGS:
+        if (source / name).exists() and not (run / name).exists():
+            found = (source / name).read_bytes()
+            with replacing(run / name) as temporary:
+                temporary.write_bytes(found[: logs.get(name, 0)] if logs else found)
+
+
+def cut_rows(path: Path, update: int) -> None:
+    """Drops the rows of `update` and after, where a checkpoint of an older version counts none."""
+    if path.exists():
+        rows = [row for row in read_rows(path, None, whole=False) if is_before(row, update)]
+        with replacing(path) as temporary:
+            temporary.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+def is_before(row: Row, update: int) -> bool:
+    """Tells whether a row is of an update before this one."""
+    found = row.get("update")
+    return isinstance(found, int) and found < update
+
+
+def read_rows(path: Path, length: int | None, *, whole: bool = True) -> list[Row]:
+    """Reads the rows of a log.
+
+    Args:
+      path: Of the log; none if it is missing.
+      length: Bytes that are read; None for all.
+      whole: Whether a line that is no row is an error. If not, it is left out.
+
+    Raises:
+      CheckpointError: If the log is damaged.
+    """
+    if not path.exists():
+        return []
+    with path.open("rb") as file:
+        lines = file.read(-1 if length is None else length).splitlines()
+    found = [_parsed(line) for line in lines]
+    if whole and None in found:
+        raise CheckpointError(
+            f"{path} is damaged at line {found.index(None) + 1}: put the file back, or delete it "
+            "to go on without its rows."
+        )
+    return [row for row in found if row is not None]
+
+
+def _parsed(line: bytes) -> Row | None:
+    """Reads a row; None if the line is none."""
+    try:
+        row = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return row if isinstance(row, dict) else None

@@ -1,0 +1,124 @@
+"""A run directory: one process at a time, and logs whose truth is what a checkpoint counts."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from swarmjax.config import ConfigError
+from swarmjax.run import directory
+from swarmjax.run.directory import Log
+from swarmjax.run.errors import CheckpointError
+
+# Holds the lock of a directory until it is killed.
+_HOLDER = """
+import pathlib, sys, time
+from swarmjax.run import directory
+with directory.locked(pathlib.Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_a_second_process_is_refused_until_the_first_is_dead(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    code = [sys.executable, "-c", _HOLDER, str(run)]
+    with subprocess.Popen(code, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        with (
+            pytest.raises(ConfigError, match=f"which process {holder.pid} is writing: wait"),
+            directory.locked(run),
+        ):
+            pass
+        holder.kill()
+    with directory.locked(run):
+        assert run.exists()
+
+
+def test_a_run_that_wrote_nothing_leaves_no_directory(tmp_path: Path) -> None:
+    with directory.locked(tmp_path / "a" / "b"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_directory_that_was_there_stays(tmp_path: Path) -> None:
+    with directory.locked(tmp_path):
+        pass
+    assert tmp_path.exists()
+
+
+def _write(path: Path, *rows: dict) -> int:
+    log = Log(path)
+    log.write(rows)
+    length = log.sync()
+    log.close()
+    return length
+
+
+def test_a_log_is_cut_to_the_bytes_that_are_counted(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    length = _write(path, {"update": 0}, {"update": 1})
+    _write(path, {"update": 2})
+    with path.open("a") as file:
+        file.write('{"update": 3, "are')
+    directory.cut(path, length)
+    assert directory.read_rows(path, None) == [{"update": 0}, {"update": 1}]
+
+
+@pytest.mark.parametrize("content", ["", '{"update": 0}', '{"update": 0}\n{"update": 1}'])
+def test_a_log_that_lacks_rows_is_refused_and_left_as_it_is(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "metrics.jsonl"
+    path.write_text(content)
+    with pytest.raises(CheckpointError, match=r"put the file back, or delete it to go on"):
+        directory.cut(path, len('{"update": 0}\n{"update": 1}\n'))
+    assert path.read_text() == content
+
+
+def test_a_log_that_was_deleted_is_begun_anew(tmp_path: Path) -> None:
+    directory.cut(tmp_path / "metrics.jsonl", 100)
+    assert directory.read_rows(tmp_path / "metrics.jsonl", 100) == []
+
+
+@pytest.mark.parametrize("line", [b"[]", b"{", b"\xff\xfe", b"[" * 100_000, b"NaN"])
+def test_a_damaged_line_is_named(tmp_path: Path, line: bytes) -> None:
+    path = tmp_path / "metrics.jsonl"
+    path.write_bytes(b'{"update": 0}\n' + line + b"\n")
+    with pytest.raises(CheckpointError, match=r"metrics.jsonl is damaged at line 2: put the file"):
+        directory.read_rows(path, None)
+
+
+def test_a_full_disk_is_an_error_and_nothing_waits(tmp_path: Path) -> None:
+    (tmp_path / "metrics.jsonl").symlink_to("/dev/full")
+    log = Log(tmp_path / "metrics.jsonl")
+    with pytest.raises(OSError, match="No space left on device"):
+        log.write([{"update": 0}])
+    log.close()
+
+
+def test_rows_are_dropped_by_update_where_no_bytes_are_counted(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"update": 0}\n{"why": "x"}\n{"update": 4}\n{"upda')
+    directory.cut_rows(path, 4)
+    assert directory.read_rows(path, None) == [{"update": 0}]
+
+
+def test_what_may_change_is_not_in_the_digest_of_a_config() -> None:
+    stored = {"budget": 1, "run": {"dir": "a", "id": "x"}, "algo": {"epochs": 1}, "resume": None}
+    now = {"budget": 2, "run": {"dir": "b", "id": "x"}, "algo": {"epochs": 9, "new": 1}}
+    kept = directory.kept_config(stored, now)
+    assert kept == stored | {"budget": 2, "run": {"dir": "b", "id": "x"}}
+    assert directory.config_digest(kept) == directory.config_digest(stored)
+    assert directory.config_digest(now) != directory.config_digest(stored)
+
+
+def test_logs_are_brought_to_another_directory(tmp_path: Path) -> None:
+    source, run = tmp_path / "source", tmp_path / "run"
+    source.mkdir()
+    run.mkdir()
+    length = _write(source / directory.METRICS, {"update": 0})
+    _write(source / directory.METRICS, {"update": 1})
+    directory.bring(source, run, {directory.METRICS: length})
+    assert directory.read_rows(run / directory.METRICS, None) == [{"update": 0}]
+    assert not (run / directory.DECISIONS).exists()

@@ -1,0 +1,268 @@
+"""What a whole run survives: kills, signals, a full disk, and a second start."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from swarmjax import train
+from swarmjax.config import ConfigError
+from swarmjax.policy import digest
+from swarmjax.run import checkpoint, directory, lifecycle
+from swarmjax.run.directory import LOCK
+from swarmjax.run.settings import load_run
+from swarmjax.run.signals import REQUEUE
+
+TINY = [
+    "stage=s1",
+    "arenas=4",
+    "budget=144",  # nine updates
+    "task.step_limit=8",
+    "algo.rollout_length=4",
+    "algo.num_minibatches=2",
+    "algo.hidden_sizes=[8]",
+    "run.tensorboard=false",
+]
+_CODE = "import sys; from swarmjax import train; sys.exit(train.main(sys.argv[1:]))"
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("whole") / "run"
+    assert train.main([*TINY, f"run.dir={run}"]) == 0
+    return run
+
+
+def _digest(run: Path) -> str:
+    return digest(checkpoint.restore(run)[0])
+
+
+def _updates(run: Path) -> list[int]:
+    lines = (run / "metrics.jsonl").read_text().splitlines()
+    return [json.loads(line)["update"] for line in lines]
+
+
+def _stopped(run: Path, after: int) -> Path:
+    assert train.main([*TINY, f"run.dir={run}", f"run.stop_after={after}"]) == 0
+    return run
+
+
+def _start(words: Sequence[str]) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-c", _CODE, *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ,
+    )
+
+
+def _wait_for(path: Path) -> None:
+    deadline = time.monotonic() + 240.0
+    while not (path.exists() and path.stat().st_size) and time.monotonic() < deadline:
+        time.sleep(0.05)
+
+
+def test_the_first_checkpoint_comes_before_the_first_update(tmp_path: Path) -> None:
+    _stopped(tmp_path / "run", after=1)
+    assert checkpoint.steps(tmp_path / "run") == [1, 0]
+
+
+def test_checkpoints_come_by_share_of_the_budget(tmp_path: Path) -> None:
+    words = [*TINY, f"run.dir={tmp_path}", "run.chunk=1", "run.keep_checkpoints=9"]
+    assert train.main([*words, "run.checkpoint_share=0.33"]) == 0
+    assert checkpoint.steps(tmp_path) == [9, 6, 3, 0]
+
+
+@pytest.mark.parametrize("torn", ["config.json", "metrics.jsonl", "curriculum.jsonl"])
+def test_a_resume_that_is_killed_while_it_opens_its_files_loses_nothing(
+    torn: str, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = _stopped(tmp_path / "run", after=5)
+    before = {path: path.read_bytes() for path in run.glob("*.json*")}
+    replaced = Path.replace
+
+    def die(self: Path, target: Path) -> Path:
+        if Path(target).name == torn:
+            raise KeyboardInterrupt
+        return replaced(self, target)
+
+    monkeypatch.setattr(Path, "replace", die)
+    monkeypatch.setattr(directory, "cut", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        train.main([f"resume={run}"])
+    monkeypatch.undo()
+    assert {path: path.read_bytes() for path in before if path.name == torn}.items() <= (
+        before.items()
+    )
+    assert train.main([f"resume={run}"]) == 0
+    assert _digest(run) == _digest(whole)
+    assert _updates(run) == list(range(9))
+    summary = json.loads((run / "summary.json").read_text())
+    kept = json.loads((whole / "summary.json").read_text())
+    assert summary["transitions"] == kept["transitions"]
+
+
+def test_rows_after_the_checkpoint_are_not_doubled(whole: Path, tmp_path: Path) -> None:
+    run = _stopped(tmp_path / "run", after=5)
+    with (run / "metrics.jsonl").open("a") as file:  # of a call whose checkpoint never came
+        file.write('{"update": 5, "seed": 0}\n{"update": 6, "se')
+    assert train.main([f"resume={run}"]) == 0
+    assert _updates(run) == list(range(9))
+    assert _digest(run) == _digest(whole)
+
+
+def test_a_run_that_goes_on_elsewhere_takes_its_logs_along(whole: Path, tmp_path: Path) -> None:
+    run = _stopped(tmp_path / "run", after=5)
+    assert train.main([f"resume={run}", f"run.dir={tmp_path / 'on'}"]) == 0
+    assert _updates(tmp_path / "on") == list(range(9))
+    assert _updates(run) == list(range(5))
+    assert _digest(tmp_path / "on") == _digest(whole)
+
+
+@pytest.mark.parametrize("words", [["run.chunk=1"], ["run.chunk=all"]])
+def test_a_signal_of_a_scheduler_saves_and_asks_for_a_requeue(
+    words: list[str], tmp_path: Path
+) -> None:
+    process = _start([*TINY, f"budget={16 * 10**7}", f"run.dir={tmp_path}", *words])
+    _wait_for(tmp_path / "metrics.jsonl")
+    began = time.monotonic()
+    process.send_signal(signal.SIGUSR1)
+    said, _ = process.communicate(timeout=120)
+    # A call of `all` takes about ten seconds; the rest is for a busy machine.
+    assert time.monotonic() - began < 60.0
+    assert process.returncode == REQUEUE
+    assert f"resume={tmp_path}" in said
+    done = checkpoint.restore(tmp_path)[1]
+    assert _updates(tmp_path) == list(range(done))
+
+
+def test_a_signal_while_jax_loads_ends_with_a_sentence(tmp_path: Path) -> None:
+    process = _start([*TINY, f"run.dir={tmp_path / 'run'}"])
+    time.sleep(1.0)
+    process.send_signal(signal.SIGTERM)
+    said, _ = process.communicate(timeout=120)
+    assert process.returncode == REQUEUE
+    assert "stopped before the first update" in said
+    assert "Traceback" not in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_two_processes_do_not_write_one_run(tmp_path: Path) -> None:
+    first = _start([*TINY, f"budget={16 * 10**7}", f"run.dir={tmp_path}"])
+    _wait_for(tmp_path / "metrics.jsonl")
+    try:
+        with pytest.raises(ConfigError, match=f"process {first.pid} is writing"):
+            train.main([f"resume={tmp_path}"])
+        with pytest.raises(ConfigError, match="holds a run already"):
+            train.main([*TINY, f"run.dir={tmp_path}"])
+    finally:
+        first.kill()
+        first.communicate()
+
+
+def _full(monkeypatch: pytest.MonkeyPatch, after: int) -> None:
+    """Lets a disk be full after some rows."""
+    write, left = directory.Log.write, [after]
+
+    def until_full(self: directory.Log, rows: Any) -> None:
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError(28, "No space left on device")
+        write(self, rows)
+
+    monkeypatch.setattr(directory.Log, "write", until_full)
+
+
+@pytest.mark.parametrize("after", [0, 1, 2, 9])
+def test_a_full_disk_is_one_sentence_and_the_run_goes_on_later(
+    after: int,
+    whole: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    run = tmp_path / "run"
+    _full(monkeypatch, after)
+    assert train.main([*TINY, f"run.dir={run}", "run.chunk=1"]) == 1
+    said = " ".join(capsys.readouterr().out.split())
+    assert "No space left on device" in said
+    assert f"What was saved before is in {run}" in said
+    monkeypatch.undo()
+    assert train.main([f"resume={run}"]) == 0
+    assert _digest(run) == _digest(whole)
+
+
+# To go on with what is there, or to begin
+
+
+def test_auto_begins_and_then_goes_on(whole: Path, tmp_path: Path) -> None:
+    words = [*TINY, f"run.dir={tmp_path}", "resume=auto"]
+    assert train.main([*words, "run.stop_after=4"]) == 0
+    assert train.main(words) == 0
+    assert _digest(tmp_path) == _digest(whole)
+    assert _updates(tmp_path) == list(range(9))
+
+
+def test_auto_takes_a_larger_budget(tmp_path: Path) -> None:
+    words = [*TINY, f"run.dir={tmp_path}", "resume=auto"]
+    assert train.main(words) == 0
+    assert train.main([*words, "budget=160"]) == 0
+    assert checkpoint.restore(tmp_path)[1] == 10
+
+
+def test_auto_refuses_other_settings_key_by_key(whole: Path) -> None:
+    words = [*TINY, f"run.dir={whole}", "resume=auto", "algo.discount=0.9", "seed=3"]
+    with pytest.raises(ConfigError) as error:
+        load_run(words)
+    assert "algo.discount is 0.9 and not 0.998" in str(error.value)
+    assert "seed is 3 and not 0" in str(error.value)
+    assert "budget and run.* may change" in str(error.value)
+
+
+def test_auto_needs_a_directory() -> None:
+    with pytest.raises(ConfigError, match=r"resume is auto, but there is no run\.dir: give"):
+        load_run([*TINY, "resume=auto"])
+
+
+def test_a_finished_run_stays_as_it_is_by_auto(whole: Path) -> None:
+    files = [path for path in whole.rglob("*") if path.is_file() and path.name != LOCK]
+    before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
+    assert train.main([*TINY, f"run.dir={whole}", "resume=auto"]) == 0
+    assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in files} == before
+
+
+@pytest.mark.parametrize("lost", ["metrics.jsonl", "curriculum.jsonl"])
+def test_a_log_that_was_cut_is_refused_with_what_to_do(lost: str, tmp_path: Path) -> None:
+    run = _stopped(tmp_path / "run", after=5)
+    text = (run / "metrics.jsonl").read_text()
+    (run / "metrics.jsonl").write_text(text[: len(text) // 2])
+    with pytest.raises(ValueError, match="put the file back, or delete it to go on"):
+        train.main([f"resume={run}"])
+    (run / "metrics.jsonl").unlink()
+    assert train.main([f"resume={run}"]) == 0
+    assert _updates(run) == list(range(5, 9))
+
+
+def test_the_directory_of_a_run_may_vanish(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, moved = tmp_path / "run", tmp_path / "moved"
+    report = lifecycle.train
+
+    def vanish(*arguments: Any, **given: Any) -> Any:
+        run.rename(moved)
+        return report(*arguments, **given)
+
+    monkeypatch.setattr(lifecycle, "train", vanish)
+    code = train.main([*TINY, f"run.dir={run}"])
+    said = capsys.readouterr()
+    assert "Traceback" not in said.out + said.err
+    assert code in (0, 1)

@@ -1,0 +1,81 @@
+"""Signals: the first asks a run to save, the second ends it at once."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from swarmjax.run.signals import INTERRUPTED, REQUEUE, Stop, StoppedError
+
+# Listens, says so, and then does what the last argument says.
+_PROCESS = """
+import ctypes, sys, time
+from swarmjax.run.signals import Stop
+with Stop() as stop:
+    print("listening", flush=True)
+    if sys.argv[1] == "poll":
+        while not stop.asked:
+            time.sleep(0.01)
+    else:  # within one call of C, as a compiled program is, from which no signal brings Python back
+        libc = ctypes.PyDLL(None)
+        libc.usleep(30_000_000)
+        libc.usleep(30_000_000)
+sys.exit(stop.code)
+"""
+
+
+def _start(how: str) -> subprocess.Popen:
+    code = [sys.executable, "-c", _PROCESS, how]
+    process = subprocess.Popen(code, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "listening\n"
+    return process
+
+
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [
+        (signal.SIGINT, INTERRUPTED),
+        (signal.SIGTERM, REQUEUE),
+        (signal.SIGUSR1, REQUEUE),
+        (signal.SIGUSR2, REQUEUE),
+        (signal.SIGHUP, REQUEUE),
+    ],
+)
+def test_a_signal_asks_to_stop_and_says_so(number: int, code: int) -> None:
+    process = _start("poll")
+    process.send_signal(number)
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == code
+    assert said == "stopping after this call, to save; once more stops at once\n"
+
+
+def test_a_second_signal_ends_the_process_even_within_a_call() -> None:
+    process = _start("call")
+    process.send_signal(signal.SIGTERM)
+    time.sleep(0.3)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=10)
+    assert process.returncode == REQUEUE  # what the first one asked for
+    assert "stopped at once" in said
+
+
+def test_nothing_to_save_is_an_error_of_its_own() -> None:
+    with Stop() as stop:
+        stop.check()
+        os.kill(os.getpid(), signal.SIGUSR1)
+        deadline = time.monotonic() + 10.0
+        while not stop.signalled and time.monotonic() < deadline:
+            time.sleep(0.01)
+        with pytest.raises(StoppedError):
+            stop.check()
+
+
+def test_signals_are_given_back() -> None:
+    before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGUSR1)]
+    with Stop():
+        pass
+    assert [signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGUSR1)] == before
