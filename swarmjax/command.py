@@ -59,6 +59,10 @@ EXAMPLES: dict[str, dict[str, str]] = {
         "minutes=55 out=runs/paper": "stop in time, with all saved",
         "resume=runs/paper": "go on with a reproduction that was stopped",
     },
+    "swarmjax.verify": {
+        "run=runs/first": "train it again up to its first checkpoint, and compare digests",
+        "run=runs/first updates=500": "up to update 500",
+    },
     "swarmjax.suite": {
         "suite=headline": "draw the levels and hold them to the digests in the suite's file",
         "suite=headline out=headline.npz": "write all levels to a file that evaluate reads",

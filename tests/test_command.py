@@ -19,6 +19,7 @@ from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
 from swarmjax.run.settings import TrainConfig, load_run, load_train
 from swarmjax.suite import SuiteConfig
 from swarmjax.task.stage_files import load_levels
+from swarmjax.verify import VerifyConfig
 
 # The loader of each command and its settings.
 COMMANDS: dict[str, tuple[Callable[[Sequence[str]], object], type[Section]]] = {
@@ -29,6 +30,7 @@ COMMANDS: dict[str, tuple[Callable[[Sequence[str]], object], type[Section]]] = {
     "swarmjax.replay": (partial(load_levels, ReplayConfig), ReplayConfig),
     "swarmjax.reproduce": (load_reproduce, ReproduceConfig),
     "swarmjax.suite": (partial(files.load, SuiteConfig), SuiteConfig),
+    "swarmjax.verify": (partial(files.load, VerifyConfig), VerifyConfig),
 }
 EVERY_EXAMPLE = [(name, words) for name, of in command.EXAMPLES.items() for words in of]
 

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 Leaves = dict[str, np.ndarray]
 
 FOLDER = "checkpoints"
-SAVED = "checkpoints.jsonl"  # a row for each checkpoint that was written, of those removed too
 _OLD_META = {"digest", "update"}  # all that checkpoints held before they were bound to their run
 _UNFINISHED = "*.orbax-checkpoint-tmp*"  # what Orbax renames when it is whole
 
@@ -104,7 +103,7 @@ class Checkpoints:
             for step in self._manager.all_steps():
                 if step > update:
                     self._manager.delete(step)
-            directory.cut_rows(run / SAVED, update + 1)
+            directory.cut_rows(run / directory.SAVED, update + 1)
 
     @functools.cached_property
     def _manager(self) -> "ocp.CheckpointManager":
@@ -175,14 +174,14 @@ class Checkpoints:
                 meta=ocp.args.JsonSave(meta | {"seal": _seal(meta)}),
             ),
         )
-        with directory.Log(self._run / SAVED) as log:
+        with directory.Log(self._run / directory.SAVED) as log:
             log.write([{"update": update, "digest": meta["digest"], "score": score}])
         self._prune()
 
     def _prune(self) -> None:
         """Removes all but the newest and the best."""
         steps = sorted(self._manager.all_steps())
-        rows = directory.read_rows(self._run / SAVED, None, whole=False)
+        rows = directory.read_rows(self._run / directory.SAVED, None, whole=False)
         scores = {row["update"]: row["score"] for row in rows if row.get("score") is not None}
         rated = [step for step in steps if step in scores]
         best = max(rated, key=lambda step: (scores[step], step), default=None)

@@ -25,6 +25,7 @@ from swarmjax.run.errors import CheckpointError
 CONFIG, SUMMARY, LOCK = "config.json", "summary.json", ".lock"
 METRICS, DECISIONS, EPISODES = "metrics.jsonl", "curriculum.jsonl", "episodes.jsonl"
 LOGS = (METRICS, DECISIONS, EPISODES)
+SAVED = "checkpoints.jsonl"  # a row for each checkpoint that was written, of those removed too
 # Keys of a stored config that may change when its run goes on: they fix nothing that was computed.
 MAY_CHANGE = ("budget", "resume", "run")
 

@@ -174,6 +174,21 @@ def _load(settings: TrainConfig) -> tuple[Built, Schedule, Any, TrainState]:
     return program, schedule, init, template
 
 
+def begin(settings: TrainConfig) -> tuple[Built, Schedule, TrainState]:
+    """Builds a run that begins: its program, its curriculum's numbers and its first state.
+
+    Args:
+      settings: the config.
+
+    Raises:
+      ConfigError: if it cannot begin as the config says.
+    """
+    program, schedule, init, template = _load(settings)
+    source = warm_start.read(settings)
+    state, _ = _first_state(program, lambda: init(schedule), template, source, None)
+    return program, schedule, state
+
+
 def _first_state(
     program: Built,
     init: Callable[[], TrainState],

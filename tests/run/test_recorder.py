@@ -129,13 +129,17 @@ def test_a_run_ends_though_the_disk_was_full_for_tensorboard(
 ) -> None:
     """TensorBoardX's own writer has a thread that dies, and its full queue made this wait."""
 
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    write, left = RecordWriter.write, [5]
 
+    def until_full(self: RecordWriter, data: bytes) -> None:
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write(self, data)
+
+    monkeypatch.setattr(RecordWriter, "write", until_full)
     with Recorder(tmp_path, seeds=[0], tensorboard=True, update=0) as record:
-        record.write([_row(0)], [], {"speed": 2.0})
-        monkeypatch.setattr(RecordWriter, "write", full)
-        for update in range(1, 300):
+        for update in range(300):
             record.write([_row(update)], [], {"speed": 2.0})
     assert len((tmp_path / "metrics.jsonl").read_text().splitlines()) == 300
     assert capsys.readouterr().err.count("No space left on device") == 1

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from swarmjax import train
+from swarmjax import train, verify
 from swarmjax.config import ConfigError
 from swarmjax.policy import digest
 from swarmjax.run import checkpoint, directory, lifecycle
@@ -266,3 +267,41 @@ def test_the_directory_of_a_run_may_vanish(
     said = capsys.readouterr()
     assert "Traceback" not in said.out + said.err
     assert code in (0, 1)
+
+
+# To train again and compare
+
+
+def test_a_run_verifies(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert verify.main([f"run={whole}", "updates=9"]) == 0
+    assert f"{whole} is bit for bit what it was, to update 9" in capsys.readouterr().out
+
+
+def test_a_run_that_was_trained_otherwise_does_not_verify(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = shutil.copytree(whole, tmp_path / "run")
+    stored = json.loads((run / "config.json").read_text())
+    stored["algo"]["discount"] = 0.5
+    (run / "config.json").write_text(json.dumps(stored))
+    assert verify.main([f"run={run}", "updates=9"]) == verify.DIFFERS
+    assert "differs from update" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "has no digests in checkpoints.jsonl: give a run that has saved a checkpoint"),
+        ('{"update": 0, "digest": "a"}\n', "has no digests in checkpoints.jsonl"),
+        ('{"update": 7, "digest": "a"}\n', "the first checkpoint of .* give at least 7"),
+        ("{\n", "checkpoints.jsonl is damaged at line 1"),
+    ],
+)
+def test_what_cannot_be_verified_is_one_sentence(
+    content: str | None, said: str, whole: Path, tmp_path: Path
+) -> None:
+    shutil.copy(whole / "config.json", tmp_path)
+    if content is not None:
+        (tmp_path / "checkpoints.jsonl").write_text(content)
+    with pytest.raises(ValueError, match=said):
+        verify.main([f"run={tmp_path}", "updates=3"])

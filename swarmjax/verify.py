@@ -1,0 +1,122 @@
+"""`python -m swarmjax.verify run=DIR`: trains a run's first updates again and compares digests.
+
+Usage: python -m swarmjax.verify run=runs/NAME [updates=N]
+
+It exits with 0 if every state is bit for bit what the run saved, with 1 if one is not.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import ClassVar
+
+from swarmjax import command, words
+from swarmjax.config import ConfigError, Section, about, files
+from swarmjax.config.section import MAX_COUNT
+from swarmjax.run import directory
+from swarmjax.run.errors import CheckpointError
+from swarmjax.run.settings import TrainConfig, from_stored, read_config, settle
+
+DIFFERS = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifyConfig(Section):
+    """Which run is trained again, and how much of it."""
+
+    command: ClassVar[str] = "verify"
+
+    run: str = field(metadata=about("run directory"))
+    updates: int | None = field(
+        default=None,
+        metadata=about(
+            "most updates that are trained; null: to the first checkpoint", 1, MAX_COUNT
+        ),
+    )
+    extensions: str | None = field(
+        default=None, metadata=about("Python file with the pieces that the run needs; it is run")
+    )
+
+
+def load_digests(settings: VerifyConfig) -> dict[int, str]:
+    """Reads the digests that can be compared.
+
+    Returns:
+      Digest of the state by update, in their order.
+
+    Raises:
+      ConfigError: if the run has written none of the updates asked for.
+      CheckpointError: if its log is damaged.
+    """
+    rows = directory.read_rows(Path(settings.run) / directory.SAVED, None)
+    found = {row["update"]: row["digest"] for row in rows if row["update"] > 0}
+    if not found:
+        raise ConfigError(
+            f"run is {settings.run}, which has no digests in {directory.SAVED}: give a run that "
+            "has saved a checkpoint after its first update."
+        )
+    most = min(found) if settings.updates is None else settings.updates
+    chosen = {update: found[update] for update in sorted(found) if update <= most}
+    if not chosen:
+        raise ConfigError(
+            f"updates is {settings.updates}, but the first checkpoint of {settings.run} is of "
+            f"update {min(found)}: give at least {min(found)}."
+        )
+    return chosen
+
+
+def replay(trained: TrainConfig, updates: Sequence[int]) -> dict[int, str]:
+    """Trains a run from its beginning.
+
+    Args:
+      trained: its config.
+      updates: after which the state is looked at, in their order.
+
+    Returns:
+      Digest of the state by update.
+    """
+    import numpy as np
+
+    from swarmjax.policy import digest
+    from swarmjax.run import checkpoint, lifecycle, memory, trainer
+
+    program, schedule, state = lifecycle.begin(trained)
+    compiled, state = trainer.prepare(program, schedule, state, memory.limit())
+    call, found, done = partial(compiled.call, schedule), {}, 0
+    for update in updates:
+        while done < update:
+            n = min(update - done, program.rows)
+            state, _ = call(state, np.int32(n))
+            done += n
+        found[update] = digest(checkpoint.to_leaves(state))
+    return found
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    settings: VerifyConfig = files.load(VerifyConfig, arguments)
+    trained = from_stored(read_config(Path(settings.run)), "stored ")
+    if settings.extensions is not None:
+        trained = replace(trained, extensions=settings.extensions)
+    saved = load_digests(settings)
+    found = replay(settle(trained), list(saved))
+    differing = [update for update in saved if found[update] != saved[update]]
+    sys.stdout.write(_verdict(settings.run, list(saved), differing) + "\n")
+    return DIFFERS if differing else 0
+
+
+def _verdict(run: str, updates: list[int], differing: list[int]) -> str:
+    """Says what was found."""
+    if differing:
+        return (
+            f"{run} differs from update {differing[0]} on: another version, device or config "
+            "trained it, or its device does not compute the same bits twice."
+        )
+    what = words.count(len(updates), "checkpoint")
+    return f"{run} is bit for bit what it was, to update {updates[-1]:,} ({what} compared)."
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("verify", main, VerifyConfig, (CheckpointError,)))
