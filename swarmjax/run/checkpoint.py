@@ -35,6 +35,9 @@ Leaves = dict[str, np.ndarray]
 
 FOLDER = "checkpoints"
 _OLD_META = {"digest", "update"}  # all that checkpoints held before they were bound to their run
+# In each step: the SHA-256 of its files. Given damaged files Orbax fails too, but it prints the
+# tracebacks of its threads as well.
+_MANIFEST = "files.json"
 _UNFINISHED = "*.orbax-checkpoint-tmp*"  # what Orbax renames when it is whole
 
 
@@ -174,6 +177,8 @@ class Checkpoints:
                 meta=ocp.args.JsonSave(meta | {"seal": _seal(meta)}),
             ),
         )
+        step = self._folder / str(update)
+        directory.write_json(step / _MANIFEST, _file_digests(step))
         with directory.Log(self._run / directory.SAVED) as log:
             log.write([{"update": update, "digest": meta["digest"], "score": score}])
         self._prune()
@@ -207,6 +212,32 @@ def _quieten() -> None:
     """Keeps Orbax from telling every step of its own, and its errors beside our sentence."""
     absl_logging.set_verbosity(absl_logging.FATAL)
     logging.getLogger("absl").setLevel(logging.CRITICAL)
+
+
+def _file_digests(step: Path) -> dict[str, str]:
+    """Returns the SHA-256 of each file of a step, in hexadecimal, by its path within."""
+    files = sorted(path for path in step.rglob("*") if path.is_file() and path.name != _MANIFEST)
+    found = {}
+    for path in files:
+        with path.open("rb") as file:
+            found[str(path.relative_to(step))] = hashlib.file_digest(file, "sha256").hexdigest()
+    return found
+
+
+def _check_files(step: Path) -> None:
+    """Refuses a step whose files are not those that were written.
+
+    A run that is killed just after Orbax ended leaves a step that does not list its files, as
+    older versions did.
+    """
+    if not (step / _MANIFEST).exists():
+        return
+    try:
+        expected = json.loads((step / _MANIFEST).read_text())
+    except (OSError, ValueError, RecursionError):
+        expected = None
+    if expected != _file_digests(step):
+        raise CheckpointError("its files do not match their digests")
 
 
 def _seal(meta: Mapping[str, Any]) -> str:
@@ -339,6 +370,7 @@ def _read(
     """Reads one step and checks its digest, and that it is of this update, config and run."""
     import orbax.checkpoint as ocp
 
+    _check_files(Path(manager.directory) / str(step))
     found = manager.restore(
         step,
         args=ocp.args.Composite(state=ocp.args.StandardRestore(), meta=ocp.args.JsonRestore()),

@@ -186,6 +186,7 @@ def test_a_checkpoint_of_another_config_is_refused(tmp_path: Path) -> None:
 
 def test_a_checkpoint_that_no_longer_says_what_it_is_of_is_refused(tmp_path: Path) -> None:
     _save(tmp_path, 1)
+    (_steps(tmp_path) / "1" / "files.json").unlink()
     meta = _steps(tmp_path) / "1" / "meta" / "metadata"
     found = json.loads(meta.read_text())
     meta.write_text(json.dumps(found | {"rate_scale": 0.5}))
@@ -199,6 +200,7 @@ def test_a_checkpoint_that_no_longer_says_what_it_is_of_is_refused(tmp_path: Pat
 
 def test_a_checkpoint_of_an_older_version_loads_with_a_sentence(tmp_path: Path) -> None:
     _save(tmp_path, 1)
+    (_steps(tmp_path) / "1" / "files.json").unlink()
     meta = _steps(tmp_path) / "1" / "meta" / "metadata"
     found = json.loads(meta.read_text())
     meta.write_text(json.dumps({key: found[key] for key in ("digest", "update")}))

@@ -46,11 +46,15 @@ def _put_others_in_their_place(run: Path) -> None:
 
 @pytest.fixture(params=[_flip_in_the_file, _put_others_in_their_place])
 def damaged(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
-    """A run with a sound checkpoint of update 1, and one of update 2 that has another bit."""
+    """A run with a sound checkpoint of update 1, and one of update 2 that has another bit.
+
+    It does not list its files, as older ones do not: the digest of the arrays has to notice.
+    """
     run = tmp_path / "run"
     damage: Damage = request.param
     _save(run, WEIGHTS, 1, 2)
     damage(run)
+    (_step(run, 2) / "files.json").unlink()
     return run
 
 
@@ -78,3 +82,17 @@ def test_a_bit_that_changed_in_the_arrays_is_refused_where_they_are_asked_for(
 ) -> None:
     with pytest.raises(CheckpointError, match="do not match its digest"):
         checkpoint.restore(damaged, 2)
+
+
+def test_a_bit_that_changed_in_a_file_is_refused_before_orbax_reads_it(tmp_path: Path) -> None:
+    _save(tmp_path, WEIGHTS, 1, 2)
+    _flip_in_the_file(tmp_path)
+    with pytest.raises(CheckpointError, match="its files do not match their digests"):
+        checkpoint.restore(tmp_path, 2)
+
+
+def test_a_list_of_files_that_is_damaged_is_refused(tmp_path: Path) -> None:
+    _save(tmp_path, WEIGHTS, 2)
+    (_step(tmp_path, 2) / "files.json").write_text("[" * 100_000)
+    with pytest.raises(CheckpointError, match="its files do not match their digests"):
+        checkpoint.restore(tmp_path)

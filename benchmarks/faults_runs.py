@@ -1,0 +1,344 @@
+"""Campaigns of `benchmarks.faults` against whole runs: kills, signals, and damaged checkpoints.
+
+Every trial is a function of its number, the seed of the campaign and a folder of its own, and
+returns the fields of its line. Runs are small (nine hundred updates of four arenas, a checkpoint
+after each tenth of the budget) and are compared with one that nobody disturbed.
+"""
+
+import contextlib
+import functools
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from swarmjax.policy import digest
+from swarmjax.run import checkpoint, directory
+from swarmjax.run.errors import CheckpointError
+from swarmjax.run.signals import INTERRUPTED, REQUEUE
+
+UPDATES = 900
+WORDS = (
+    "stage=s1",
+    "arenas=4",
+    f"budget={16 * UPDATES}",
+    "task.step_limit=8",
+    "algo.rollout_length=4",
+    "algo.num_minibatches=2",
+    "algo.hidden_sizes=[8]",
+    "run.tensorboard=false",
+    "run.chunk=10",
+    "resume=auto",
+)
+INTERVAL = UPDATES // 10  # updates between two checkpoints
+KILLS = 4  # of a run, before it may end
+_SECONDS = 8.0  # that a whole run takes, about
+_POLL = 0.002  # s
+
+
+def start(run: Path) -> subprocess.Popen[str]:
+    """Starts or goes on with a run, in a process of its own."""
+    words = [sys.executable, "-m", "swarmjax.train", *WORDS, f"run.dir={run}"]
+    return subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ
+    )
+
+
+@functools.cache
+def undisturbed() -> str:
+    """Digest of the last state of a run that nobody disturbed."""
+    with tempfile.TemporaryDirectory() as folder:
+        said, _ = start(Path(folder) / "run").communicate()
+        found = checkpoint.find(Path(folder) / "run")
+        assert found.update == UPDATES, said
+        return digest(found.leaves)
+
+
+def newest(run: Path) -> int:
+    """Update of the newest checkpoint that is whole; 0 without one."""
+    return max(checkpoint.steps(run), default=0)
+
+
+def logged(run: Path) -> list[int]:
+    """Updates that the metrics hold, in their order; a line that was cut off is left out."""
+    rows = directory.read_rows(run / directory.METRICS, None, whole=False)
+    return [row["update"] for row in rows]
+
+
+def kills(trial: int, seed: int, folder: Path) -> dict[str, Any]:
+    """Kills a run `KILLS` times, then lets it end.
+
+    Every other kill comes at any moment; the rest while a checkpoint is written, or within the
+    first second of a resume.
+    """
+    random, run = np.random.default_rng([seed, trial]), folder / "run"
+    moments, repeated = [], []
+    for number in range(KILLS):
+        how = ("any", "save", "any", "resume")[number % 4]
+        process = start(run)
+        _MOMENTS[how](process, run, random)
+        process.kill()
+        process.communicate()
+        moments.append(how)
+        rows = [update for update in logged(run) if update >= newest(run)]
+        repeated.append(len(rows))
+    said, _ = (process := start(run)).communicate()
+    whole = _is_whole(run)
+    sound = process.returncode == 0 and whole["identical"] and whole["log_complete"]
+    return {
+        "outcome": "ok" if sound else "WRONG",
+        "kills": len(moments),
+        "moments": moments,
+        "repeated_updates": max(repeated),
+        "interval": INTERVAL,
+        **whole,
+        **({} if sound else {"said": said[-500:]}),
+    }
+
+
+def _at_any_moment(process: subprocess.Popen[str], _: Path, random: np.random.Generator) -> None:
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(random.uniform(0.0, _SECONDS))
+
+
+def _while_saving(process: subprocess.Popen[str], run: Path, random: np.random.Generator) -> None:
+    """Waits for a random one of the next checkpoints to be begun, and a little more."""
+    left = int(random.integers(1, 4))
+    seen: set[str] = set()
+    while left and process.poll() is None:
+        names = {path.name for path in (run / checkpoint.FOLDER).glob("*tmp*")} - seen
+        seen |= names
+        left -= bool(names)
+        time.sleep(_POLL)
+    time.sleep(random.uniform(0.0, 0.05))
+
+
+def _in_the_first_second(
+    process: subprocess.Popen[str], run: Path, random: np.random.Generator
+) -> None:
+    """Waits until the process holds the lock of its run, and up to a second more."""
+    while process.poll() is None:
+        with contextlib.suppress(OSError):
+            if str(process.pid) in (run / directory.LOCK).read_text():
+                break
+        time.sleep(_POLL)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(random.uniform(0.0, 1.0))
+
+
+_MOMENTS: dict[str, Callable[[subprocess.Popen[str], Path, np.random.Generator], None]] = {
+    "any": _at_any_moment,
+    "save": _while_saving,
+    "resume": _in_the_first_second,
+}
+
+
+def _is_whole(run: Path) -> dict[str, bool]:
+    """Compares a run that has ended with one that nobody disturbed."""
+    with contextlib.suppress(CheckpointError, OSError, ValueError, KeyError):
+        summary = json.loads((run / directory.SUMMARY).read_text())
+        found = checkpoint.find(run)
+        return {
+            "identical": found.update == UPDATES and digest(found.leaves) == undisturbed(),
+            "log_complete": logged(run) == list(range(UPDATES)) and summary["updates"] == UPDATES,
+        }
+    return {"identical": False, "log_complete": False}
+
+
+def terms(trial: int, seed: int, folder: Path) -> dict[str, Any]:
+    """Asks a run to stop, at any moment, as a scheduler does; then lets it end."""
+    random, run = np.random.default_rng([seed, trial]), folder / "run"
+    number = (signal.SIGTERM, signal.SIGUSR1, signal.SIGINT)[trial % 3]
+    process = start(run)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(random.uniform(0.1, _SECONDS))
+    ended = process.poll() is not None
+    process.send_signal(number)
+    said, _ = process.communicate()
+    wanted = 0 if ended else INTERRUPTED if number == signal.SIGINT else REQUEUE
+    # The budget may be spent by the time that the signal is noticed.
+    done = newest(run)
+    code_is_right = process.returncode in ({wanted, 0} if done == UPDATES else {wanted})
+    repeated = len([update for update in logged(run) if update >= done])
+    start(run).communicate()
+    whole = _is_whole(run)
+    sound = code_is_right and not repeated and whole["identical"] and whole["log_complete"]
+    return {
+        "outcome": "ok" if sound else "WRONG",
+        "signal": signal.Signals(number).name,
+        "code": process.returncode,
+        "update": done,
+        "repeated_updates": repeated,
+        **whole,
+        **({} if sound else {"said": said[-500:]}),
+    }
+
+
+# Damaged checkpoints
+
+
+@functools.cache
+def _template() -> Path:
+    """Two runs of one config and one of another, with several checkpoints each; kept for good."""
+    folder = Path(tempfile.mkdtemp(prefix="faults-"))
+    more = ("run.keep_checkpoints=5",)
+    for name, changed in (("mine", ()), ("twin", ()), ("other", ("algo.discount=0.9",))):
+        words = [*WORDS, *more, *changed, f"run.dir={folder / name}"]
+        subprocess.run(
+            [sys.executable, "-m", "swarmjax.train", *words], check=True, capture_output=True
+        )
+    return folder
+
+
+def checkpoints(trial: int, seed: int, folder: Path) -> dict[str, Any]:
+    """Damages one or more checkpoints of a run; the newest sound one must be found."""
+    random, run = np.random.default_rng([seed, trial]), folder / "mine"
+    shutil.copytree(_template() / "mine", run)
+    sound = {step: _digest_of(run, step) for step in checkpoint.steps(run)}
+    kind = list(_DAMAGES)[trial % len(_DAMAGES)]
+    touched = _DAMAGES[kind](run, random)
+    left = max((step for step in sound if step not in touched), default=None)
+    began = time.perf_counter()
+    try:
+        kept = checkpoint.find(run)
+        found: int | str = kept.update
+        # Damage that changes nothing which counts, as in a file that nobody reads, is no error.
+        wrong = sound.get(kept.update) != digest(kept.leaves) or (
+            left is not None and kept.update < left
+        )
+    except CheckpointError as error:
+        found, wrong = str(error)[:200], left is not None or "\n" in str(error)
+    return {
+        "outcome": "WRONG" if wrong else "ok",
+        "kind": kind,
+        "damaged": sorted(touched),
+        "newest_untouched": left,
+        "found": found,
+        "seconds": round(time.perf_counter() - began, 3),
+    }
+
+
+def _digest_of(run: Path, step: int) -> str:
+    return digest(checkpoint.find(run, step).leaves)
+
+
+def _newest(run: Path, random: np.random.Generator) -> list[Path]:
+    """Folders of the newest one, two or three checkpoints."""
+    steps = checkpoint.steps(run)[: int(random.integers(1, 4))]
+    return [run / checkpoint.FOLDER / str(step) for step in steps]
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if path.is_file())
+
+
+def _flip(run: Path, random: np.random.Generator) -> set[int]:
+    """Flips one bit of one file of each."""
+    for step in (chosen := _newest(run, random)):
+        file = _files(step)[random.integers(len(_files(step)))]
+        content = bytearray(file.read_bytes())
+        if content:
+            content[random.integers(len(content))] ^= 1 << int(random.integers(8))
+        file.write_bytes(content)
+    return _numbers(chosen)
+
+
+def _cut(run: Path, random: np.random.Generator) -> set[int]:
+    """Cuts one file of each."""
+    for step in (chosen := _newest(run, random)):
+        file = _files(step)[random.integers(len(_files(step)))]
+        content = file.read_bytes()
+        file.write_bytes(content[: random.integers(len(content) + 1)])
+    return _numbers(chosen)
+
+
+def _delete(run: Path, random: np.random.Generator) -> set[int]:
+    """Deletes some files of each."""
+    for step in (chosen := _newest(run, random)):
+        for file in _files(step):
+            if random.random() < 0.3:
+                file.unlink()
+    return _numbers(chosen)
+
+
+def _empty(run: Path, random: np.random.Generator) -> set[int]:
+    """Empties the folder of each."""
+    for step in (chosen := _newest(run, random)):
+        shutil.rmtree(step)
+        step.mkdir()
+    return _numbers(chosen)
+
+
+def _swap(run: Path, random: np.random.Generator) -> set[int]:
+    """Swaps two."""
+    steps = random.choice(checkpoint.steps(run), 2, replace=False)
+    first, second = (run / checkpoint.FOLDER / str(step) for step in steps)
+    aside = run / checkpoint.FOLDER / "aside"
+    first.rename(aside)
+    second.rename(first)
+    aside.rename(second)
+    return set(map(int, steps))
+
+
+def _rename(run: Path, random: np.random.Generator) -> set[int]:
+    """Gives one the name of another update."""
+    step = int(random.choice(checkpoint.steps(run)))
+    new = int(random.integers(1, 10 * UPDATES))
+    with contextlib.suppress(OSError):  # there is one of that name
+        (run / checkpoint.FOLDER / str(step)).rename(run / checkpoint.FOLDER / str(new))
+    return {step, new}
+
+
+def _foreign(source: str, run: Path, random: np.random.Generator) -> set[int]:
+    """Puts one of another run in the place of one."""
+    step = int(random.choice(checkpoint.steps(run)))
+    given = _template() / source / checkpoint.FOLDER / str(step)
+    if given.exists():
+        shutil.rmtree(run / checkpoint.FOLDER / str(step))
+        shutil.copytree(given, run / checkpoint.FOLDER / str(step))
+        return {step}
+    return set()
+
+
+def _mix(run: Path, random: np.random.Generator) -> set[int]:
+    """Puts the arrays of one checkpoint beside the description of another."""
+    first, second = map(int, random.choice(checkpoint.steps(run), 2, replace=False))
+    part = str(random.choice(["state", "meta"]))
+    shutil.rmtree(run / checkpoint.FOLDER / str(first) / part)
+    shutil.copytree(
+        run / checkpoint.FOLDER / str(second) / part, run / checkpoint.FOLDER / str(first) / part
+    )
+    return {first}
+
+
+def _config(run: Path, _: np.random.Generator) -> set[int]:
+    """Puts the config of another run beside all of them."""
+    shutil.copy(_template() / "other" / directory.CONFIG, run / directory.CONFIG)
+    return set(checkpoint.steps(run))
+
+
+def _numbers(folders: list[Path]) -> set[int]:
+    return {int(folder.name) for folder in folders}
+
+
+_DAMAGES: dict[str, Callable[[Path, np.random.Generator], set[int]]] = {
+    "flip": _flip,
+    "cut": _cut,
+    "delete": _delete,
+    "empty": _empty,
+    "swap": _swap,
+    "rename": _rename,
+    "twin": functools.partial(_foreign, "twin"),
+    "other": functools.partial(_foreign, "other"),
+    "mix": _mix,
+    "config": _config,
+}
