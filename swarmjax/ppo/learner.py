@@ -195,20 +195,34 @@ def update(
 
     Returns:
         The state after, and metrics, each []: those of `losses.ppo_loss` and `grad_norm` (before
-        clipping), as means over all minibatches, and the policy's mean `std` after the update.
+        clipping), as means over the minibatches that were learned from, the number of
+        `skipped_steps`, which were not finite, and the policy's mean `std` after the update.
     """
     _check(config, batch)
+    counted = batch.valid.astype(bool)
+    batch = replace(batch, valid=counted & _is_finite(batch))
     samples = _samples(learner, config, batch)
     begun = (learner.params, learner.optimizer_state)
     learn = dispatch.find(backend) or _learn
     (params, optimizer_state), metrics = learn(config, updates, begun, samples, key)
-    metrics = {name: jnp.mean(metric) for name, metric in metrics.items()}
+    lost = jnp.any(counted) & ~jnp.any(batch.valid)  # no sample is finite: nor is any step
+    metrics["skipped_steps"] = jnp.where(lost, 1.0, metrics["skipped_steps"])
+    metrics = optimizer.mean_of_taken(metrics)
     metrics["std"] = jnp.mean(jnp.exp(params["actor"]["log_std"]))
     moments = learner.normalizer
     if config.normalize_observations:
         moments = normalizer.update(moments, batch.observation, batch.valid)
     learned = replace(learner, params=params, optimizer_state=optimizer_state, normalizer=moments)
     return learned, metrics
+
+
+def _is_finite(batch: Batch) -> jax.Array:
+    """Tells which samples, [G, N], hold finite numbers alone."""
+    numbers = (batch.log_prob, batch.advantage, batch.return_)
+    vectors = (batch.observation, batch.action)
+    found = [jnp.isfinite(x) for x in numbers]
+    found += [jnp.all(jnp.isfinite(x), axis=-1) for x in vectors]
+    return functools.reduce(jnp.logical_and, found)
 
 
 def _check(config: AlgoConfig, batch: Batch) -> None:

@@ -1,5 +1,7 @@
 """The optimiser, and the one step that every way of computing a gradient ends in."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import optax
@@ -8,7 +10,8 @@ from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.losses import Metrics
 from swarmjax.ppo.networks import Params
 
-# The metrics of a step: those of `losses.ppo_loss`, and the norm of the gradient before clipping.
+# The metrics of a step: those of `losses.ppo_loss`, the norm of the gradient before clipping, and 1
+# if the step was skipped.
 METRICS = (
     "approx_kl",
     "bound_loss",
@@ -17,6 +20,7 @@ METRICS = (
     "policy_loss",
     "value_loss",
     "grad_norm",
+    "skipped_steps",
 )
 
 Progress = tuple[Params, optax.OptState]
@@ -97,6 +101,10 @@ def take(
 ) -> tuple[Progress, Metrics]:
     """Takes a step along a gradient; none at all if no sample is valid.
 
+    A step is skipped, and counted, if a number of its gradient, or of what it leads to, is not
+    finite. `optax.apply_if_finite` looks at the gradient alone, so that an optimiser whose state is
+    broken would break the parameters, and after some skips it takes such a step.
+
     Args:
         config: Of the optimiser.
         updates: As given to `make`.
@@ -105,11 +113,39 @@ def take(
         any_valid: [], whether the gradient is of any valid sample.
 
     Returns:
-        Parameters and the optimiser's state after, and the metrics with `grad_norm`.
+        Parameters and the optimiser's state after, and the metrics with `grad_norm` and
+        `skipped_steps`, which are zero in a skipped step but for the last.
     """
     (params, optimizer_state), (gradient, metrics) = progress, found
     metrics["grad_norm"] = optax.tree.norm(gradient)
     steps, stepped_state = make(config, updates).update(gradient, optimizer_state, params)
     stepped = (optax.apply_updates(params, steps), stepped_state)
+    finite = jnp.isfinite(metrics["grad_norm"]) & _is_finite(stepped)
+    metrics = {name: jnp.where(finite, metric, 0.0) for name, metric in metrics.items()}
+    metrics["skipped_steps"] = (any_valid & ~finite).astype(jnp.float32)
+    taken = any_valid & finite
     # Adam moves by its momentum even where the gradient is zero.
-    return jax.tree.map(lambda new, old: jnp.where(any_valid, new, old), stepped, progress), metrics
+    return jax.tree.map(lambda new, old: jnp.where(taken, new, old), stepped, progress), metrics
+
+
+def _is_finite(tree: Any) -> jax.Array:
+    """Tells whether all numbers of a tree are finite: their sum is not if one is not."""
+    return jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves(tree)))
+
+
+def mean_of_taken(metrics: Metrics) -> Metrics:
+    """Sums up the steps of an update.
+
+    Args:
+        metrics: Of its steps, any shape, as `take` gives them.
+
+    Returns:
+        The means over the steps that were taken, [], NaN if all were skipped, and the number of
+        `skipped_steps`.
+    """
+    skipped = jnp.sum(metrics["skipped_steps"])
+    count = metrics["skipped_steps"].size
+    # Exactly 1 in an update whose steps were all taken.
+    share = count / (count - skipped)
+    means = {name: jnp.mean(metric) * share for name, metric in metrics.items()}
+    return means | {"skipped_steps": skipped}

@@ -128,7 +128,7 @@ class Checkpoints:
         score: float | None = None,
         rate_scale: float = 1.0,
     ) -> None:
-        """Begins to write a state; an update that is there already is left as it is.
+        """Begins to write a state, unless its update is there or what it learned is not finite.
 
         Args:
           state: What changes in the run; it is copied before this returns.
@@ -159,7 +159,7 @@ class Checkpoints:
     def _write(self, leaves: Leaves, meta: dict[str, Any], score: float | None) -> None:
         update = meta["update"]
         try:
-            if update not in self._manager.all_steps():
+            if _is_sound(leaves) and update not in self._manager.all_steps():
                 self._write_step(leaves, meta, score)
         except Exception as error:  # whatever a full disk makes Orbax raise
             reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
@@ -212,6 +212,12 @@ def _quieten() -> None:
     """Keeps Orbax from telling every step of its own, and its errors beside our sentence."""
     absl_logging.set_verbosity(absl_logging.FATAL)
     logging.getLogger("absl").setLevel(logging.CRITICAL)
+
+
+def _is_sound(leaves: Leaves) -> bool:
+    """Tells whether what was learned is finite: a run must be able to go back to it."""
+    learned = [x for name, x in leaves.items() if name.startswith("learners/")]
+    return all(np.isfinite(x).all() for x in learned if np.issubdtype(x.dtype, np.floating))
 
 
 def _file_digests(step: Path) -> dict[str, str]:

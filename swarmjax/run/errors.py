@@ -7,3 +7,7 @@ class CheckpointError(ValueError):
 
 class TrainingError(RuntimeError):
     """A run that cannot go on, in one sentence."""
+
+
+class DivergedError(RuntimeError):
+    """A run whose gradient steps are no longer finite, in one sentence."""

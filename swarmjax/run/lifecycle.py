@@ -20,7 +20,7 @@ from swarmjax.ppo import optimizer
 from swarmjax.run import checkpoint, directory, memory, warm_start
 from swarmjax.run.checkpoint import Checkpoints, Kept, Leaves
 from swarmjax.run.display import Display, working
-from swarmjax.run.errors import TrainingError
+from swarmjax.run.errors import DivergedError, TrainingError
 from swarmjax.run.policy_export import POLICY, seed_path, write_policy
 from swarmjax.run.settings import TrainConfig, read_config
 from swarmjax.run.signals import Stop
@@ -32,6 +32,11 @@ from swarmjax.training import program as programs
 from swarmjax.training import seeds
 from swarmjax.training.loop import TrainState
 
+_LOWERED = 0.1  # what the learning rates of a run that diverged are multiplied by
+_GIVE_UP = (
+    "It had gone back once already: give lower algo.actor_learning_rate and "
+    "algo.critic_learning_rate, or look at metrics.jsonl for what broke."
+)
 _PRICE = "learners/price/"  # of checkpoints written while algo.contact_limit was a key
 
 
@@ -71,9 +76,34 @@ def _carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) -
         source = warm_start.read(settings) if kept is None else None
     if kept is not None and kept.update == settings.updates:
         return _complete(run, settings, kept, display)
+    try:
+        return _train(settings, run, stop, display, source, kept)
+    except DivergedError as error:
+        kept = checkpoint.find(run)
+        if kept.rate_scale < 1.0:
+            raise TrainingError(f"{error} {_GIVE_UP}") from None
+        display.say(
+            f"{error} The run goes back to update {kept.update:,}, with learning rates of "
+            f"{_LOWERED:g} times what they were."
+        )
+    try:
+        return _train(settings, run, stop, display, None, kept._replace(rate_scale=_LOWERED))
+    except DivergedError as error:
+        raise TrainingError(f"{error} {_GIVE_UP}") from None
+
+
+def _train(
+    settings: TrainConfig,
+    run: Path,
+    stop: Stop,
+    display: Display,
+    source: Source | None,
+    kept: Kept | None,
+) -> Tally:
+    """Trains from a checkpoint, or from the seed and what `source` had learned."""
     stop.check()
     with working("building the arenas"):
-        program, schedule, init, template = _load(settings)
+        program, schedule, init, template = _load(_scaled(settings, kept))
         state, skipped = _first_state(program, lambda: init(schedule), template, source, kept)
     for sentence in _first_sentences(program, run, source, kept, skipped):
         display.say(sentence)
@@ -89,6 +119,15 @@ def _carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) -
     _write_policies(run, settings, leaves, tally.update)
     _write_summary(run, program, tally)
     return tally
+
+
+def _scaled(settings: TrainConfig, kept: Kept | None) -> TrainConfig:
+    """Lowers the learning rates of a run that diverged once."""
+    if kept is None or kept.rate_scale == 1.0:
+        return settings
+    rates = optimizer.learning_rates(settings.algo, settings.updates)
+    lowered = {f"{name}_learning_rate": rate * kept.rate_scale for name, rate in rates.items()}
+    return replace(settings, algo=replace(settings.algo, **lowered))
 
 
 def _first_sentences(
@@ -145,7 +184,7 @@ def _complete(run: Path, settings: TrainConfig, kept: Kept, display: Display) ->
         f"nothing left to train: {settings.resume} has spent its budget of {steps} "
         f"({words.count(kept.update, 'update')}); for more, give a larger budget"
     )
-    tally = begin_tally(settings, kept.update, 0.0, kept)
+    tally = begin_tally(settings, kept.update, 0.0, Path(settings.resume or run), kept)
     if not current:
         with working("building the arenas"):
             program, *_ = _load(settings)

@@ -4,6 +4,7 @@ import contextlib
 import importlib
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -17,12 +18,11 @@ import numpy as np
 from swarmjax import provenance, words
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.curriculum.log import log
-from swarmjax.ppo import optimizer
 from swarmjax.run import memory, recorder
 from swarmjax.run.checkpoint import Checkpoints, Kept
 from swarmjax.run.directory import EPISODES, Row
 from swarmjax.run.display import Display, summarize
-from swarmjax.run.errors import TrainingError
+from swarmjax.run.errors import DivergedError
 from swarmjax.run.recorder import Recorder
 from swarmjax.run.settings import TrainConfig
 from swarmjax.run.signals import Stop
@@ -38,6 +38,7 @@ Built = Program[TrainConfig]  # the program of a run
 CALL_SECONDS = 1.0  # what a call should take when run.chunk is auto: the display's pace
 ALL_SECONDS = 10.0  # likewise, when it is all: how long a signal may have to wait
 FIRST_UPDATES = 32  # of the first call then, by which the others are measured
+PATIENCE = 10  # updates in a row without a finite gradient step, after which a run has diverged
 GROWTH = 4  # a call is at most this many times as long as the one before
 
 
@@ -76,6 +77,7 @@ class Tally:
       earlier_s: spent training before this process began.
       seconds: spent training by this process, compilation apart.
       decisions: promotions and demotions.
+      skipped_in_row: newest updates of each seed whose gradient steps were all skipped.
     """
 
     update: int
@@ -86,6 +88,12 @@ class Tally:
     earlier_s: float = 0.0
     seconds: float = 0.0
     decisions: list[dict] = field(default_factory=list)
+    skipped_in_row: Counter[int] = field(default_factory=Counter)
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the newest update of every seed took a gradient step."""
+        return not any(self.skipped_in_row.values())
 
 
 def compile_chunk(
@@ -204,19 +212,21 @@ def train(
       The last state, which is saved, and what came of the run.
 
     Raises:
-      TrainingError: if a loss of any seed is no longer finite, or the directory cannot be written;
-        the checkpoint before that is kept.
+      DivergedError: if the gradient steps of a seed are no longer finite; the checkpoint before
+        that is kept.
+      TrainingError: if the directory cannot be written.
     """
     settings, done = program.config, int(state.update[0])
-    tally = begin_tally(settings, done, compiled.seconds, kept)
+    tally = begin_tally(settings, done, compiled.seconds, run, kept)
     keep, resumed = settings.run.keep_checkpoints, None if kept is None else done
     with (
         _recorder(run, program, done, kept) as record,
         Checkpoints(run, keep, resumed) as checkpoints,
     ):
         saves = Saves(settings, done)
+        save = partial(checkpoints.save, rate_scale=1.0 if kept is None else kept.rate_scale)
         if kept is None:
-            checkpoints.save(state, done, record.sync())
+            save(state, done, record.sync())
         for n in _calls(program, tally, stop):
             began = time.perf_counter()
             state, metrics = compiled.call(schedule, state, np.int32(n))
@@ -225,9 +235,11 @@ def train(
             _report(program, tally, metrics, n, time.perf_counter() - began, record, display)
             if log is not None:
                 _log_episodes(program.config, log, np.arange(tally.update)[-n:], record, display)
-            if saves.due(tally.update):
-                checkpoints.save(state, tally.update, record.sync(), score(settings, tally))
-        checkpoints.save(state, tally.update, record.sync(), score(settings, tally))
+            if tally.is_sound and saves.due(tally.update):
+                save(state, tally.update, record.sync(), score(settings, tally))
+        if not tally.is_sound:
+            raise DivergedError(f"no gradient step was finite at the end, update {tally.update:,}.")
+        save(state, tally.update, record.sync(), score(settings, tally))
     return state, tally
 
 
@@ -266,7 +278,7 @@ def score(settings: TrainConfig, tally: Tally) -> float | None:
 
 
 def begin_tally(
-    settings: TrainConfig, done: int, compile_s: float, kept: Kept | None = None
+    settings: TrainConfig, done: int, compile_s: float, run: Path, kept: Kept | None = None
 ) -> Tally:
     """Begins to add up, from what a resumed run had come to.
 
@@ -274,6 +286,7 @@ def begin_tally(
       settings: of the run.
       done: updates of every seed that are done.
       compile_s: that compiling took.
+      run: directory that holds the logs of a run that goes on.
       kept: the checkpoint that the run goes on from, if one.
 
     Returns:
@@ -290,9 +303,9 @@ def begin_tally(
         transitions=dict.fromkeys(numbers, 0),
         targets_reached={seed: {} for seed in numbers},
     )
-    if settings.resume is None or kept is None:
+    if kept is None:
         return tally
-    rows, decisions = recorder.history(Path(settings.resume), done, kept.logs)
+    rows, decisions = recorder.history(run, done, kept.logs)
     _add(settings, tally, rows, decisions)
     tally.earlier_s = rows[-1]["train_s"] if rows else 0.0
     return tally
@@ -370,7 +383,7 @@ def _report(
     tally.seconds += seconds
     rows = recorder.rows(metrics, n, names, seeds.numbers(settings), control_steps)
     rows: list[Row] = [row | {"train_s": tally.earlier_s + tally.seconds} for row in rows]
-    _check_finite(settings, rows)
+    _watch_steps(settings, tally, rows)
     decisions = _decisions(settings, rows)
     speeds = _speeds(program, rows, seconds) | {"compile_s": tally.compile_s}
     _add(settings, tally, rows, decisions)
@@ -413,18 +426,19 @@ def _decisions(settings: TrainConfig, rows: list[Row]) -> list[Row]:
     return sorted(found, key=lambda entry: entry["update"])
 
 
-def _check_finite(settings: TrainConfig, rows: list[Row]) -> None:
-    """Stops a run whose networks have broken, before it is saved."""
-    rates = optimizer.learning_rates(settings.algo, settings.updates)
+def _watch_steps(settings: TrainConfig, tally: Tally, rows: list[Row]) -> None:
+    """Counts the updates in a row whose gradient steps were all skipped; too many end the run."""
     for row in rows:
-        where = f" of seed {row['seed']}" if settings.seeds > 1 else ""
-        for name in ("policy_loss", "value_loss", "grad_norm"):
-            if row[name] is None:
-                raise TrainingError(
-                    f"{name} is no longer finite at update {row['update']}{where}: try lower "
-                    "algo.actor_learning_rate and algo.critic_learning_rate than "
-                    f"{rates['actor']:.2g} and {rates['critic']:.2g}."
-                )
+        seed, skipped = row["seed"], row["policy_loss"] is None
+        tally.skipped_in_row[seed] = tally.skipped_in_row[seed] + 1 if skipped else 0
+        if tally.skipped_in_row[seed] >= PATIENCE:
+            raise DivergedError(_diverged(settings, tally, row))
+
+
+def _diverged(settings: TrainConfig, tally: Tally, row: Row) -> str:
+    where = f" of seed {row['seed']}" if settings.seeds > 1 else ""
+    count = words.count(tally.skipped_in_row[row["seed"]], "update")
+    return f"no gradient step{where} was finite in {count} up to update {row['update'] + 1:,}."
 
 
 def _speeds(program: Built, rows: list[Row], seconds: float) -> dict[str, float]:

@@ -103,7 +103,7 @@ class TimeStep(NamedTuple):
       truncated: [R] the time ran out for the robot.
       valid: [R] the robot was on its way, and the physics sound: a transition to learn from.
       done: [] the arena's episode is over.
-      sound: [] the physics is finite.
+      sound: [] the physics is finite, and so are rewards, distances and observations.
     """
 
     observation: Array
@@ -259,10 +259,15 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
         arrives,
         begins & active[:, None],
     )
-    valid = active & sound
     if world.terms:
         earned = _complete(world, earned, state, action, pose)
-    gained = jnp.where(valid, reward.total(earned, world.task.reward, world.terms), 0.0)
+    gained = reward.total(earned, world.task.reward, world.terms)
+    sound &= _is_finite(gained, active) & _is_finite(sight.distance, level.present)
+    sound &= _is_finite(seen, level.present[:, None])
+    valid = active & sound
+    gained = jnp.where(valid, gained, 0.0)
+    # The step of an arena that broke is not learned from, and the critic need not see it either.
+    seen = jnp.where(sound, seen, state.observation)
     episode = _tally(state.episode, gained, begins, earned, valid)
     timeout = clock >= world.task.step_limit
     new = replace(
@@ -285,6 +290,11 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
         done=jnp.all(arrived | ~level.present) | timeout | ~sound,
         sound=sound,
     )
+
+
+def _is_finite(numbers: Array, counted: Array) -> Array:
+    """Tells whether the numbers [R, ...] of the robots that are counted are finite, []."""
+    return jnp.all(jnp.isfinite(numbers) | ~counted)
 
 
 def _move(

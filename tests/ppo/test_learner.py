@@ -384,3 +384,45 @@ def test_advantages_of_monte_carlo_returns_are_taken_as_they_are() -> None:
     # At ratio 1 the policy's loss is the mean advantage, about 5, negated. Float32.
     mean = np.mean(np.asarray(batch.advantage)[np.asarray(batch.valid)])
     np.testing.assert_allclose(metrics["policy_loss"], -mean, rtol=1e-5)
+
+
+# Numbers that are not finite
+
+
+def _break(x: jax.Array, value: float) -> jax.Array:
+    return x.at[(0,) * x.ndim].set(value) if x.dtype == jnp.float32 and x.ndim else x
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("field", ["observation", "action", "log_prob", "advantage", "return_"])
+def test_a_sample_that_is_not_finite_is_left_out(field: str, value: float) -> None:
+    state, key = _experienced(), jax.random.key(1)
+    batch = _batch(state)
+    batch = replace(batch, valid=batch.valid.at[0, 0].set(True))
+    spoilt = replace(batch, **{field: getattr(batch, field).at[0, 0].set(value)})
+    without = replace(batch, valid=batch.valid.at[0, 0].set(False))
+    found, expected = _update(state, spoilt, key), _update(state, without, key)
+    _assert_equal(found, expected)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("part", ["params", "optimizer_state"])
+def test_steps_from_a_broken_learner_are_all_skipped_and_counted(part: str, value: float) -> None:
+    state = _experienced()
+    broken = jax.tree.map(lambda x: _break(x, value), getattr(state, part))
+    state = replace(state, **{part: broken})
+    after, metrics = _update(state, _batch(state), jax.random.key(1))
+    _assert_equal((after.params, after.optimizer_state), (state.params, state.optimizer_state))
+    assert metrics["skipped_steps"] == CONFIG.epochs * CONFIG.num_minibatches
+    assert np.isnan(metrics["policy_loss"])
+    assert np.isfinite(after.normalizer.mean).all()
+
+
+def test_a_batch_of_which_no_sample_is_finite_counts_as_skipped() -> None:
+    state = _experienced()
+    batch = _batch(state)
+    spoilt = replace(batch, advantage=batch.advantage * jnp.nan)
+    after, metrics = _update(state, spoilt, jax.random.key(1))
+    _assert_equal(after, state)
+    assert metrics["skipped_steps"] == CONFIG.epochs * CONFIG.num_minibatches
+    assert np.isnan(metrics["policy_loss"])

@@ -1,5 +1,8 @@
 """The learning rates that a run begins with."""
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from swarmjax.ppo import optimizer
@@ -34,3 +37,25 @@ def test_given_learning_rates_are_kept() -> None:
 
 def test_epochs_and_minibatches_count_as_gradient_steps() -> None:
     assert optimizer.gradient_steps(AlgoConfig(epochs=3, num_minibatches=5), 7) == 105
+
+
+def test_means_are_those_of_the_steps_that_were_taken() -> None:
+    metrics = {
+        "loss": jnp.array([[1.0, 0.0], [2.0, 6.0]]),
+        "skipped_steps": jnp.array([[0.0, 1.0], [0, 0]]),
+    }
+    found = optimizer.mean_of_taken(metrics)
+    assert found["loss"] == pytest.approx((1.0 + 2.0 + 6.0) / 3)
+    assert found["skipped_steps"] == 1.0
+
+
+def test_one_broken_gradient_leaves_parameters_and_optimiser_as_they_are() -> None:
+    config = AlgoConfig(epochs=1, num_minibatches=1)
+    params = {"actor": {"w": jnp.ones(3)}, "critic": {"w": jnp.ones(2)}}
+    progress = (params, optimizer.make(config, 5).init(params))
+    gradient = {"actor": {"w": jnp.array([1.0, jnp.nan, 0.0])}, "critic": {"w": jnp.ones(2)}}
+    loss = {"policy_loss": jnp.float32(jnp.nan)}
+    found, metrics = optimizer.take(config, 5, progress, (gradient, loss), jnp.array(True))
+    jax.tree.map(np.testing.assert_array_equal, found, progress)
+    assert metrics["skipped_steps"] == 1.0
+    assert metrics["policy_loss"] == 0.0

@@ -8,15 +8,18 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
 import pytest
 
 from swarmjax import train, verify
 from swarmjax.config import ConfigError
 from swarmjax.policy import digest
-from swarmjax.run import checkpoint, directory, lifecycle
+from swarmjax.run import checkpoint, directory, execute, lifecycle, trainer
 from swarmjax.run.directory import LOCK
 from swarmjax.run.settings import load_run
 from swarmjax.run.signals import REQUEUE
@@ -305,3 +308,69 @@ def test_what_cannot_be_verified_is_one_sentence(
         (tmp_path / "checkpoints.jsonl").write_text(content)
     with pytest.raises(ValueError, match=said):
         verify.main([f"run={tmp_path}", "updates=3"])
+
+
+# Numbers that are not finite
+
+
+def _spoil(monkeypatch: pytest.MonkeyPatch, at: int, times: int = 1) -> None:
+    """Breaks the optimiser's state of a run's last seed after some updates, so many times."""
+    call, left = trainer.compile_chunk, [times]
+
+    def broken(x: jax.Array) -> jax.Array:
+        return x.at[-1].set(np.nan) if x.dtype == np.float32 else x
+
+    def compile_and_spoil(*arguments: Any, **given: Any) -> Any:
+        compiled = call(*arguments, **given)
+
+        def spoil(schedule: Any, state: Any, n: Any) -> Any:
+            state, metrics = compiled.call(schedule, state, n)
+            if left[0] and int(state.update[0]) >= at:
+                left[0] -= 1
+                learners = state.learners
+                found = jax.tree.map(broken, learners.optimizer_state)
+                state = replace(state, learners=replace(learners, optimizer_state=found))
+            return state, metrics
+
+        return replace(compiled, call=spoil)
+
+    monkeypatch.setattr(trainer, "compile_chunk", compile_and_spoil)
+
+
+def test_a_run_that_diverges_goes_back_once_with_lower_rates(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _spoil(monkeypatch, at=20)
+    run, words = tmp_path / "run", [*TINY, "budget=640", "run.chunk=1"]
+    assert train.main([*words, f"run.dir={run}"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "no gradient step was finite in 10 updates up to update 30" in said
+    assert "The run goes back to update 16, with learning rates of 0.1 times" in said
+    kept = checkpoint.find(run)
+    assert (kept.update, kept.rate_scale) == (40, 0.1)
+    assert _updates(run) == list(range(40))
+    assert all(np.isfinite(leaf).all() for leaf in kept.leaves.values() if leaf.dtype == np.float32)
+
+
+def test_a_run_that_diverges_again_stops_and_names_the_seed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _spoil(monkeypatch, at=5, times=99)
+    words = [*TINY, "budget=640", "run.chunk=1", "seeds=2", f"run.dir={tmp_path}"]
+    assert train.main(words) == execute.FAILED
+    said = " ".join(capsys.readouterr().out.split())
+    assert "no gradient step of seed 1 was finite in 10 updates" in said
+    assert "It had gone back once already: give lower algo.actor_learning_rate" in said
+    assert checkpoint.restore(tmp_path)[1] == 4
+
+
+def test_lower_rates_are_kept_when_the_run_is_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _spoil(monkeypatch, at=20)
+    run, words = tmp_path / "run", [*TINY, "budget=640", "run.chunk=1", "run.stop_after=35"]
+    assert train.main([*words, f"run.dir={run}"]) == 0
+    capsys.readouterr()
+    assert train.main([f"resume={run}"]) == 0
+    assert "learning rates 3e-05 (actor)" in " ".join(capsys.readouterr().out.split())
+    assert checkpoint.find(run).rate_scale == 0.1

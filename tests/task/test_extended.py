@@ -156,3 +156,22 @@ def test_a_way_of_drawing_that_is_missing_is_refused() -> None:
         "stage ring: level is 'ring': give one of random, fixed, or extensions=FILE, a file that "
         "defines it."
     )
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "@reward_term(weight=1.0)\ndef a(step): return step.distance * jnp.nan",
+        "@observation()\ndef a(view): return jnp.where(view.distance > 0, jnp.inf, 0.0)",
+    ],
+)
+def test_what_is_not_finite_ends_the_episode_and_teaches_nothing(tmp_path: Path, body: str) -> None:
+    stage = StageConfig(name="s", robots=3, side=1.0)
+    world = _world(extensions.write(tmp_path / "mine.py", body), (stage,))
+    uniforms = np.random.default_rng(3).random(level.uniform_count(world.spacing), np.float32)
+    mine = extended.draw(uniforms, task_stage.single(stage, world.drawings), world.spacing, ())
+    _, came = _step(world, mine, np.zeros((4, 2), np.float32))
+    assert not came.sound
+    assert came.done
+    assert not came.valid.any()
+    assert not came.reward.any()
