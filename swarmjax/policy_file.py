@@ -18,7 +18,9 @@ import numpy as np
 
 from swarmjax import extension, policy
 from swarmjax.atomic_file import replacing
-from swarmjax.policy import FORMAT, MAX_BYTES, Policy, PolicyError
+from swarmjax.config import ConfigError
+from swarmjax.config.reading import parse_json
+from swarmjax.policy import FORMAT, MAX_BYTES, MAX_ENTRIES, MAX_LETTERS, Policy, PolicyError
 from swarmjax.policy_network import PolicyNetwork
 
 ACTION_NAMES = ("speed", "turn_rate")
@@ -242,7 +244,7 @@ def _unpack(content: bytes) -> dict[str, bytes]:
     """Returns the members of an archive by their arrays' names."""
     found: set[str] = set()
     try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        with policy.open_archive(io.BytesIO(content)) as archive:
             members = archive.infolist()
             for member in members:
                 _check_member(member, found)
@@ -309,10 +311,14 @@ def _text(members: Mapping[str, np.ndarray], name: str) -> str:
 
 
 def _parse_meta(text: str) -> dict[str, Any]:
+    if len(text) > MAX_LETTERS or sum(map(text.count, "[{,:")) > MAX_ENTRIES:
+        raise PolicyError(
+            f"meta cannot be read: expected at most {MAX_LETTERS} letters and {MAX_ENTRIES} entries."
+        )
     try:
-        meta = json.loads(text)
-    except (ValueError, RecursionError):
-        raise PolicyError("meta cannot be read: expected one text of JSON.") from None
+        meta = parse_json(text, "meta")
+    except ConfigError as error:
+        raise PolicyError(str(error)) from None
     if not isinstance(meta, dict):
         raise PolicyError(f"meta is {_show(meta)}: expected a JSON object.")
     return meta

@@ -177,7 +177,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["run.chunk=0"], "run.chunk is 0: give 1 to 2147483647."),
         (["run.dir="], "run.dir is '': give text or null."),
         (["seed=-1"], "seed is -1: give 0 to 2147483647."),
-        (["robot.max_speed=0"], "robot.max_speed is 0: give more than 0."),
+        (["robot.max_speed=0"], "robot.max_speed is 0: give 0.001 to 5."),
         (["robot.hull_radius=-0.08"], "robot.hull_radius is -0.08: give more than 0, at most "
          "0.045."),
         (["curriculum.budget_share=1"], "curriculum.budget_share is 1: give more than 0, less "
