@@ -87,10 +87,10 @@ def _read(file: IO[bytes]) -> dict[str, np.ndarray]:
         plain = {x.filename for x in members if not (x.compress_type or x.flag_bits & 1)}
         if len(plain) < len(members):
             raise ValueError("a member is compressed, encrypted or there twice")
-        return {member.filename.removesuffix(".npy"): _array(archive, member) for member in members}
+        return {x.filename.removesuffix(".npy"): read_array(archive, x) for x in members}
 
 
-def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+def read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     """Reads a member whose header says neither more nor less than there is."""
     with archive.open(member) as file:
         if np.lib.format.read_magic(file) != (1, 0):

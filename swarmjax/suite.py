@@ -23,7 +23,7 @@ from rich.table import Table
 
 from swarmjax import command
 from swarmjax.atomic_file import replacing
-from swarmjax.config import ConfigError, about, files
+from swarmjax.config import ConfigError, about, files, reading
 from swarmjax.config.section import Section
 from swarmjax.evaluate import cells, trials
 from swarmjax.evaluate.cells import Cell, Suite
@@ -150,7 +150,7 @@ def _search(settings: SuiteConfig, cell: CellConfig, entrants: Sequence[Entrant]
 
 def _comment(path: Path) -> str:
     """The lines of comment that a file begins with."""
-    lines = path.read_text().splitlines(keepends=True)
+    lines = reading.read_text(path).splitlines(keepends=True)
     end = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
     return "".join(lines[:end])
 

@@ -6,7 +6,6 @@ A last line without its newline is being written, or was as the run was killed: 
 that a run can be read at any time. Any other damage is refused, by its file, line and key.
 """
 
-import json
 import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -16,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax.config import ConfigError
+from swarmjax.config import ConfigError, reading
 from swarmjax.evaluate.statistics import iqm
 from swarmjax.run import recorder
 from swarmjax.run.settings import TrainConfig, from_stored
@@ -288,10 +287,7 @@ def read_object(path: Path) -> Row:
     Raises:
       ConfigError: if it cannot be read, or holds something else.
     """
-    try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path} cannot be read: {error}.") from None
+    found = reading.read_json(path)
     if not isinstance(found, dict):
         raise ConfigError(f"{path} holds no keys and values: it is damaged.")
     return found
@@ -327,22 +323,18 @@ def read_lines(run: Path, name: str) -> Iterator[tuple[str, Row]]:
     path = run / name
     if not path.exists():
         raise ConfigError(f"{run} has no {name}: it holds no training yet.")
-    try:
-        with path.open() as file:
-            for number, line in enumerate(file, 1):
-                if not line.endswith("\n"):
-                    return
-                where = f"{path} in line {number}"
-                yield where, _object(line, where)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} cannot be read: {error}.") from None
+    for number, line in enumerate(reading.read_lines(path), 1):
+        if not line.endswith(b"\n"):
+            return
+        where = f"{path} in line {number}"
+        yield where, _object(line, where)
 
 
-def _object(line: str, where: str) -> Row:
+def _object(line: bytes, where: str) -> Row:
     """Reads one line."""
     try:
-        found = json.loads(line)
-    except ValueError:
+        found = reading.parse_json(line.decode(), where)
+    except (ConfigError, UnicodeDecodeError):
         found = None
     if not isinstance(found, dict):
         raise ConfigError(f"{where} is damaged: go on with the run, or take it out.")
