@@ -10,6 +10,7 @@ import contextlib
 import json
 import os
 import random
+import re
 import resource
 import signal
 import subprocess
@@ -169,7 +170,8 @@ def _write_run(run: Path) -> None:
     run.mkdir()
     config = to_dict(load_train(["stage=s1", "budget=1e6"]))
     (run / "config.json").write_text(json.dumps(config))
-    row = {"update": 1, "seed": 0, "env_steps": 4096, "stage_weights": [1.0]}
+    lists = dict.fromkeys(("mix", "weights", *rows.BY_STAGE), [0.5])
+    row = {"update": 1, "seed": 0, "arena_steps": 4096, "train_s": 1.0, "return": 0.1, **lists}
     (run / "metrics.jsonl").write_text(json.dumps(row) + "\n")
     (run / "reproduce.json").write_text(json.dumps({"settings": to_dict(ReproduceConfig())}))
 
@@ -200,6 +202,8 @@ def _mutate_text(text: str, draw: random.Random) -> str:
             lambda: text[:at] + draw.choice("[]{}:-&*!|>'\"%@`#,\n\t 0\0\udcff") + text[at:],
             lambda: text[:at] + text[at + draw.randrange(1, 9) :],
             lambda: "".join([*lines[:line], f"{head}: {nasty}\n", *lines[line + 1 :]]),
+            lambda: _other_value(text, draw),
+            lambda: _other_value(text, draw),
             lambda: "".join([*lines[:line], lines[line], *lines[line:]]),
             lambda: "".join([*lines[:line], *lines[line + 1 :]]),
             lambda: "a0: &a0 [1]\n" + bomb + text,
@@ -207,6 +211,15 @@ def _mutate_text(text: str, draw: random.Random) -> str:
             lambda: draw.choice(("", nasty, "null", "[]", "[1]", "{}", "a: " + nasty)),
         )
     )()
+
+
+def _other_value(text: str, draw: random.Random) -> str:
+    """Puts a nasty value in the place of a number or word of a file."""
+    found = [*re.finditer(r"(?<=: )[\w.\"-]+", text)]
+    if not found:
+        return text
+    start, end = draw.choice(found).span()
+    return f"{text[:start]}{draw.choice(_NASTY)}{text[end:]}"
 
 
 def _mutate_words(words: list[str], cls: type[Section], draw: random.Random) -> list[str]:
@@ -218,15 +231,13 @@ def _mutate_words(words: list[str], cls: type[Section], draw: random.Random) -> 
     cut = draw.randrange(len(word))
     changed = draw.choice(
         (
-            f"{key}={nasty}",
-            f"{key}={nasty}",
+            *[f"{key}={nasty}"] * 5,
             f"{key}={draw.choice((draw.random(), draw.randrange(-9, 99), [0.1, 0.2], 'true'))}",
             f"{key}.{draw.choice(keys)}=1",
             f"{word.partition('=')[0]}={nasty}",
             word[:cut] + draw.choice("=.,'\"[]{}$:é \t\\+~@") + word[cut:],
             word[:cut] + word[cut + 1 :],
-            nasty,
-            f"++{word}",
+            draw.choice((nasty, f"++{word}")),
         )
     )
     if draw.random() < 0.4:

@@ -7,7 +7,6 @@ that a run can be read at any time. Any other damage is refused, by its file, li
 """
 
 import math
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +35,7 @@ _LISTS = ("mix", "weights", *BY_STAGE)
 CURVES = ("return", "contacts_per_robot", "policy_loss", "value_loss", "entropy")
 MANY = 9  # stages from which on each is drawn small
 SUMMARY = "summary.json"
+_LARGEST = float(np.finfo(np.float32).max)
 _NUMBERS = ("seed", "update", "arena_steps")
 # A verdict takes one cohort in which its episodes begin, and one in which the last of them end.
 _COHORTS_OF_A_VERDICT = 2
@@ -218,7 +218,7 @@ def check_whole(row: Row, keys: Sequence[str], where: str) -> None:
       ConfigError: if one is missing or of another type.
     """
     for key in keys:
-        if not isinstance(row.get(key), int) or isinstance(row[key], bool):
+        if not _is_whole(row.get(key)):
             raise ConfigError(f"{where} has no whole number as {key}: it is damaged.")
 
 
@@ -259,10 +259,15 @@ def per_stage(found: object, stages: int, what: str) -> np.ndarray:
 
 
 def _is_number_or_null(value: object) -> bool:
-    """Tells whether a value is None or fits a float; text and truth values are no numbers."""
+    """Tells whether a value is None or fits a float32; text and truth values are no numbers."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return value is None
-    return abs(value) <= sys.float_info.max  # no nan is
+    return abs(value) <= _LARGEST  # no nan is
+
+
+def _is_whole(value: object) -> bool:
+    """Tells whether a value is a whole number that NumPy holds; truth values are none."""
+    return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
 
 
 def read_config(run: Path) -> TrainConfig:
