@@ -170,7 +170,7 @@ def _write_run(run: Path) -> None:
     run.mkdir()
     config = to_dict(load_train(["stage=s1", "budget=1e6"]))
     (run / "config.json").write_text(json.dumps(config))
-    lists = dict.fromkeys(("mix", "weights", *rows.BY_STAGE), [0.5])
+    lists = {key: [0.5] for key in ("mix", "weights", *rows.BY_STAGE)}
     row = {"update": 1, "seed": 0, "arena_steps": 4096, "train_s": 1.0, "return": 0.1, **lists}
     (run / "metrics.jsonl").write_text(json.dumps(row) + "\n")
     (run / "reproduce.json").write_text(json.dumps({"settings": to_dict(ReproduceConfig())}))

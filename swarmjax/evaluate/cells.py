@@ -29,6 +29,7 @@ from swarmjax.task.stage_config import StageConfig
 FORMAT = 1
 _TARGET_RADIUS = TaskConfig().target_radius
 MAX_BYTES = 2**30  # of all levels of a file; those of a thousand of s6 take 0.2 MB
+_LEAST_ROOM = 2**22  # bytes that any file may unpack to, and some times its own
 _PACKED = 20  # numbers drawn at random are packed to half their size, never to a thousandth
 
 
@@ -247,8 +248,9 @@ def _unpack(content: bytes) -> dict[str, np.ndarray]:
     try:
         with policy.open_archive(io.BytesIO(content)) as archive:
             members = archive.infolist()
-            if sum(each.file_size for each in members) > min(MAX_BYTES, _room(len(content))):
-                raise ValueError(f"it unpacks to more than {_PACKED} times its size")
+            most = min(MAX_BYTES, _LEAST_ROOM + _PACKED * len(content))
+            if sum(each.file_size for each in members) > most:
+                raise ValueError(f"it unpacks to more than {most} bytes")
             if len({each.filename for each in members}) < len(members):
                 raise ValueError("a member is there twice")
             return {
@@ -258,11 +260,6 @@ def _unpack(content: bytes) -> dict[str, np.ndarray]:
     except Exception as error:  # whatever a damaged file makes zipfile and NumPy raise
         reason = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
         raise ConfigError(f"it cannot be read: {reason}.") from None
-
-
-def _room(size: int) -> int:
-    """How many bytes a file of so many may unpack to: a few megabytes, or in proportion."""
-    return 2**22 + _PACKED * size
 
 
 def _parse(arrays: dict[str, np.ndarray]) -> Suite:
