@@ -87,7 +87,7 @@ def main(arguments: Sequence[str]) -> int:
             "are chosen into the suite's file."
         )
     if settings.out is not None and Path(settings.out).suffix != ".npz":
-        raise ConfigError(f"out is {settings.out}: give a file .npz.")
+        raise ConfigError(f"out is {reading.called(settings.out)}: give a file .npz.")
     suite = _renew(settings) if settings.write else cells.draw(settings.suite)
     if settings.out is not None:
         cells.write(Path(settings.out), suite)

@@ -316,8 +316,8 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
         if key not in _RESUME_KEYS and not key.startswith("run."):
             allowed = ", ".join(_RESUME_KEYS)
             raise ConfigError(
-                f"{word} cannot be given: resume keeps the rest of the stored run and takes "
-                f"{allowed} only."
+                f"{section.show(word, quote='')} cannot be given: resume keeps the rest of "
+                f"the stored run and takes {allowed} only."
             )
     given = files.values(words)
     kept = to_dict(from_stored(stored, "stored "))

@@ -497,6 +497,10 @@ def test_a_run_from_before_the_choice_of_gradient_goes_on():
     assert load_resume(stored, []).algo.update_backend == "auto"
 
 
+def test_a_long_word_is_shortened_where_resume_refuses_it():
+    assert len(refusal(load_resume, to_dict(load_train([])), ["seed=" + "9" * 4000])) < 300
+
+
 @pytest.mark.parametrize("word", ["arenas=256", "stage=s3", "algo.clip_epsilon=0.1", "run=3"])
 def test_resume_refuses_other_keys(word):
     stored = to_dict(load_train([]))
