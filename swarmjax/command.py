@@ -5,7 +5,7 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 
-from swarmjax.config import ConfigError, files, section
+from swarmjax.config import ConfigError, files, reading, section
 from swarmjax.config.section import Section
 from swarmjax.policy import PolicyError
 
@@ -100,6 +100,13 @@ def run(
         return INTERRUPTED
     except (ConfigError, PolicyError, *also) as error:
         sys.stderr.write(f"{module}: error: {error}\n")
+        return USER_ERROR
+    except OSError as error:
+        if error.filename is None:
+            raise
+        # Of a file that became unreadable, or cannot be made, where no command foresaw it.
+        name, reason = reading.called(str(error.filename)), error.strerror
+        sys.stderr.write(f"{module}: error: {name} cannot be used: {reason}.\n")
         return USER_ERROR
 
 

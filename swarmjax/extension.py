@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-from swarmjax.config import ConfigError, show
+from swarmjax.config import ConfigError, reading, show
 from swarmjax.config.section import ByName
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
@@ -230,12 +230,10 @@ def load(source: str | None) -> Extensions:
         return _handed[source]
     path = Path(source)
     try:
-        content = path.read_bytes()
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ConfigError(
-            f"extensions is {show(source)}, which cannot be read: {reason}."
-        ) from None
+        content = reading.read_bytes(path)
+    except ConfigError as error:
+        _, _, reason = str(error).partition(" cannot be read: ")
+        raise ConfigError(f"extensions is {show(source)}, which cannot be read: {reason}") from None
     key = (str(path.resolve()), hashlib.sha256(content).hexdigest())
     if key not in _files:
         _files[key] = collect(_pieces(vars(_import(path, content, key[1]))), source)

@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import math
 import zipfile
+from contextlib import nullcontext
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -10,6 +12,9 @@ import numpy as np
 
 FORMAT = 2
 MAX_BYTES = 2**30  # of all arrays; those of two layers of 64 take 20 kB
+_MAX_LIST = 2**16  # bytes of the list of members, of which a name takes a hundred
+MAX_LETTERS = 2**20  # of `meta`, each four bytes
+MAX_ENTRIES = 2**16  # of `meta`, of which each may take a hundred bytes and more
 _ACTIVATIONS = {
     "tanh": np.tanh,
     "relu": lambda x: np.maximum(x, 0),
@@ -40,12 +45,14 @@ class Policy(NamedTuple):
 def load(path: str | Path | IO[bytes]) -> Policy:
     """Returns the policy in a file (path, or open in binary); PolicyError if it is none."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            if sum(member.file_size for member in archive.infolist()) > MAX_BYTES:
-                raise ValueError(f"it unpacks to more than {MAX_BYTES} bytes")
-            members = {name.removesuffix(".npy"): archive.open(name) for name in archive.namelist()}
-            arrays = {name: np.lib.format.read_array(file) for name, file in members.items()}
-        found, meta = str(arrays.pop("digest")), json.loads(str(arrays["meta"]))
+        if isinstance(path, str | Path) and Path(path).exists() and not Path(path).is_file():
+            raise ValueError("it is no plain file")  # a pipe would be waited for
+        with open(path, "rb") if isinstance(path, str | Path) else nullcontext(path) as file:
+            arrays = _read(file)
+        found, text = _text(arrays.pop("digest")), _text(arrays["meta"])
+        if sum(map(text.count, "[{,:")) > MAX_ENTRIES:
+            raise ValueError(f"meta has more than {MAX_ENTRIES} entries")
+        meta = json.loads(text)
         if meta["format"] != FORMAT:
             raise ValueError(f"meta.format is {meta['format']}, and {FORMAT} is what is read")
         if found != digest(arrays):
@@ -57,14 +64,57 @@ def load(path: str | Path | IO[bytes]) -> Policy:
         return Policy(*[layers, *rest, *meta["action"]["high"], meta, found])
     except Exception as error:  # whatever a damaged file makes zipfile, NumPy and json raise
         reason = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
-        raise PolicyError(f"{path} cannot be read as a policy: {reason}.") from None
+        raise PolicyError(f"{path} cannot be read as a policy: {reason[:200]}.") from None
+
+
+def open_archive(file: IO[bytes]) -> zipfile.ZipFile:
+    """Opens an archive after a look at its end, which says how much zipfile would read of it."""
+    file.seek(max(0, file.seek(0, 2) - 42))
+    end = file.read()
+    if end[-22:-18] != b"PK\5\6":
+        raise zipfile.BadZipFile("File is not a zip file")
+    if end[:4] == b"PK\6\7" or int.from_bytes(end[-10:-6], "little") > _MAX_LIST:
+        raise ValueError(f"its list of members has more than {_MAX_LIST} bytes")
+    return zipfile.ZipFile(file)
+
+
+def _read(file: IO[bytes]) -> dict[str, np.ndarray]:
+    """Reads the arrays of an archive; nothing is unpacked that takes more room than the file."""
+    with open_archive(file) as archive:
+        members, size = archive.infolist(), file.seek(0, 2)
+        if size > MAX_BYTES or sum(member.file_size for member in members) > size:
+            raise ValueError(f"it unpacks to more than the file, or {MAX_BYTES} bytes")
+        plain = {x.filename for x in members if not (x.compress_type or x.flag_bits & 1)}
+        if len(plain) < len(members):
+            raise ValueError("a member is compressed, encrypted or there twice")
+        return {x.filename.removesuffix(".npy"): read_array(archive, x) for x in members}
+
+
+def read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """Reads a member whose header says neither more nor less than there is."""
+    with archive.open(member) as file:
+        if np.lib.format.read_magic(file) != (1, 0):
+            raise ValueError(f"{member.filename!r} is not of npy version 1.0")
+        shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
+        size = file.tell() + math.prod(shape) * dtype.itemsize
+        if dtype.hasobject or is_fortran or size != member.file_size:
+            raise ValueError(f"{member.filename!r} is not the array that its header tells of")
+        return np.frombuffer(file.read(), dtype).reshape(shape)
+
+
+def _text(array: np.ndarray) -> str:
+    if array.dtype.kind == "U" and not array.shape and array.itemsize <= 4 * MAX_LETTERS:
+        return array.item()
+    raise ValueError(f"meta or digest is no text of {MAX_LETTERS} letters at most")
 
 
 def digest(arrays: dict[str, np.ndarray]) -> str:
     """Returns the SHA-256 over the names, types, shapes and bytes of arrays, names sorted."""
-    heads = {name: f"{name} {x.dtype.str} {list(x.shape)}\n".encode() for name, x in arrays.items()}
-    rows = (heads[name] + arrays[name].tobytes() for name in sorted(arrays))
-    return hashlib.sha256(b"".join(rows)).hexdigest()
+    found = hashlib.sha256()
+    for name, x in sorted(arrays.items()):
+        found.update(f"{name} {x.dtype.str} {list(x.shape)}\n".encode())
+        found.update(np.ascontiguousarray(x).reshape(-1).view(np.uint8))  # without a copy
+    return found.hexdigest()
 
 
 def act(policy: Policy, observation: np.ndarray, normal: Any = 0.0) -> np.ndarray:

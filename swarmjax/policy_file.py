@@ -18,7 +18,9 @@ import numpy as np
 
 from swarmjax import extension, policy
 from swarmjax.atomic_file import replacing
-from swarmjax.policy import FORMAT, MAX_BYTES, Policy, PolicyError
+from swarmjax.config import ConfigError
+from swarmjax.config.reading import parse_json
+from swarmjax.policy import FORMAT, MAX_BYTES, MAX_ENTRIES, MAX_LETTERS, Policy, PolicyError
 from swarmjax.policy_network import PolicyNetwork
 
 ACTION_NAMES = ("speed", "turn_rate")
@@ -189,6 +191,7 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     if learners < 1 or (meta["policy"] == "shared" and learners != 1):
         expected = "1 for a shared policy" if meta["policy"] == "shared" else "1 or more"
         raise PolicyError(f"meta.learners is {_show(learners)}: expected {expected}.")
+    _check_optional(meta)
     size = _check_observation(meta["observation"])
     _check_action(meta["action"])
     _check_embodiment(meta)
@@ -242,7 +245,7 @@ def _unpack(content: bytes) -> dict[str, bytes]:
     """Returns the members of an archive by their arrays' names."""
     found: set[str] = set()
     try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        with policy.open_archive(io.BytesIO(content)) as archive:
             members = archive.infolist()
             for member in members:
                 _check_member(member, found)
@@ -303,16 +306,20 @@ def _text(members: Mapping[str, np.ndarray], name: str) -> str:
     if array.shape != () or not array.dtype.str.startswith("<U"):
         raise PolicyError(f"{name} is {array.dtype} {list(array.shape)}: expected one text.")
     try:
-        return array.tobytes().decode("utf-32-le").rstrip("\0")
+        return str(array.reshape(-1).view(np.uint8).data, "utf-32-le").rstrip("\0")
     except UnicodeDecodeError:
         raise PolicyError(f"{name} cannot be read: expected text in Unicode.") from None
 
 
 def _parse_meta(text: str) -> dict[str, Any]:
+    if len(text) > MAX_LETTERS or sum(map(text.count, "[{,:")) > MAX_ENTRIES:
+        raise PolicyError(
+            f"meta cannot be read: expected at most {MAX_LETTERS} letters, {MAX_ENTRIES} entries."
+        )
     try:
-        meta = json.loads(text)
-    except (ValueError, RecursionError):
-        raise PolicyError("meta cannot be read: expected one text of JSON.") from None
+        meta = parse_json(text, "meta")
+    except ConfigError as error:
+        raise PolicyError(str(error)) from None
     if not isinstance(meta, dict):
         raise PolicyError(f"meta is {_show(meta)}: expected a JSON object.")
     return meta
@@ -327,6 +334,26 @@ def _entry(mapping: Mapping[str, Any], key: str, kind: type, where: str = "meta"
     value = mapping[key]
     if not isinstance(value, kind) or isinstance(value, bool):
         raise PolicyError(f"{where}.{key} is {_show(value)}: expected {_KINDS[kind]}.")
+
+
+def _check_optional(meta: Mapping[str, Any]) -> None:
+    """Checks the keys that files of older versions lack."""
+    for key in ("realism", "extensions"):
+        if key in meta:
+            _entry(meta, key, dict)
+    for name, pieces in meta.get("extensions", {}).items():
+        if not _are_texts(pieces):
+            raise PolicyError(
+                f"meta.extensions.{_show(name)} is {_show(pieces)}: expected digests."
+            )
+    stages = meta.get("stages", [])
+    if not isinstance(stages, list | tuple) or not all(isinstance(x, dict) for x in stages):
+        raise PolicyError(f"meta.stages is {_show(stages)}: expected a list of objects.")
+
+
+def _are_texts(pieces: object) -> bool:
+    """Tells whether these are texts by name."""
+    return isinstance(pieces, dict) and all(isinstance(each, str) for each in pieces.values())
 
 
 def _choice(

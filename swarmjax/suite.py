@@ -23,11 +23,11 @@ from rich.table import Table
 
 from swarmjax import command
 from swarmjax.atomic_file import replacing
-from swarmjax.config import ConfigError, about, files
-from swarmjax.config.section import MAX_COUNT, Section
+from swarmjax.config import ConfigError, about, files, reading
+from swarmjax.config.section import Section
 from swarmjax.evaluate import cells, trials
 from swarmjax.evaluate.cells import Cell, Suite
-from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.evaluate.config import MOST_STEPS, EvaluateConfig
 from swarmjax.evaluate.evaluation import list_files
 from swarmjax.evaluate.suite_config import CellConfig, read_suite
 from swarmjax.evaluate.table import PLAIN_WIDTH
@@ -53,7 +53,7 @@ class SuiteConfig(Section):
         metadata=about("choose the levels that these fail most: a.npz,b.npz or a pattern"),
     )
     pool: int = field(default=20_000, metadata=about("levels drawn to choose from", 1, 1_000_000))
-    steps: int = field(default=1500, metadata=about("control steps of an episode", 1, MAX_COUNT))
+    steps: int = field(default=1500, metadata=about("control steps of an episode", 1, MOST_STEPS))
     workers: int | None = field(
         default=None, metadata=about("processes; null: one a core", 1, 1024)
     )
@@ -87,7 +87,7 @@ def main(arguments: Sequence[str]) -> int:
             "are chosen into the suite's file."
         )
     if settings.out is not None and Path(settings.out).suffix != ".npz":
-        raise ConfigError(f"out is {settings.out}: give a file .npz.")
+        raise ConfigError(f"out is {reading.called(settings.out)}: give a file .npz.")
     suite = _renew(settings) if settings.write else cells.draw(settings.suite)
     if settings.out is not None:
         cells.write(Path(settings.out), suite)
@@ -150,7 +150,7 @@ def _search(settings: SuiteConfig, cell: CellConfig, entrants: Sequence[Entrant]
 
 def _comment(path: Path) -> str:
     """The lines of comment that a file begins with."""
-    lines = path.read_text().splitlines(keepends=True)
+    lines = reading.read_text(path).splitlines(keepends=True)
     end = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
     return "".join(lines[:end])
 

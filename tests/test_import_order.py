@@ -38,7 +38,7 @@ ALONE: dict[str, set[str]] = {
     "atomic_file": set(),
     "provenance": {"words"},
     "words": set(),
-    "policy_file": {"policy", "policy_network", "extension", "atomic_file"},
+    "policy_file": {"config", "policy", "policy_network", "extension", "atomic_file"},
     "policy_network": {"extension"},
     "command": {"config", "policy"},
 }

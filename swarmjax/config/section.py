@@ -7,6 +7,7 @@ is not known here.
 
 import dataclasses
 import difflib
+import itertools
 import math
 import types
 import typing
@@ -15,6 +16,12 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 MAX_COUNT = 2**31 - 1  # counts and seeds are int32 on the device
+# All else is computed in float32: nothing lies beyond, and nearer to 0 a device computes with 0.
+_LARGEST, _SMALLEST = 3.4e38, 1.2e-38
+_MOST_NAME = 255  # bytes of the name of a file, by Linux, macOS and Windows
+_MOST_PATH = 4095  # bytes of a path on Linux, which has most
+_MOST_BITS = 13_000  # of a number that is written; Python refuses to write more than 4300 digits
+_SHOWN = 80  # letters that a sentence has of a value
 
 
 class ConfigError(ValueError):
@@ -32,8 +39,9 @@ class Bounds:
     reason: str = ""  # why no more is taken than `high`, and what to do about it
 
     def hold(self, value: float) -> bool:
-        """Tell whether a number lies within."""
-        return self.low <= value <= self.high and self.above < value < self.below
+        """Tell whether a number lies within, and float32 can hold it."""
+        inside = self.low <= value <= self.high and self.above < value < self.below
+        return inside and _fits(value)
 
     def refuse(self, key: str, value: object, number: float) -> ConfigError:
         """Say what to give instead of a number.
@@ -44,6 +52,8 @@ class Bounds:
             number: that of it which does not hold.
         """
         why = f"; {self.reason}" if self.reason and number > self.high else ""
+        if number != 0 and self.low <= number <= self.high and not _fits(number):
+            why = f"; float32 holds 0 and sizes of {_SMALLEST:g} to {_LARGEST:g}"
         return ConfigError(f"{key} is {show(value)}: give {self}{why}.")
 
     def __str__(self) -> str:
@@ -127,10 +137,15 @@ class ByName(dict[str, Any]):
         return hash(frozenset(self.items()))
 
 
+def _fits(number: float) -> bool:
+    """Tell whether a number is 0 or of a size that float32 holds."""
+    return number == 0 or _SMALLEST <= abs(number) <= _LARGEST
+
+
 def _leaves(value: object) -> Iterator[object]:
-    """Yield a value, or what stands in nested tuples."""
-    if isinstance(value, tuple):
-        for item in value:
+    """Yield a value, or what stands in nested tuples and by name."""
+    if isinstance(value, tuple | ByName):
+        for item in value.values() if isinstance(value, ByName) else value:
             yield from _leaves(item)
     else:
         yield value
@@ -394,6 +409,8 @@ def convert(hint: object, value: object, key: str) -> object:
         return build(section, mapping, key if key.endswith(": ") else f"{key}.")
     if hint is None and value is not None:
         raise ConfigError(f"{key} is {show(value)}, but is not built yet: leave it out.")
+    if isinstance(value, str) and str in options(hint):
+        check_text(key, value)
     for option in options(hint):
         try:
             return _scalar(option, value)
@@ -418,6 +435,8 @@ def _by_name(hint: object, value: object, key: str) -> "ByName":
     """Convert values of one type, by names that the section does not know."""
     if not isinstance(value, Mapping):
         raise ConfigError(f"{key} is {show(value)}: give values by name, as in {key}.NAME=1.")
+    for name in value:
+        check_text(key, str(name))
     return ByName({str(name): convert(hint, each, f"{key}.{name}") for name, each in value.items()})
 
 
@@ -443,6 +462,32 @@ def _scalar(hint: object, value: object) -> object:
     elif isinstance(hint, type) and isinstance(value, hint) and value != "":
         return value
     raise TypeError
+
+
+def check_text(key: str, text: str) -> None:
+    """Refuse text that no path or name can be, before anything is done with it.
+
+    Args:
+        key: what a sentence calls it.
+        text: a path, a name, or several with commas between them.
+
+    Raises:
+        ConfigError: it has a control character, is no Unicode, or names what no file can be called.
+    """
+    if any(ord(letter) < 32 or 127 <= ord(letter) < 160 for letter in text):
+        raise ConfigError(f"{key} is {show(text)}: give text without control characters.")
+    try:
+        content = text.encode()
+    except UnicodeEncodeError:
+        raise ConfigError(f"{key} is {show(text)}: give text in UTF-8.") from None
+    for path in content.split(b","):
+        for parts, most in (([path], _MOST_PATH), (path.split(b"/"), _MOST_NAME)):
+            longest = max(map(len, parts))
+            if longest > most:
+                what = "path" if parts == [path] and most == _MOST_PATH else "name"
+                raise ConfigError(
+                    f"{key} is {show(text)}, with a {what} of {longest} bytes: give at most {most}."
+                )
 
 
 def _number(kind: type[int] | type[float], value: object) -> int | float:
@@ -495,12 +540,18 @@ def show(value: object, quote: str = "'") -> str:
         quote: what stands around text.
     """
     if isinstance(value, str):
+        value = value[:_SHOWN]
         text = value.encode("unicode_escape").decode("ascii") if not value.isprintable() else value
         text = f"{quote}{text}{quote}"
     elif value is None or isinstance(value, bool):
         text = {None: "null", True: "true", False: "false"}[value]
     elif isinstance(value, list | tuple):
-        text = f"[{','.join(show(item, quote) for item in value)}]"
+        text = f"[{','.join(show(item, quote) for item in value[:_SHOWN])}]"
+    elif isinstance(value, Mapping):
+        items = itertools.islice(value.items(), _SHOWN)
+        text = ", ".join(f"{show(key)}: {show(item)}" for key, item in items).join("{}")
+    elif isinstance(value, int) and value.bit_length() > _MOST_BITS:
+        text = f"a number of {round(value.bit_length() * math.log10(2))} digits"
     else:
         text = f"{value:.10g}" if isinstance(value, float) else str(value)
-    return text if len(text) <= 80 else f"{text[:77]}..."
+    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."

@@ -6,7 +6,6 @@ that they are the same to the last bit. Levels of a suite are drawn for the nomi
 
 import io
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +14,7 @@ import numpy as np
 
 from swarmjax import epuck, extension, policy
 from swarmjax.atomic_file import replacing
-from swarmjax.config import ConfigError, build, show, to_dict
+from swarmjax.config import ConfigError, build, reading, section, show, to_dict
 from swarmjax.evaluate import judge
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.suite_config import CellConfig, read_suite
@@ -30,6 +29,8 @@ from swarmjax.task.stage_config import StageConfig
 FORMAT = 1
 _TARGET_RADIUS = TaskConfig().target_radius
 MAX_BYTES = 2**30  # of all levels of a file; those of a thousand of s6 take 0.2 MB
+_LEAST_ROOM = 2**22  # bytes that any file may unpack to, and some times its own
+_PACKED = 20  # numbers drawn at random are packed to half their size, never to a thousandth
 
 
 class Cell(NamedTuple):
@@ -231,13 +232,11 @@ def read(path: Path) -> Suite:
     Raises:
         ConfigError: If anything about it is unsound.
     """
+    section.check_text("suite", str(path))
     try:
-        size = path.stat().st_size
-        if size > MAX_BYTES:
-            raise ConfigError(f"suite {path} is {size} bytes: {MAX_BYTES} are read at most.")
-        content = path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"suite {path} cannot be read: {error.strerror or error}.") from None
+        content = reading.read_bytes(path, MAX_BYTES)
+    except ConfigError as error:
+        raise ConfigError(f"suite {error}") from None
     try:
         return _parse(_unpack(content))
     except ConfigError as error:
@@ -247,12 +246,17 @@ def read(path: Path) -> Suite:
 def _unpack(content: bytes) -> dict[str, np.ndarray]:
     """Reads the arrays of an archive, none of them pickled, and none larger than it may be."""
     try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            size = sum(member.file_size for member in archive.infolist())
-        if size > MAX_BYTES:
-            raise ValueError(f"it unpacks to more than {MAX_BYTES} bytes")
-        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            return dict(arrays)
+        with policy.open_archive(io.BytesIO(content)) as archive:
+            members = archive.infolist()
+            most = min(MAX_BYTES, _LEAST_ROOM + _PACKED * len(content))
+            if sum(each.file_size for each in members) > most:
+                raise ValueError(f"it unpacks to more than {most} bytes")
+            if len({each.filename for each in members}) < len(members):
+                raise ValueError("a member is there twice")
+            return {
+                each.filename.removesuffix(".npy"): policy.read_array(archive, each)
+                for each in members
+            }
     except Exception as error:  # whatever a damaged file makes zipfile and NumPy raise
         reason = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
         raise ConfigError(f"it cannot be read: {reason}.") from None
@@ -269,8 +273,8 @@ def _parse(arrays: dict[str, np.ndarray]) -> Suite:
 def _parse_meta(array: np.ndarray | None) -> dict[str, Any]:
     """Reads what the file says of itself."""
     try:
-        meta = json.loads(str(array))
-    except (ValueError, RecursionError):
+        meta = reading.parse_json(str(array), "meta")
+    except ConfigError:
         raise ConfigError("meta is missing or no JSON: it is no suite of this project.") from None
     if not isinstance(meta, dict) or meta.get("format") != FORMAT:
         raise ConfigError(f"meta.format is not {FORMAT}: it is no suite that this version reads.")

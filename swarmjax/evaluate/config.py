@@ -12,6 +12,8 @@ from swarmjax.task.config import TaskConfig, check_realism
 from swarmjax.task.shapes import Shape
 from swarmjax.task.stage_config import StageConfig
 
+MOST_STEPS = 1_000_000  # control steps of an episode; nine hours
+MOST_EPISODES = 1_000_000  # whose levels fill some gigabytes
 # What `witness.load` takes from the policies.
 AS_TRAINED = {
     "stage": "its last stage",
@@ -56,9 +58,9 @@ class EvaluateConfig(Section):
         default="c", metadata=about("c: MuJoCo's C engine; mjx: the one that trains")
     )
     steps: int = field(
-        default=1500, metadata=about("control steps of an episode; Table 1", 1, MAX_COUNT)
+        default=1500, metadata=about("control steps of an episode; Table 1", 1, MOST_STEPS)
     )
-    episodes: int = field(default=1000, metadata=about("episodes", 1, MAX_COUNT))
+    episodes: int = field(default=1000, metadata=about("episodes", 1, MOST_EPISODES))
     seed: int = field(default=1, metadata=about("random seed of the levels", 0, MAX_COUNT))
     workers: int | None = field(
         default=None, metadata=about("processes; null: one a core", 1, 1024)

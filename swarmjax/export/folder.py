@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from swarmjax.atomic_file import replacing
-from swarmjax.config import ConfigError
+from swarmjax.config import ConfigError, reading
 
 MANIFEST = "export.json"
 BUILT = ("__pycache__", "build")  # folders that using an export makes, and using it again would
@@ -95,8 +95,8 @@ def check_folder(path: Path) -> None:
 def _strange(path: Path) -> str | None:
     """Names something in a folder that its manifest does not vouch for."""
     try:
-        listed = json.loads((path / MANIFEST).read_bytes())
-    except (OSError, ValueError):
+        listed = reading.read_json(path / MANIFEST)
+    except ConfigError:
         listed = None
     if not isinstance(listed, dict):
         return min(found.name for found in path.iterdir())

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.config.section import MAX_COUNT
-from swarmjax.evaluate.config import AS_TRAINED, EvaluateConfig
+from swarmjax.evaluate.config import AS_TRAINED, MOST_EPISODES, MOST_STEPS, EvaluateConfig
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig, check_realism
@@ -52,9 +52,9 @@ class ReplayConfig(Section):
         default=None,
         metadata=about("replay this many of the episodes, those that went worst", 1, 100),
     )
-    steps: int = field(default=1500, metadata=about("control steps of an episode", 1, MAX_COUNT))
+    steps: int = field(default=1500, metadata=about("control steps of an episode", 1, MOST_STEPS))
     episodes: int = field(
-        default=1000, metadata=about("how many levels there are to choose from", 1, MAX_COUNT)
+        default=1000, metadata=about("how many levels there are to choose from", 1, MOST_EPISODES)
     )
     seed: int = field(default=1, metadata=about("random seed of the levels", 0, MAX_COUNT))
     workers: int | None = field(
@@ -119,6 +119,12 @@ class ReplayConfig(Section):
         return (0,) if self.level is None else tuple(int(each) for each in self.level.split(","))
 
     @property
+    def _drawn(self) -> int:
+        """How many levels of a stage are drawn: of those that are named no more than needed."""
+        is_named = self.worst is None and self.suite is None
+        return max(self.levels) + 1 if is_named else self.episodes
+
+    @property
     def evaluation(self) -> EvaluateConfig:
         """The evaluation that the episodes are part of."""
         return EvaluateConfig(
@@ -131,8 +137,7 @@ class ReplayConfig(Section):
             shape=self.shape,
             action=self.action,
             steps=self.steps,
-            # Of levels that are named no more are drawn than needed.
-            episodes=max(self.levels) + 1 if self.worst is None else self.episodes,
+            episodes=self._drawn,
             seed=self.seed,
             workers=self.workers,
             substeps=self.substeps,

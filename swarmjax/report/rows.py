@@ -6,9 +6,7 @@ A last line without its newline is being written, or was as the run was killed: 
 that a run can be read at any time. Any other damage is refused, by its file, line and key.
 """
 
-import json
 import math
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax.config import ConfigError
+from swarmjax.config import ConfigError, reading
 from swarmjax.evaluate.statistics import iqm
 from swarmjax.run import recorder
 from swarmjax.run.settings import TrainConfig, from_stored
@@ -37,6 +35,7 @@ _LISTS = ("mix", "weights", *BY_STAGE)
 CURVES = ("return", "contacts_per_robot", "policy_loss", "value_loss", "entropy")
 MANY = 9  # stages from which on each is drawn small
 SUMMARY = "summary.json"
+_LARGEST = float(np.finfo(np.float32).max)
 _NUMBERS = ("seed", "update", "arena_steps")
 # A verdict takes one cohort in which its episodes begin, and one in which the last of them end.
 _COHORTS_OF_A_VERDICT = 2
@@ -219,7 +218,7 @@ def check_whole(row: Row, keys: Sequence[str], where: str) -> None:
       ConfigError: if one is missing or of another type.
     """
     for key in keys:
-        if not isinstance(row.get(key), int) or isinstance(row[key], bool):
+        if not _is_whole(row.get(key)):
             raise ConfigError(f"{where} has no whole number as {key}: it is damaged.")
 
 
@@ -260,10 +259,15 @@ def per_stage(found: object, stages: int, what: str) -> np.ndarray:
 
 
 def _is_number_or_null(value: object) -> bool:
-    """Tells whether a value is None or fits a float; text and truth values are no numbers."""
+    """Tells whether a value is None or fits a float32; text and truth values are no numbers."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return value is None
-    return abs(value) <= sys.float_info.max  # no nan is
+    return abs(value) <= _LARGEST  # no nan is
+
+
+def _is_whole(value: object) -> bool:
+    """Tells whether a value is a whole number that NumPy holds; truth values are none."""
+    return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
 
 
 def read_config(run: Path) -> TrainConfig:
@@ -288,10 +292,7 @@ def read_object(path: Path) -> Row:
     Raises:
       ConfigError: if it cannot be read, or holds something else.
     """
-    try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path} cannot be read: {error}.") from None
+    found = reading.read_json(path)
     if not isinstance(found, dict):
         raise ConfigError(f"{path} holds no keys and values: it is damaged.")
     return found
@@ -327,22 +328,18 @@ def read_lines(run: Path, name: str) -> Iterator[tuple[str, Row]]:
     path = run / name
     if not path.exists():
         raise ConfigError(f"{run} has no {name}: it holds no training yet.")
-    try:
-        with path.open() as file:
-            for number, line in enumerate(file, 1):
-                if not line.endswith("\n"):
-                    return
-                where = f"{path} in line {number}"
-                yield where, _object(line, where)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} cannot be read: {error}.") from None
+    for number, line in enumerate(reading.read_lines(path), 1):
+        if not line.endswith(b"\n"):
+            return
+        where = f"{path} in line {number}"
+        yield where, _object(line, where)
 
 
-def _object(line: str, where: str) -> Row:
+def _object(line: bytes, where: str) -> Row:
     """Reads one line."""
     try:
-        found = json.loads(line)
-    except ValueError:
+        found = reading.parse_json(line.decode(), where)
+    except (ConfigError, UnicodeDecodeError):
         found = None
     if not isinstance(found, dict):
         raise ConfigError(f"{where} is damaged: go on with the run, or take it out.")

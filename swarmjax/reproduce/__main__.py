@@ -18,7 +18,8 @@ from rich.progress import Progress
 
 from swarmjax import command, provenance
 from swarmjax.atomic_file import replacing
-from swarmjax.config import ConfigError, to_dict
+from swarmjax.config import ConfigError, section, to_dict
+from swarmjax.report import rows as report_rows
 from swarmjax.reproduce import arms, judge
 from swarmjax.reproduce import page as reproduce_page
 from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
@@ -86,14 +87,13 @@ def _settings(arguments: Sequence[str]) -> tuple[ReproduceConfig, Path]:
 def _read(out: Path) -> dict:
     """Reads the settings of a reproduction that is gone on with."""
     path = out / FACTS
-    try:
-        return json.loads(path.read_text())["settings"]
-    except FileNotFoundError:
-        raise ConfigError(
-            f"resume is {out}, which is no reproduction: it has no {FACTS}."
-        ) from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ConfigError(f"{path} cannot be read: {error}.") from None
+    section.check_text("resume", str(out))
+    if not path.exists():
+        raise ConfigError(f"resume is {out}, which is no reproduction: it has no {FACTS}.")
+    settings = report_rows.read_object(path).get("settings")
+    if not isinstance(settings, dict):
+        raise ConfigError(f"{path} has no keys and values as settings: it is damaged.")
+    return settings
 
 
 def _choose_device(device: str) -> None:

@@ -3,12 +3,12 @@
 Each has a run directory of its own in that of the reproduction, and goes on where it stopped.
 """
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from swarmjax.config import ConfigError
+from swarmjax.report import rows as report_rows
 from swarmjax.reproduce.config import ARMS, Arm, ReproduceConfig
 from swarmjax.run import checkpoint, compile_cache, lifecycle, memory
 from swarmjax.run.checkpoint import CheckpointError
@@ -122,7 +122,7 @@ def summaries(out: Path) -> dict[Arm, dict[str, Any]]:
     for arm in ARMS:
         path = out / arm / "summary.json"
         if path.exists():
-            summary = json.loads(path.read_text())
-            if summary["budget_spent"]:
+            summary = report_rows.read_object(path)
+            if summary.get("budget_spent"):
                 found[arm] = summary
     return found

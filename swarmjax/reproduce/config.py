@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
-from swarmjax.config import ConfigError, Section, about, build, files, to_dict
+from swarmjax.config import ConfigError, Section, about, build, files, show, to_dict
 from swarmjax.config.section import MAX_COUNT, modernise
 
 _REPRODUCE_RESUME_KEYS = ("resume", "minutes", "device", "arms", "episodes", "workers")
@@ -134,8 +134,8 @@ def load_reproduce(
     for key, word in words.items():
         if key not in _REPRODUCE_RESUME_KEYS:
             raise ConfigError(
-                f"{word} cannot be given: resume keeps the rest of the stored reproduction and "
-                f"takes {', '.join(_REPRODUCE_RESUME_KEYS)} only."
+                f"{show(word, quote='')} cannot be given: resume keeps the rest of "
+                f"the stored reproduction and takes {', '.join(_REPRODUCE_RESUME_KEYS)} only."
             )
     kept = to_dict(build(ReproduceConfig, modernise(ReproduceConfig, stored), "stored ")) | {
         "minutes": None

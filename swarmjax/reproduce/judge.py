@@ -4,7 +4,6 @@ Every policy drives by its mean action on the last stage and on the 1.5 m arena,
 differ by the noise of their sensors alone.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from swarmjax import policy_file
-from swarmjax.config import ConfigError, build
+from swarmjax.config import ConfigError, build, reading
 from swarmjax.evaluate import cells, engine_c, trials
 from swarmjax.evaluate import judge as evaluate_judge
 from swarmjax.evaluate.config import EvaluateConfig
@@ -154,6 +153,6 @@ def read(out: Path) -> list[Row]:
     if not path.exists():
         return []
     try:
-        return [*json.loads(path.read_text())["rows"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        return [*reading.read_json(path)["rows"]]
+    except (ConfigError, KeyError, TypeError) as error:
         raise ConfigError(f"{path} cannot be read ({error}): remove it to judge anew.") from None

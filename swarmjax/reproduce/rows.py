@@ -175,7 +175,7 @@ def _check_episode(row: Row, where: str) -> None:
 
 def _is_count(value: Any) -> bool:
     """Tells whether a value is a whole number of 0 or more; truth values are none."""
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
 
 
 def _is_finite(value: Any) -> bool:

@@ -1,13 +1,23 @@
 """The settings of a training run, and what its directory tells of them."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from swarmjax import extension
-from swarmjax.config import ConfigError, Section, about, build, files, inherit, show, to_dict
+from swarmjax.config import (
+    ConfigError,
+    Section,
+    about,
+    build,
+    files,
+    inherit,
+    reading,
+    section,
+    show,
+    to_dict,
+)
 from swarmjax.config.section import MAX_COUNT, modernise
 from swarmjax.ppo.config import AlgoConfig, resolve
 from swarmjax.run.directory import MAY_CHANGE
@@ -205,12 +215,10 @@ def read_config(run: Path) -> dict:
       ConfigError: if there is none, or it is no JSON object.
     """
     path = run / "config.json"
-    try:
-        found = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise ConfigError(f"{run} is no run directory: it has no config.json.") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{path} cannot be read: {error}.") from None
+    section.check_text("the run directory", str(run))
+    if not path.exists():
+        raise ConfigError(f"{run} is no run directory: it has no config.json.")
+    found = reading.read_json(path)
     if not isinstance(found, dict):
         raise ConfigError(f"{path} is no run's config: it holds no JSON object.")
     return found
@@ -322,8 +330,8 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
         if key not in _RESUME_KEYS and not key.startswith("run."):
             allowed = ", ".join(_RESUME_KEYS)
             raise ConfigError(
-                f"{word} cannot be given: resume keeps the rest of the stored run and takes "
-                f"{allowed} only."
+                f"{section.show(word, quote='')} cannot be given: resume keeps the rest of "
+                f"the stored run and takes {allowed} only."
             )
     given = files.values(words)
     kept = to_dict(from_stored(stored, "stored "))

@@ -14,6 +14,15 @@ _HULL_REASON = (
     "larger ones, raise PASSAGE in swarmjax/task/stage_config.py and LARGEST_HULL in "
     "swarmjax/sim/config.py together"
 )
+# What MuJoCo's geometry, float32 and an arena of 0.4 to 4 m can bear; an e-puck drives 0.13 m/s.
+LEAST = 0.001  # m, m/s, rad/s or of friction, of what is divided by
+_FASTEST = 5.0  # m/s
+_SPEED_REASON = "a faster robot crosses the largest arena, of 4 m, in less than a second"
+_FASTEST_TURN = 50.0  # rad/s
+_TURN_REASON = "a robot that turns faster is round more than once in a control step of 0.128 s"
+FASTEST_WHEEL = 1000.0  # rad/s
+MOST_FRICTION = 10.0
+FRICTION_REASON = "rubber on rubber has less than 2"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,33 +46,52 @@ class RobotConfig(Section):
         metadata=about("moment of inertia about the vertical axis, kg m^2", 1e-8, 10.0),
     )
     wheel_radius: float = field(
-        default=epuck.WHEEL_RADIUS, metadata=about("radius of the wheels, m", above=0.0)
+        default=epuck.WHEEL_RADIUS,
+        metadata=about("radius of the wheels, m", LEAST, LARGEST_HULL),
     )
     track: float = field(
         default=epuck.TRACK,
-        metadata=about("distance between the wheels that commands are computed with, m", above=0),
+        metadata=about(
+            "distance between the wheels that commands are computed with, m",
+            LEAST,
+            2 * LARGEST_HULL,
+        ),
     )
     effective_track: float = field(
         default=epuck.TRACK,
-        metadata=about("distance between the points where the wheels grip, m", above=0.0),
+        metadata=about(
+            "distance between the points where the wheels grip, m", LEAST, 2 * LARGEST_HULL
+        ),
     )
     motor_lag: float = field(
         default=0.0,
         metadata=about("time constant of the wheel servos, s; 0: one physics step", 0.0, 1.0),
     )
     max_wheel_speed: float = field(
-        default=epuck.MAX_WHEEL_SPEED, metadata=about("limit of each wheel, rad/s", above=0.0)
+        default=epuck.MAX_WHEEL_SPEED,
+        metadata=about("limit of each wheel, rad/s", LEAST, FASTEST_WHEEL),
     )
     friction: float = field(
-        default=epuck.FRICTION, metadata=about("friction of wheel on floor", above=0.0)
+        default=epuck.FRICTION,
+        metadata=about("friction of wheel on floor", LEAST, MOST_FRICTION, reason=FRICTION_REASON),
     )
     max_speed: float = field(
         default=epuck.MAX_SPEED,
-        metadata=about("upper end of the speed command, m/s; the lower is 0", above=0.0),
+        metadata=about(
+            "upper end of the speed command, m/s; the lower is 0",
+            LEAST,
+            _FASTEST,
+            reason=_SPEED_REASON,
+        ),
     )
     max_turn_rate: float = field(
         default=epuck.MAX_TURN_RATE,
-        metadata=about("both ends of the turn command, rad/s", above=0.0),
+        metadata=about(
+            "both ends of the turn command, rad/s",
+            LEAST,
+            _FASTEST_TURN,
+            reason=_TURN_REASON,
+        ),
     )
 
     def _check(self) -> None:

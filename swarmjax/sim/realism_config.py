@@ -6,8 +6,13 @@ from typing import Literal
 
 from swarmjax import epuck
 from swarmjax.config import ConfigError, Section, about, show
-from swarmjax.config.section import MAX_COUNT
+from swarmjax.sim.config import FASTEST_WHEEL, FRICTION_REASON, LARGEST_HULL, LEAST, MOST_FRICTION
 
+_LONGEST = 3600.0  # s; an episode of training takes 16 s, and no pause in it may be longer
+_MOST_LATENCY = 1000  # control steps; real robots have 1 to 10
+_LATENCY_REASON = (
+    "each control step of latency is a command or an observation that every arena keeps"
+)
 # What is counted has no meaning for sensors that report metres.
 COUNTED = (
     "infrared_noise",
@@ -56,7 +61,9 @@ class RealismConfig(Section):
     infrared_period: tuple[float, float] | None = field(
         default=None,
         metadata=about(
-            "between samples, s; a robot and episode; null: every control step", above=0.0
+            "between samples, s; a robot and episode; null: every control step",
+            above=0.0,
+            high=_LONGEST,
         ),
     )
     reflectance_wall: tuple[float, float] | None = field(
@@ -73,7 +80,7 @@ class RealismConfig(Section):
         metadata=about("probability of never seeing anything; a sensor and episode", 0.0, 1.0),
     )
     wheel_radius: tuple[float, float] | None = field(
-        default=None, metadata=about("m; a robot and episode", above=0.0, below=0.03)
+        default=None, metadata=about("m; a robot and episode", LEAST, below=0.03)
     )
     wheel_mismatch: float | None = field(
         default=None,
@@ -82,17 +89,21 @@ class RealismConfig(Section):
         ),
     )
     track: tuple[float, float] | None = field(
-        default=None, metadata=about("effective track, m; a robot and episode", above=0.0)
+        default=None,
+        metadata=about("effective track, m; a robot and episode", LEAST, 2 * LARGEST_HULL),
     )
     max_wheel_speed: tuple[float, float] | None = field(
-        default=None, metadata=about("rad/s; a robot and episode", above=0.0)
+        default=None, metadata=about("rad/s; a robot and episode", LEAST, FASTEST_WHEEL)
     )
     mass: tuple[float, float] | None = field(
         default=None,
         metadata=about("kg; a robot and episode", above=2 * epuck.WHEEL_MASS, high=100.0),
     )
     friction: tuple[float, float] | None = field(
-        default=None, metadata=about("of wheel on floor; a robot and episode", above=0.0)
+        default=None,
+        metadata=about(
+            "of wheel on floor; a robot and episode", LEAST, MOST_FRICTION, reason=FRICTION_REASON
+        ),
     )
     speed_noise: float | None = field(
         default=None, metadata=about("relative deviation; a wheel and control step", 0.0, 1.0)
@@ -101,20 +112,26 @@ class RealismConfig(Section):
         default=None, metadata=about("wheel speeds that this firmware can make")
     )
     action_latency: tuple[int, int] | None = field(
-        default=None, metadata=about("control steps; a robot and episode", 0, MAX_COUNT)
+        default=None,
+        metadata=about(
+            "control steps; a robot and episode", 0, _MOST_LATENCY, reason=_LATENCY_REASON
+        ),
     )
     stall: float | None = field(
         default=None,
         metadata=about("probability that commands stop coming; a control step", 0.0, 1.0),
     )
     stall_time: tuple[float, float] = field(
-        default=(0.1, 0.3), metadata=about("for how long, s; a stall", above=0.0)
+        default=(0.1, 0.3), metadata=about("for how long, s; a stall", above=0.0, high=_LONGEST)
     )
     observation_latency: tuple[int, int] | None = field(
-        default=None, metadata=about("control steps; a robot and episode", 0, MAX_COUNT)
+        default=None,
+        metadata=about(
+            "control steps; a robot and episode", 0, _MOST_LATENCY, reason=_LATENCY_REASON
+        ),
     )
     target_distance_noise: float | None = field(
-        default=None, metadata=about("deviation, m; a robot and control step", 0.0)
+        default=None, metadata=about("deviation, m; a robot and control step", 0.0, 10.0)
     )
     target_bearing_noise: float | None = field(
         default=None, metadata=about("deviation, rad; a robot and control step", 0.0, math.pi)

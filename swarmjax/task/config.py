@@ -2,13 +2,21 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from swarmjax import epuck
 from swarmjax.config import ConfigError, Section, about, files, show
 from swarmjax.config.section import MAX_COUNT, ByName
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
+
+# Beyond, returns squared, as the value's loss has them, may leave float32.
+_MOST_WEIGHT = 1e6
+
+
+def _weight(meaning: str) -> dict[str, Any]:
+    """Return the metadata of a weight of the reward."""
+    return about(meaning, -_MOST_WEIGHT, _MOST_WEIGHT)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,19 +25,19 @@ class RewardConfig(Section):
 
     renamed: ClassVar[Mapping[str, str]] = {"time": "step_penalty"}
 
-    progress: float = field(default=1.0, metadata=about("per metre nearer to the target"))
+    progress: float = field(default=1.0, metadata=_weight("per metre nearer to the target"))
     proximity: float = field(
-        default=0.0, metadata=about("per control step with something in infrared range")
+        default=0.0, metadata=_weight("per control step with something in infrared range")
     )
-    arrival: float = field(default=0.0, metadata=about("once, on arrival"))
-    contact: float = field(default=-0.2, metadata=about("per contact event, of whatever kind"))
+    arrival: float = field(default=0.0, metadata=_weight("once, on arrival"))
+    contact: float = field(default=-0.2, metadata=_weight("per contact event, of whatever kind"))
     robot_contact: float = field(
-        default=0.0, metadata=about("besides, per contact event with another robot")
+        default=0.0, metadata=_weight("besides, per contact event with another robot")
     )
-    step_penalty: float = field(default=-0.002, metadata=about("per control step until arrival"))
+    step_penalty: float = field(default=-0.002, metadata=_weight("per control step until arrival"))
     extra: dict[str, float] = field(
         default_factory=ByName,
-        metadata=about("weights of the terms of extensions, by their names; 0: off"),
+        metadata=_weight("weights of the terms of extensions, by their names; 0: off"),
     )
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from swarmjax.config import ConfigError, Section, build, files, section, show, to_dict
+from swarmjax.config.reading import called
 from swarmjax.task.stage_config import GridConfig
 
 
@@ -89,8 +90,8 @@ def _check_suite_alone(cls: type[Section], suite: object, overrides: Sequence[st
     for key in files.split_words(cls, overrides):
         if key.partition(".")[0] in ("stage", "shape", "episodes", "seed"):
             raise ConfigError(
-                f"{key} cannot be given with suite={suite}, which says what its levels are: "
-                f"leave {key} or suite out."
+                f"{key} cannot be given with suite={called(str(suite))}, which says what its "
+                f"levels are: leave {key} or suite out."
             )
 
 

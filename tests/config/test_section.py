@@ -163,7 +163,7 @@ def test_a_missing_key_is_named():
 def test_sections_made_by_hand_are_held_to_their_bounds():
     assert refusal(lambda: SimConfig(max_robots=0)) == "max_robots is 0: give 1 to 100."
     assert refusal(lambda: RewardConfig(step_penalty=math.nan)) == (
-        "step_penalty is nan: give any finite number."
+        "step_penalty is nan: give -1000000 to 1000000."
     )
 
 

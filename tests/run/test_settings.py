@@ -177,7 +177,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["run.chunk=0"], "run.chunk is 0: give 1 to 2147483647."),
         (["run.dir="], "run.dir is '': give text or null."),
         (["seed=-1"], "seed is -1: give 0 to 2147483647."),
-        (["robot.max_speed=0"], "robot.max_speed is 0: give more than 0."),
+        (["robot.max_speed=0"], "robot.max_speed is 0: give 0.001 to 5."),
         (["robot.hull_radius=-0.08"], "robot.hull_radius is -0.08: give more than 0, at most "
          "0.045."),
         (["curriculum.budget_share=1"], "curriculum.budget_share is 1: give more than 0, less "
@@ -495,6 +495,10 @@ def test_a_run_from_before_the_choice_of_gradient_goes_on():
     stored = to_dict(load_train([]))
     assert stored["algo"].pop("update_backend") == "auto"
     assert load_resume(stored, []).algo.update_backend == "auto"
+
+
+def test_a_long_word_is_shortened_where_resume_refuses_it():
+    assert len(refusal(load_resume, to_dict(load_train([])), ["seed=" + "9" * 4000])) < 300
 
 
 @pytest.mark.parametrize("word", ["arenas=256", "stage=s3", "algo.clip_epsilon=0.1", "run=3"])

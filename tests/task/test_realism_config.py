@@ -231,8 +231,8 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
          "the wheels lie inside the hull: give less than 0.037."),
         (["realism.track=[0.052,0.08]"], "realism.track is [0.052,0.08], but robot.hull_radius "
          "is 0.037 and the wheels lie inside the hull: give less than 0.074."),
-        (["realism.wheel_radius=[0.02,0.03]"], "realism.wheel_radius is [0.02,0.03]: give more "
-         "than 0, less than 0.03."),
+        (["realism.wheel_radius=[0.02,0.03]"], "realism.wheel_radius is [0.02,0.03]: give "
+         "0.001 or more, less than 0.03."),
         (["robot.hull_radius=0.029", "robot.wheel_radius=0.02",
           "realism.wheel_radius=[0.02,0.0295]"], "realism.wheel_radius is [0.02,0.0295], but "
          "robot.hull_radius is 0.029 and the wheels lie inside the hull: give less than 0.029."),
@@ -241,15 +241,17 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
          "wheeled and its wheels alone have 7.78e-06: give more than 7.78e-06."),
         (["robot.motor_lag=-0.1"], "robot.motor_lag is -0.1: give 0 to 1."),
         # Impossible draws.
-        (["realism.friction=[0,1]"], "realism.friction is [0,1]: give more than 0."),
-        (["realism.max_wheel_speed=[0,6]"], "realism.max_wheel_speed is [0,6]: give more than 0."),
+        (["realism.friction=[0,1]"], "realism.friction is [0,1]: give 0.001 to 10."),
+        (["realism.max_wheel_speed=[0,6]"], "realism.max_wheel_speed is [0,6]: give 0.001 "
+         "to 1000."),
         (["realism.speed_noise=-0.05"], "realism.speed_noise is -0.05: give 0 to 1."),
         (["realism.wheel_mismatch=0.5"], "realism.wheel_mismatch is 0.5: give 0 to 0.1."),
         (["realism.dead_sensor=1.1"], "realism.dead_sensor is 1.1: give 0 to 1."),
         (["realism.stall=2"], "realism.stall is 2: give 0 to 1."),
-        (["realism.stall_time=[0,0.3]"], "realism.stall_time is [0,0.3]: give more than 0."),
-        (["realism.target_distance_noise=-1"], "realism.target_distance_noise is -1: give 0 or "
-         "more."),
+        (["realism.stall_time=[0,0.3]"], "realism.stall_time is [0,0.3]: give more than 0, "
+         "at most 3600."),
+        (["realism.target_distance_noise=-1"], "realism.target_distance_noise is -1: give 0 to "
+         "10."),
         (["realism=real", "realism.reflectance_wall=[0,1]"], "realism.reflectance_wall is [0,1]: "
          "give more than 0, at most 1."),
         # Longer than the episode: 500 control steps of 0.032 s are 16 s.
@@ -258,7 +260,7 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
         (["realism.observation_latency=[0,600]"], "realism.observation_latency is [0,600], but "
          "an episode takes 500 control steps: give less than 500."),
         (["realism.action_latency=[-1,2]"], "realism.action_latency is [-1,2]: give 0 to "
-         "2147483647."),
+         "1000."),
         (["realism.infrared_period=[0.01,16]"], "realism.infrared_period is [0.01,16], but an "
          "episode takes 16 s: give less than 16."),
         (["realism.stall=0.01", "realism.stall_time=[1,20]"], "realism.stall_time is [1,20], but "
@@ -354,11 +356,11 @@ def test_help_gives_range_unit_and_choices(cls, command, robot, realism, mass):
     )
     assert (
         f"realism.action_latency={mass} control steps; a robot and episode "
-        "(a range [low,high] of whole numbers 0 to 2147483647 or null)" in lines
+        "(a range [low,high] of whole numbers 0 to 1000 or null)" in lines
     )
     stall = "[0.1,0.3]" if mass == "null" else mass
     assert (
         f"realism.stall_time={stall} for how long, s; a stall "
-        "(a range [low,high] of numbers more than 0)" in lines
+        "(a range [low,high] of numbers more than 0, at most 3600)" in lines
     )
     assert not any(line.startswith("realism.name") for line in lines)

@@ -1,0 +1,178 @@
+"""What the project does when something goes wrong: campaigns of faults, one JSON line a trial.
+
+`python -m benchmarks.faults campaign=NAME out=FILE [count=N] [seed=S]` tries one fault after the
+other and appends a line for each to `out`. It may be stopped at any time: started again, it goes on
+with the trials that `out` lacks. `campaign=table out=FILE` prints a summary of what `out` holds.
+A line tells its `campaign`, `trial`, `seed`, `commit` and `outcome`, and what the campaign adds.
+"""
+
+import json
+import os
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from benchmarks import faults_inputs, faults_policies
+from swarmjax import command, provenance
+from swarmjax.config import ConfigError, Section, about, build, show
+from swarmjax.config.section import MAX_COUNT
+
+Trial = Callable[[int, Path], dict[str, Any]]
+TABLE = "table"
+_STRIDE = 1_000_000  # trials of a campaign at most: each has a seed of its own
+
+
+class Campaign(NamedTuple):
+    """Faults of one kind.
+
+    Attributes:
+        trial: tries one: from its seed and an empty folder to what its line says.
+        trials: how many are tried unless a word says otherwise.
+    """
+
+    trial: Trial
+    trials: int
+
+
+CAMPAIGNS: dict[str, Campaign] = {
+    "policies": Campaign(faults_policies.trial, 1000),
+    "inputs": Campaign(faults_inputs.trial, 5000),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FaultsConfig(Section):
+    """Which faults are tried."""
+
+    campaign: str = field(metadata=about(f"{', '.join(CAMPAIGNS)}; or table, the summary of out"))
+    out: str = field(metadata=about("file of the lines; those that it has are not tried again"))
+    count: int | None = field(
+        default=None, metadata=about("trials; null: as many as the campaign asks for", 1, _STRIDE)
+    )
+    seed: int = field(
+        default=0, metadata=about("of the faults; another one tries others", 0, MAX_COUNT)
+    )
+
+    def _check(self) -> None:
+        if self.campaign not in (*CAMPAIGNS, TABLE):
+            names = ", ".join((*CAMPAIGNS, TABLE))
+            raise ConfigError(f"campaign is {show(self.campaign)}: give one of {names}.")
+
+
+def parse(words: Sequence[str]) -> FaultsConfig:
+    """Makes the settings from `key=value` words.
+
+    Args:
+        words: of the command line.
+
+    Raises:
+        ConfigError: a word is unsound.
+    """
+    pairs = [word.partition("=") for word in words]
+    for key, equals, _ in pairs:
+        if not equals:
+            raise ConfigError(f"{show(key)} is not a setting: give key=value.")
+    return build(FaultsConfig, {key: value for key, _, value in pairs})
+
+
+def read(out: Path) -> list[dict[str, Any]]:
+    """Reads the lines of a file; the last one may be torn, and is then left out.
+
+    Args:
+        out: the file; it need not exist.
+
+    Raises:
+        ConfigError: a line is no JSON object.
+    """
+    if not out.exists():
+        return []
+    found = []
+    for number, line in enumerate(out.read_text().splitlines(keepends=True), 1):
+        if not line.endswith("\n"):
+            break
+        try:
+            found.append(dict(json.loads(line)))
+        except (ValueError, TypeError):
+            raise ConfigError(f"{out} in line {number} is no line of a campaign.") from None
+    return found
+
+
+def run(settings: FaultsConfig) -> Iterator[dict[str, Any]]:
+    """Tries the faults that the file lacks, and yields a line each once it is written.
+
+    Args:
+        settings: of the campaign.
+    """
+    out, campaign = Path(settings.out), CAMPAIGNS[settings.campaign]
+    asked = (settings.campaign, settings.seed)
+    done = {row["trial"] for row in read(out) if (row["campaign"], row["seed"]) == asked}
+    _drop_torn(out)
+    commit = provenance.commit()
+    with out.open("a") as file:
+        for number in range(campaign.trials if settings.count is None else settings.count):
+            if number in done:
+                continue
+            with tempfile.TemporaryDirectory(prefix="faults-") as folder:
+                told = campaign.trial(settings.seed * _STRIDE + number, Path(folder))
+            row = {"campaign": asked[0], "trial": number, "seed": asked[1], "commit": commit}
+            file.write(json.dumps(row | told) + "\n")
+            file.flush()
+            yield row | told
+
+
+def _drop_torn(out: Path) -> None:
+    """Cuts off a last line that a stop left half written."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if not out.exists():
+        return
+    content = out.read_bytes()
+    os.truncate(out, content.rfind(b"\n") + 1)
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Sums lines up: for each campaign the outcomes, and the largest of each number.
+
+    Args:
+        rows: of the file.
+
+    Returns:
+        A table in Markdown.
+    """
+    lines = [
+        "| campaign | commits | outcome | trials | the most of each number |",
+        "|---" * 5 + "|",
+    ]
+    counted = Counter((row["campaign"], row["outcome"]) for row in rows)
+    for (campaign, outcome), count in sorted(counted.items()):
+        mine = [row for row in rows if (row["campaign"], row["outcome"]) == (campaign, outcome)]
+        commits = ", ".join(sorted({str(row["commit"]) for row in mine}))
+        lines.append(f"| {campaign} | {commits} | {outcome} | {count} | {_most(mine)} |")
+    return "\n".join(lines)
+
+
+def _most(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Names the largest value of each number that rows have."""
+    found: dict[str, float] = {}
+    for row in rows:
+        for key, value in row.items():
+            if isinstance(value, int | float) and key not in ("trial", "seed"):
+                found[key] = max(value, found.get(key, value))
+    return ", ".join(f"{key} {value:.4g}" for key, value in found.items())
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    settings = parse(arguments)
+    if settings.campaign != TABLE:
+        outcomes = Counter(row["outcome"] for row in run(settings))
+        sys.stdout.write(f"tried now: {json.dumps(outcomes)}\n")
+    sys.stdout.write(table(read(Path(settings.out))) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("faults", main, FaultsConfig))

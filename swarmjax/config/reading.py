@@ -1,0 +1,268 @@
+"""What a user gives, read without trust: files, and the YAML and JSON in them.
+
+A file is opened only if it is one (a pipe would wait for ever) and not too large. YAML is walked
+through before anything is made of it, because a few of its lines may stand for billions of values.
+"""
+
+import contextlib
+import json
+import os
+import stat
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from swarmjax.config.section import ConfigError, show
+
+MOST_TYPED = 2**20  # bytes of a file that a person writes; those of configs/ take a thousandth
+MOST_MADE = 2**24  # bytes of one that the project writes, such as a run's config
+_MOST_LINE = 2**24  # bytes of a line of those that have one object a line
+_MOST_NODES = 200_000  # values of a YAML file, what its aliases stand for counted each time
+_MOST_DEPTH = 32  # lists and mappings in one another
+_MOST_SCALAR = 5000  # letters of one value; a path has 4096
+
+
+def read_bytes(path: Path, most: int = MOST_TYPED) -> bytes:
+    """Read a whole file.
+
+    Args:
+        path: of the file.
+        most: bytes that it may have.
+
+    Raises:
+        ConfigError: it is missing, no plain file or too large, or cannot be read.
+    """
+    with _explained(path), _open(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        content = file.read(most + 1) if size <= most else b""
+    if max(size, len(content)) > most:  # the system's own files say that they have none
+        raise ConfigError(f"{called(path)} cannot be read: it has more than {most} bytes.")
+    return content
+
+
+def _open(path: Path) -> BinaryIO:
+    """Open a plain file, and nothing that reading would wait for or never end with."""
+    # Otherwise a pipe without a writer would wait here, before anything can be asked of it.
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(0, "it is no plain file")
+    return os.fdopen(descriptor, "rb")
+
+
+@contextlib.contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Put what keeps a file from being read in a sentence."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        reason = getattr(error, "strerror", None) or error
+        raise ConfigError(f"{called(path)} cannot be read: {reason}.") from None
+
+
+def read_text(path: Path, most: int = MOST_TYPED) -> str:
+    """Read a whole file of text in UTF-8.
+
+    Args:
+        path: of the file.
+        most: bytes that it may have.
+
+    Raises:
+        ConfigError: as `read_bytes`, or it is no such text.
+    """
+    try:
+        return read_bytes(path, most).decode()
+    except UnicodeDecodeError:
+        raise ConfigError(f"{called(path)} cannot be read: it is no text in UTF-8.") from None
+
+
+def called(path: Path | str) -> str:
+    """Write a path in a sentence: on one line, and not for pages."""
+    text = str(path)
+    return text if text.isprintable() and len(text) <= 300 else show(text)
+
+
+# JSON
+
+
+def read_json(path: Path, most: int = MOST_MADE) -> Any:
+    """Read a file that is one JSON value.
+
+    Args:
+        path: of the file.
+        most: bytes that it may have.
+
+    Raises:
+        ConfigError: as `read_text`, or it is no JSON.
+    """
+    return parse_json(read_text(path, most), called(path))
+
+
+def parse_json(text: str, where: str) -> Any:
+    """Return the value that a text of JSON stands for.
+
+    Args:
+        text: all of it.
+        where: what a sentence calls it.
+
+    Raises:
+        ConfigError: it is none, or is nested too deeply or holds too long a number.
+    """
+    try:
+        found = json.loads(text)
+    except RecursionError:
+        raise _too_deep(where) from None
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"{where} cannot be read: no JSON, {str(error).lower()}.") from None
+    except ValueError:
+        raise ConfigError(f"{where} cannot be read: a number has too many digits.") from None
+    _check_depth(found, where)
+    return found
+
+
+def _check_depth(found: object, where: str) -> None:
+    """Refuse what writing or comparing it would find too deep, level by level."""
+    level = [found]
+    for _ in range(_MOST_DEPTH + 1):
+        level = [inner for each in level for inner in _inside(each)]
+        if not level:
+            return
+    raise _too_deep(where)
+
+
+def _inside(value: object) -> Iterable[object]:
+    if isinstance(value, dict):
+        return value.values()
+    return value if isinstance(value, list) else ()
+
+
+def _too_deep(where: str) -> ConfigError:
+    return ConfigError(
+        f"{where} cannot be read: more than {_MOST_DEPTH} lists or mappings lie in one another."
+    )
+
+
+def read_lines(path: Path) -> Iterator[bytes]:
+    """Yield the lines of a file of any length, with their ends.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        ConfigError: it is missing, no plain file or cannot be read, or a line is too long.
+    """
+    with _explained(path), _open(path) as file:
+        while line := file.readline(_MOST_LINE + 1):
+            if len(line) > _MOST_LINE:
+                raise ConfigError(f"{called(path)} has a line of more than {_MOST_LINE} bytes.")
+            yield line
+
+
+# YAML
+
+
+def read_yaml(path: Path) -> Any:
+    """Read a file of YAML.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        What it stands for, as plain data: a number with an exponent is one, a date is text.
+
+    Raises:
+        ConfigError: as `read_text`, or it is no YAML, or stands for too much.
+    """
+    import yaml
+
+    text, where = read_text(path), called(path)
+    loader = _loader()
+    try:
+        _measure(yaml.parse(text, loader), where)
+        return yaml.load(text, loader)
+    except ConfigError:
+        raise
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{where} cannot be read: {_first_line(error)}.") from None
+    except (ValueError, TypeError, OverflowError) as error:  # of a number or of a key
+        raise ConfigError(f"{where} cannot be read: {_first_line(error)}.") from None
+
+
+class _Open:
+    """A list or mapping that has begun: its anchor, and how many values it has so far."""
+
+    def __init__(self, anchor: str | None) -> None:
+        self.anchor, self.values = anchor, 1
+
+
+def _measure(events: Iterable[Any], where: str) -> None:
+    """Refuse a text that stands for too many values, or for values too deep in one another."""
+    import yaml
+
+    anchors, within = dict[str | None, int](), [_Open(None)]
+    for event in events:
+        if isinstance(event, yaml.CollectionStartEvent):
+            within.append(_Open(event.anchor))
+        elif isinstance(event, yaml.CollectionEndEvent):
+            ended = within.pop()
+            anchors[ended.anchor] = ended.values
+            within[-1].values += ended.values
+        elif isinstance(event, yaml.AliasEvent):
+            _check_ended(event.anchor, within, where)
+            within[-1].values += anchors.get(event.anchor, 1)
+        elif isinstance(event, yaml.ScalarEvent):
+            within[-1].values += 1
+            _check_scalar(event.value, where)
+        _check_room(within, where)
+
+
+def _check_ended(anchor: str, within: list[_Open], where: str) -> None:
+    if anchor in [each.anchor for each in within]:
+        raise ConfigError(f"{where} cannot be read: *{anchor} stands within itself.")
+
+
+def _check_scalar(value: str, where: str) -> None:
+    if len(value) > _MOST_SCALAR:
+        most = f"a value has more than {_MOST_SCALAR} letters"
+        raise ConfigError(f"{where} cannot be read: {most}.")
+
+
+def _check_room(within: list[_Open], where: str) -> None:
+    if len(within) > _MOST_DEPTH:
+        raise _too_deep(where)
+    if within[-1].values > _MOST_NODES:
+        raise ConfigError(f"{where} cannot be read: it has more than {_MOST_NODES} values.")
+
+
+def _loader() -> Any:
+    """Make the loader that Hydra reads the files of configs/ with, in C where that is there."""
+    import yaml
+    from omegaconf._utils import get_yaml_loader
+
+    plain: Any = get_yaml_loader()
+    base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+    class Loader(base):
+        yaml_implicit_resolvers = plain.yaml_implicit_resolvers
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            _check_once(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+            return super().construct_mapping(node, deep=deep)
+
+    return Loader
+
+
+def _check_once(keys: Iterable[str]) -> None:
+    found = set[str]()
+    for key in keys:
+        if key in found and key != "<<":
+            raise ValueError(f"key {show(key)} is there twice")
+        found.add(key)
+
+
+def _first_line(error: Exception) -> str:
+    """Put what YAML says in part of a sentence, with its place."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return (text if len(text) <= 200 else f"{text[:197]}...").rstrip(".")

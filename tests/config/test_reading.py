@@ -1,0 +1,106 @@
+"""Files of a user's are read without trust: each of these is refused at once, in one sentence."""
+
+import json
+import os
+import time
+from pathlib import Path
+
+import pytest
+from sentences import refusal
+
+from swarmjax.config import reading
+
+BOMB = "\n".join(
+    ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+    + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 12)]
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        (BOMB, "has more than 200000 values"),
+        ("a: &a [*a]", "*a stands within itself"),
+        ("a: " + "[" * 100_000, "more than 32 lists or mappings lie in one another"),
+        ("[" * 100_000 + "]" * 100_000, "more than 32 lists or mappings lie in one another"),
+        ("a: " + "9" * 4900, "4300 digits"),
+        ("a: " + "9" * 5001, "more than 5000 letters"),
+        ("a: 1\na: 2\n", "key 'a' is there twice"),
+        ("{[1]: 2}", "unhashable"),
+        ("a: !!python/object/apply:os.system [ls]", "could not determine a constructor"),
+        ("#" * 2**20 + "\n", "more than 1048576 bytes"),
+    ],
+)
+def test_yaml_that_stands_for_too_much_is_refused_at_once(
+    tmp_path: Path, text: str, part: str
+) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    began = time.monotonic()
+    sentence = refusal(reading.read_yaml, path)
+    assert sentence.startswith(f"{path} cannot be read: ")
+    assert part in sentence
+    assert time.monotonic() - began < 5.0
+
+
+def test_aliases_that_stand_for_little_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("a: &a {x: 1, y: 1e3}\nb: *a\nc: {<<: *a, x: 2}\nd: 2020-01-01\n")
+    read = {"x": 1, "y": 1000.0}
+    expected = {"a": read, "b": read, "c": {"x": 2, "y": 1000.0}, "d": "2020-01-01"}
+    assert reading.read_yaml(path) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("[" * 100_000, "more than 32 lists or mappings lie in one another"),
+        ('{"a":' * 40 + "1" + "}" * 40, "more than 32 lists or mappings lie in one another"),
+        ("9" * 5000, "a number has too many digits"),
+        ("{", "no JSON"),
+    ],
+)
+def test_json_that_stands_for_too_much_is_refused(tmp_path: Path, text: str, part: str) -> None:
+    path = tmp_path / "mine.json"
+    path.write_text(text)
+    sentence = refusal(reading.read_json, path)
+    assert sentence.startswith(f"{path} cannot be read: ")
+    assert part in sentence
+
+
+def test_a_pipe_is_refused_without_waiting(tmp_path: Path) -> None:
+    path = tmp_path / "pipe.yaml"
+    os.mkfifo(path)
+    assert refusal(reading.read_text, path) == f"{path} cannot be read: it is no plain file."
+
+
+@pytest.mark.parametrize("path", [Path("/dev/zero"), Path("/tmp")])
+def test_what_is_no_plain_file_is_refused(path: Path) -> None:
+    assert refusal(reading.read_bytes, path) == f"{path} cannot be read: it is no plain file."
+
+
+def test_text_that_is_no_unicode_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_bytes(b"a: \xff\n")
+    assert refusal(reading.read_text, path) == f"{path} cannot be read: it is no text in UTF-8."
+
+
+def test_a_large_file_is_refused_unread(tmp_path: Path) -> None:
+    path = tmp_path / "large"
+    with path.open("wb") as file:
+        file.truncate(2**40)
+    assert "more than 1048576 bytes" in refusal(reading.read_text, path)
+
+
+@pytest.mark.parametrize("name", ["a\0b", "x" * 300])
+def test_a_name_that_no_file_can_have_is_refused(name: str) -> None:
+    assert " cannot be read: " in refusal(reading.read_bytes, Path(name))
+
+
+def test_a_line_without_an_end_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "long.jsonl"
+    with path.open("wb") as file:
+        file.write(json.dumps({}).encode() + b"\n")
+        file.truncate(2**30)
+    sentence = refusal(list, reading.read_lines(path))
+    assert sentence == f"{path} has a line of more than {2**24} bytes."
