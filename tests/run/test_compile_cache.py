@@ -80,7 +80,7 @@ def test_what_was_compiled_once_is_read_the_second_time(
 def test_training_keeps_what_it_compiles_where_it_is_told_to(
     unset: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(execute, "_run", lambda settings: int(_compile_and_run()))
+    monkeypatch.setattr(execute, "_run", lambda *_: int(_compile_and_run()))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
     assert train.main([f"run.compile_cache={tmp_path / 'given'}"]) == 7
     assert len(_entries(tmp_path / "given")) == 1

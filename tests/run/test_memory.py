@@ -128,7 +128,7 @@ def test_training_begins_with_the_choice(
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     monkeypatch.setattr(memory, "limit", lambda: available)
     monkeypatch.setattr(execute, "measure", _linear(10**6, 1000))
-    monkeypatch.setattr(execute, "_run", lambda settings: settings.arenas)
+    monkeypatch.setattr(execute, "_run", lambda settings, _: settings.arenas)
     assert train.main([*WORDS, "arenas=auto"]) == arenas
     assert capsys.readouterr().out.startswith(f"arenas=auto: {arenas:,}, ")
 

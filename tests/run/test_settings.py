@@ -530,7 +530,13 @@ def test_help_lists_every_key_once():
             value = value[0] if key == "stage" else value
             if value and isinstance(value, dict):
                 yield from leaves(value, f"{where}{key}.")
-            elif f"{where}{key}" not in ("stage_name", "realism.name", "algo.name", "pieces"):
+            elif f"{where}{key}" not in (
+                "stage_name",
+                "realism.name",
+                "algo.name",
+                "pieces",
+                "run.id",
+            ):
                 yield f"{where}{key}"
 
     assert listed == list(leaves(to_dict(load_train([]))))
