@@ -22,6 +22,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import jax
 import numpy as np
 
 import swarmjax
@@ -31,11 +32,12 @@ from swarmjax.config.section import MAX_COUNT, names
 from swarmjax.evaluate import cells, statistics, trials
 from swarmjax.evaluate.cells import Cell
 from swarmjax.evaluate.config import EvaluateConfig
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.settings import TrainConfig, load_run, load_train
 from swarmjax.task.stage_files import load_levels
 
 MEASURES = ("targets_reached", "all_reached", "contacts_per_robot", "episode_time_s")
 ACTIONS = ("sampled", "mean")
+_LISTS = ("arenas", "transitions", "cells")
 _ROBOTS = 5  # of an arena, which a transition is counted by
 
 
@@ -53,6 +55,10 @@ class ScalingConfig(Section):
     )
     seeds: int = field(default=5, metadata=about("policies of a point", 3, 4096))
     seed: int = field(default=700, metadata=about("first of them", 0, MAX_COUNT))
+    levels: int = field(default=200, metadata=about("of each cell that are judged", 1, 200))
+    cells: tuple[str, ...] = field(
+        default=("s6", "crowd_dense", "expanded", "r10", "r20"), metadata=about("that are judged")
+    )
 
 
 class Point(NamedTuple):
@@ -86,17 +92,18 @@ def training(config: ScalingConfig, point: Point, words: Sequence[str]) -> Train
         f"seeds={config.seeds}",
         f"seed={config.seed}",
         f"run.dir={Path(config.dir) / str(point)}",
+        "resume=auto",
     ]
-    return load_train([*words, *given])
+    return load_run([*words, *given])[0]
 
 
 def train(config: ScalingConfig, words: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Trains the points that have no policies yet; yields a line each."""
     for point in points(config):
         place = Path(config.dir) / str(point)
-        if (place / "summary.json").exists():
-            continue
         settings = training(config, point, words)
+        if settings is not None and _updates(place) == settings.updates:
+            continue
         line = {"benchmark": "scaling_law.train", **point._asdict(), "words": list(words)}
         if settings is None:
             yield line | {"skipped": "less than one update"}
@@ -106,6 +113,12 @@ def train(config: ScalingConfig, words: Sequence[str]) -> Iterator[dict[str, Any
         told = ("updates", "train_s", "compile_s", "device", "commit")
         line |= {name: summary.get(name) for name in told}
         yield line | {"trained_on": summary.get("transitions")}
+
+
+def _updates(place: Path) -> int:
+    """Reads how many updates a run has ended after; 0 if it has not."""
+    summary = place / "summary.json"
+    return json.loads(summary.read_text())["updates"] if summary.exists() else 0
 
 
 def policies(config: ScalingConfig, point: Point) -> list[str]:
@@ -125,7 +138,7 @@ def judge(config: ScalingConfig) -> Iterator[dict[str, Any]]:
     if some is None:
         raise ConfigError(f"dir is {show(config.dir)}, which holds no policies: do=train first.")
     settings = load_levels(EvaluateConfig, [f"policy={some}", "suite=scaling", "robot=wheeled"])
-    for cell, action in product(cells.load(settings).cells, ACTIONS):
+    for cell, action in product(_chosen(config, settings), ACTIONS):
         places = {point: judged_file(config, point, cell.name, action) for point in trained}
         left = {point: files for point, files in trained.items() if not places[point].exists()}
         for point, found in _try(replace(settings, action=action), left, cell).items():
@@ -133,6 +146,22 @@ def judge(config: ScalingConfig) -> Iterator[dict[str, Any]]:
                 np.savez(temporary, allow_pickle=False, **found)
             means = {name: round(float(x.mean()), 5) for name, x in found.items()}
             yield {"point": str(point), "cell": cell.name, "action": action, **means}
+
+
+def _chosen(config: ScalingConfig, settings: EvaluateConfig) -> list[Cell]:
+    """Takes the cells that are asked for, and their first levels."""
+    found = {cell.name: cell for cell in cells.load(settings).cells}
+    for name in config.cells:
+        if name not in found:
+            raise ConfigError(f"cells has {show(name)}: give some of {', '.join(found)}.")
+    first = slice(config.levels)
+    return [
+        cell._replace(
+            levels=jax.tree.map(lambda array: array[first], cell.levels),
+            episodes=cell.episodes[first],
+        )
+        for cell in (found[name] for name in config.cells)
+    ]
 
 
 def _try(
@@ -214,7 +243,7 @@ def parse(words: Sequence[str]) -> tuple[ScalingConfig, list[str]]:
     mine, given = set(names(ScalingConfig)), {}
     for key, _, value in (word.partition("=") for word in words):
         if key in mine:
-            given[key] = value.split(",") if key in ("arenas", "transitions") else value
+            given[key] = value.split(",") if key in _LISTS else value
     return build(ScalingConfig, given), [w for w in words if w.partition("=")[0] not in mine]
 
 

@@ -68,6 +68,9 @@ class RunConfig(Section):
     episodes: bool = field(
         default=False, metadata=about("write episodes.jsonl: each episode, robot by robot")
     )
+    deterministic: bool = field(
+        default=False, metadata=about("compute the same bits each time on a GPU; slower")
+    )
     dry: bool = field(default=False, metadata=about("check and describe the run, train nothing"))
     compile_cache: Literal["auto"] | str | None = field(
         default="auto",

@@ -120,7 +120,8 @@ def compile_chunk(
     lowered = chunk.lower(schedule, part, np.int32(1))
     if meanwhile is not None:
         threading.Thread(target=meanwhile, daemon=True).start()
-    call = lowered.compile(loop.compiler_options())
+    fixed = program.config.run.deterministic
+    call = lowered.compile(loop.compiler_options(deterministic=fixed))
     found = call.memory_analysis()
     assert found is not None  # both CPU and GPU tell
     # What is returned lies where the donated state lay, but for the metrics.

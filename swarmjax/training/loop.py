@@ -25,6 +25,8 @@ from swarmjax.training.rollout import Arena
 # Two rounds of a loop as one, so that what a round hands to the next need not be copied first: the
 # step of 8,192 arenas took 542 us instead of 606 on an H100 (docs/performance.md).
 _GPU_OPTIONS = {"xla_gpu_enable_while_loop_unrolling": "WHILE_LOOP_UNROLLING_DOUBLE_BUFFER"}
+# XLA then chooses no kernel by timing it, and none that adds in an order that varies.
+_DETERMINISTIC = {"xla_gpu_deterministic_ops": True}
 
 Metrics = dict[str, Any]
 
@@ -216,6 +218,15 @@ def _episode_metrics(ended: Ended, stage: Array) -> Metrics:
     }
 
 
-def compiler_options() -> dict[str, str]:
-    """Says what XLA is told for loops like this one on the device that JAX computes on."""
-    return _GPU_OPTIONS if jax.default_backend() == "gpu" else {}
+def compiler_options(*, deterministic: bool = False) -> dict[str, str | bool]:
+    """Says what XLA is told for loops like this one on the device that JAX computes on.
+
+    Args:
+      deterministic: Whether a GPU must compute the same bits each time. A CPU always does.
+
+    Returns:
+      Values of XLA's options, by name.
+    """
+    if jax.default_backend() != "gpu":
+        return {}
+    return _GPU_OPTIONS | (_DETERMINISTIC if deterministic else {})
