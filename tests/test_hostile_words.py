@@ -24,6 +24,7 @@ SOUND = {
     "swarmjax.replay": ["policy=a.npz"],
     "swarmjax.reproduce": [],
     "swarmjax.suite": ["suite=dev"],
+    "swarmjax.verify": ["run=a"],
 }
 TEXTS = [
     (name, key)

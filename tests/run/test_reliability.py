@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from swarmjax.config import ConfigError
 from swarmjax.policy import digest
 from swarmjax.run import checkpoint, directory, execute, lifecycle, trainer
 from swarmjax.run.directory import LOCK
-from swarmjax.run.settings import load_run
+from swarmjax.run.settings import RunConfig, load_run
 from swarmjax.run.signals import REQUEUE
 
 TINY = [
@@ -35,6 +35,22 @@ TINY = [
     "run.tensorboard=false",
 ]
 _CODE = "import sys; from swarmjax import train; sys.exit(train.main(sys.argv[1:]))"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _compiled_once() -> Iterator[None]:
+    """Compiles each program once, as no test here is about compiling."""
+    compile_chunk, found = trainer.compile_chunk, {}
+
+    def look_up(program: Any, *arguments: Any, **given: Any) -> trainer.Compiled:
+        key = repr(replace(program.config, run=RunConfig(), resume=None))
+        if key not in found:
+            found[key] = compile_chunk(program, *arguments, **given)
+        return found[key]
+
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(trainer, "compile_chunk", look_up)
+        yield
 
 
 @pytest.fixture(scope="module")
