@@ -1,8 +1,8 @@
 """Campaigns of `benchmarks.faults` against whole runs: kills, signals, and damaged checkpoints.
 
-Every trial is a function of its number, the seed of the campaign and a folder of its own, and
-returns the fields of its line. Runs are small (nine hundred updates of four arenas, a checkpoint
-after each tenth of the budget) and are compared with one that nobody disturbed.
+Every trial is a function of its seed and of an empty folder, and returns the fields of its line.
+Runs are small (nine hundred updates of four arenas, a checkpoint after each tenth of the budget)
+and are compared with one that nobody disturbed.
 """
 
 import contextlib
@@ -74,13 +74,13 @@ def logged(run: Path) -> list[int]:
     return [row["update"] for row in rows]
 
 
-def kills(trial: int, seed: int, folder: Path) -> dict[str, Any]:
+def kills(seed: int, folder: Path) -> dict[str, Any]:
     """Kills a run `KILLS` times, then lets it end.
 
     Every other kill comes at any moment; the rest while a checkpoint is written, or within the
     first second of a resume.
     """
-    random, run = np.random.default_rng([seed, trial]), folder / "run"
+    random, run = np.random.default_rng(seed), folder / "run"
     moments, repeated = [], []
     for number in range(KILLS):
         how = ("any", "save", "any", "resume")[number % 4]
@@ -154,10 +154,10 @@ def _is_whole(run: Path) -> dict[str, bool]:
     return {"identical": False, "log_complete": False}
 
 
-def terms(trial: int, seed: int, folder: Path) -> dict[str, Any]:
+def terms(seed: int, folder: Path) -> dict[str, Any]:
     """Asks a run to stop, at any moment, as a scheduler does; then lets it end."""
-    random, run = np.random.default_rng([seed, trial]), folder / "run"
-    number = (signal.SIGTERM, signal.SIGUSR1, signal.SIGINT)[trial % 3]
+    random, run = np.random.default_rng(seed), folder / "run"
+    number = (signal.SIGTERM, signal.SIGUSR1, signal.SIGINT)[seed % 3]
     process = start(run)
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(random.uniform(0.1, _SECONDS))
@@ -199,12 +199,12 @@ def _template() -> Path:
     return folder
 
 
-def checkpoints(trial: int, seed: int, folder: Path) -> dict[str, Any]:
+def checkpoints(seed: int, folder: Path) -> dict[str, Any]:
     """Damages one or more checkpoints of a run; the newest sound one must be found."""
-    random, run = np.random.default_rng([seed, trial]), folder / "mine"
+    random, run = np.random.default_rng(seed), folder / "mine"
     shutil.copytree(_template() / "mine", run)
     sound = {step: _digest_of(run, step) for step in checkpoint.steps(run)}
-    kind = list(_DAMAGES)[trial % len(_DAMAGES)]
+    kind = list(_DAMAGES)[seed % len(_DAMAGES)]
     touched = _DAMAGES[kind](run, random)
     left = max((step for step in sound if step not in touched), default=None)
     began = time.perf_counter()

@@ -399,6 +399,48 @@ def test_a_broken_arena_is_over_and_teaches_nothing(
         assert np.isfinite(total).all()
 
 
+def _spoil(state: EnvState, field: str, value: float) -> EnvState:
+    """Puts a value into what the first robot of an arena brings along."""
+    if field == "target":
+        level = state.level._replace(target=state.level.target.at[BUMPING, 0, 1].set(value))
+        return dataclasses.replace(state, level=level)
+    return dataclasses.replace(state, distance=state.distance.at[BUMPING, 0].set(value))
+
+
+@pytest.mark.parametrize("field", ["distance", "target"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_an_arena_breaks_by_what_is_seen_and_earned_as_well(
+    start: EnvState, actions: np.ndarray, tiny_step: ArenaStep, field: str, value: float
+) -> None:
+    sound, expected = tiny_step(start, jnp.asarray(actions[0]))
+    broken, came = tiny_step(_spoil(start, field, value), jnp.asarray(actions[0]))
+    broken, came = jax.tree.map(np.asarray, (_slim(broken), came))
+    assert came.sound.tolist() == [a != BUMPING for a in range(ARENAS)]
+    assert came.done.tolist() == [a == BUMPING for a in range(ARENAS)]
+    assert not came.valid[BUMPING].any()
+    assert came.truncated[BUMPING].tolist() == [True, True, False]
+    assert np.isfinite(came.reward).all()
+    assert np.isfinite(broken.episode.reward).all()
+    # What was seen last.
+    np.testing.assert_array_equal(came.observation[BUMPING], start.observation[BUMPING])
+    others = np.arange(ARENAS) != BUMPING
+    jax.tree.map(
+        lambda theirs, mine: np.testing.assert_array_equal(theirs[others], mine[others]),
+        (broken, came),
+        (_slim(sound), expected),
+    )
+
+
+def test_what_an_absent_robot_sees_breaks_nothing(
+    start: EnvState, actions: np.ndarray, tiny_step: ArenaStep
+) -> None:
+    absent = start.observation.at[BUMPING, 2].set(np.nan)
+    state, came = tiny_step(dataclasses.replace(start, observation=absent), jnp.asarray(actions[0]))
+    expected, _ = tiny_step(start, jnp.asarray(actions[0]))
+    assert came.sound.all()
+    jax.tree.map(np.testing.assert_array_equal, _slim(state), _slim(expected))
+
+
 # --- realism
 
 

@@ -276,6 +276,59 @@ def test_restart_puts_the_waiting_episode_into_arenas_that_are_over(
     jax.tree.map(check, packed, run.starts, run.before)
 
 
+# --- what is not finite
+
+
+SPOILT = 3  # arena
+Collect = Callable[[Arena], tuple[Arena, Trajectory, Ended]]
+
+
+@pytest.fixture(scope="module")
+def collect(program: Program, draw: Draw, learners: LearnerState) -> Collect:
+    """Drives arenas for one rollout."""
+    found = jax.jit(functools.partial(rollout.collect, program))
+    return lambda arenas: jax.tree.map(
+        np.asarray, found(learners, arenas, draw(1, NEXT), jax.random.key(2))
+    )
+
+
+def _spoil(arenas: Arena, field: str, value: float) -> Arena:
+    """Puts a value into one robot of one arena."""
+    if field in ("qpos", "qvel"):
+        sim = arenas.sim._replace(**{field: getattr(arenas.sim, field).at[SPOILT, 1].set(value)})
+        return dataclasses.replace(arenas, sim=sim)
+    return dataclasses.replace(arenas, distance=arenas.distance.at[SPOILT, 1].set(value))
+
+
+@pytest.mark.parametrize("field", ["qpos", "qvel", "distance"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_an_arena_that_is_not_finite_is_left_out_counted_and_begun_anew(
+    program: Program, draw: Draw, collect: Collect, field: str, value: float
+) -> None:
+    begun = draw(0, NOW)
+    sound, broken = collect(begun), collect(_spoil(begun, field, value))
+    after, trajectory, ended = broken
+    # It breaks once, in the first step, and all that follows of it is sound.
+    assert ended.broken.sum(axis=1).tolist() == [1] + [0] * (T - 1)
+    assert ended.broken[0, SPOILT] == 1
+    assert not trajectory.valid[0, 0, SPOILT].any()
+    assert trajectory.valid[1:, 0, SPOILT, :2].all()
+    assert after.cohort[SPOILT] == NEXT
+    assert np.isfinite(ended.reward).all()
+    for leaf in jax.tree.leaves((after.sim, after.observation, after.distance, after.episode)):
+        assert np.isfinite(leaf).all()
+    # Its neighbours never know.
+    others = np.arange(ARENAS) != SPOILT
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[others], b[others]), after, sound[0])
+    for mine, other in zip(trajectory, sound[1], strict=True):
+        np.testing.assert_array_equal(mine[:, :, others], other[:, :, others])
+    # Whatever is learned from is finite.
+    samples = rollout.batch(jax.tree.map(jnp.asarray, trajectory), program.config.algo)
+    valid = np.asarray(samples.valid)
+    for name, x in vars(samples).items():
+        assert np.isfinite(np.asarray(x)[valid]).all(), name
+
+
 # --- the rollout against its replay
 
 # The scan is another program than the single step, which XLA fuses differently: float32's
