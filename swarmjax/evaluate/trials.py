@@ -3,10 +3,11 @@
 import math
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from typing import NamedTuple
 
 import numpy as np
@@ -226,6 +227,15 @@ def _begin_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     # Pieces of extensions run on JAX; on a GPU each process would take most of its memory.
     os.environ["JAX_PLATFORMS"] = "cpu"
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """Ends this process when its parent has died: it would go on with what nobody collects."""
+    parent = parent_process()
+    assert parent is not None  # this one was spawned
+    parent.join()
+    os._exit(1)
 
 
 def _simulate(job: _Job) -> tuple[Outcome, np.ndarray | None]:

@@ -77,7 +77,8 @@ class Tally:
       earlier_s: spent training before this process began.
       seconds: spent training by this process, compilation apart.
       decisions: promotions and demotions.
-      skipped_in_row: newest updates of each seed whose gradient steps were all skipped.
+      skipped_in_row: newest updates of each seed that taught nothing: every gradient step was
+        skipped, or every arena broke at every step.
     """
 
     update: int
@@ -428,9 +429,9 @@ def _decisions(settings: TrainConfig, rows: list[Row]) -> list[Row]:
 
 
 def _watch_steps(settings: TrainConfig, tally: Tally, rows: list[Row]) -> None:
-    """Counts the updates in a row whose gradient steps were all skipped; too many end the run."""
+    """Counts the updates in a row that taught nothing; too many end the run."""
     for row in rows:
-        seed, skipped = row["seed"], row["policy_loss"] is None
+        seed, skipped = row["seed"], row["policy_loss"] is None or _broke(settings, row)
         tally.skipped_in_row[seed] = tally.skipped_in_row[seed] + 1 if skipped else 0
         if tally.skipped_in_row[seed] >= PATIENCE:
             raise DivergedError(_diverged(settings, tally, row))
@@ -439,7 +440,15 @@ def _watch_steps(settings: TrainConfig, tally: Tally, rows: list[Row]) -> None:
 def _diverged(settings: TrainConfig, tally: Tally, row: Row) -> str:
     where = f" of seed {row['seed']}" if settings.seeds > 1 else ""
     count = words.count(tally.skipped_in_row[row["seed"]], "update")
-    return f"no gradient step{where} was finite in {count} up to update {row['update'] + 1:,}."
+    last = f"in {count} up to update {row['update'] + 1:,}."
+    if _broke(settings, row):
+        return f"every arena{where} broke at every step {last}"
+    return f"no gradient step{where} was finite {last}"
+
+
+def _broke(settings: TrainConfig, row: Row) -> bool:
+    """Tells whether no step of any arena of an update was finite."""
+    return row["broken_arenas"] >= settings.arenas * settings.algo.rollout_length
 
 
 def _speeds(program: Built, rows: list[Row], seconds: float) -> dict[str, float]:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import extensions
 import jax
 import numpy as np
 import pytest
@@ -378,6 +379,18 @@ def test_a_run_that_diverges_again_stops_and_names_the_seed(
     assert "no gradient step of seed 1 was finite in 10 updates" in said
     assert "It had gone back once already: give lower algo.actor_learning_rate" in said
     assert checkpoint.restore(tmp_path)[1] == 4
+
+
+def test_a_run_whose_arenas_all_break_stops_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    body = "@reward_term(weight=1.0)\ndef broken(step):\n    return jnp.nan * step.action[:, 0]\n"
+    mine = extensions.write(tmp_path / "mine.py", body)
+    words = [*TINY, "budget=640", f"extensions={mine}", f"run.dir={tmp_path / 'run'}"]
+    assert train.main(words) == execute.FAILED
+    said = " ".join(capsys.readouterr().out.split())
+    assert "every arena broke at every step in 10 updates up to update 10" in said
+    assert "It had gone back once already" in said
 
 
 def test_lower_rates_are_kept_when_the_run_is_resumed(
