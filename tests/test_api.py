@@ -136,6 +136,7 @@ def test_a_callback_sees_every_update_and_stops_the_run(tmp_path: Path) -> None:
     assert result.policy.meta["update"] == 4
 
 
+@pytest.mark.slow
 def test_every_seed_has_its_policy(tmp_path: Path) -> None:
     settings = TINY | {"run.dir": tmp_path / "run", "seeds": 2, "budget": 16}
     result = swarmjax.train_policy(settings)
@@ -157,6 +158,7 @@ def test_as_many_arenas_as_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert swarmjax.train_policy(settings).policy.meta["config"]["arenas"] == 2
 
 
+@pytest.mark.slow
 def test_words_of_the_command_line_are_settings_too(tmp_path: Path) -> None:
     words = ["stage=s1", "arenas=4", "algo.num_minibatches=2", "algo.rollout_length=4", "budget=16"]
     more = ["sim.impl=jax", "run.tensorboard=false", f"run.dir={tmp_path / 'run'}"]

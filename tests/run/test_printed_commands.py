@@ -37,7 +37,12 @@ def _pasted(text: str, name: str) -> list[str]:
     return words[3:]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+SLOW = ("grid", "seeds", "paper")
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind in SLOW)) for kind in KINDS]
+)
 def test_the_policy_is_judged_by_the_command_as_printed(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

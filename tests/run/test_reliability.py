@@ -297,6 +297,7 @@ def test_a_run_verifies(whole: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert f"{whole} is bit for bit what it was, to update 9" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_run_that_was_trained_otherwise_does_not_verify(
     whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -369,6 +370,7 @@ def test_a_run_that_diverges_goes_back_once_with_lower_rates(
     assert all(np.isfinite(leaf).all() for leaf in kept.leaves.values() if leaf.dtype == np.float32)
 
 
+@pytest.mark.slow
 def test_a_run_that_diverges_again_stops_and_names_the_seed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -381,6 +383,7 @@ def test_a_run_that_diverges_again_stops_and_names_the_seed(
     assert checkpoint.restore(tmp_path)[1] == 4
 
 
+@pytest.mark.slow
 def test_a_run_whose_arenas_all_break_stops_and_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
