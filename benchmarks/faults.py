@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks import faults_inputs, faults_nan, faults_policies, faults_runs
+from benchmarks import faults_disk, faults_inputs, faults_nan, faults_policies, faults_runs
 from swarmjax import command, provenance
 from swarmjax.config import ConfigError, Section, about, build, show
 from swarmjax.config.section import MAX_COUNT
@@ -42,6 +42,7 @@ CAMPAIGNS: dict[str, Campaign] = {
     "kills": Campaign(faults_runs.kills, 50),  # of four kills each
     "terms": Campaign(faults_runs.terms, 50),
     "checkpoints": Campaign(faults_runs.checkpoints, 2000),
+    "disk": Campaign(faults_disk.trial, 40),
     "nan": Campaign(faults_nan.trial, 240),
     "policies": Campaign(faults_policies.trial, 1000),
     "inputs": Campaign(faults_inputs.trial, 5000),

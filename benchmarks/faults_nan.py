@@ -3,7 +3,7 @@
 A trial trains small, puts NaN or an infinity somewhere before a random update, and trains on. The
 outcome is one of three. Training `went on`. No step was taken any more, so that the run `goes back`
 to its checkpoint. Or it is `WRONG`: a number that is not finite was learned, or an arena changed
-that nobody had touched.
+that was not touched.
 """
 
 import functools
@@ -75,7 +75,7 @@ def _train(
 
 @functools.cache
 def undisturbed(stage: str, seed: int) -> float:
-    """Share of targets reached at the end of a run that nobody disturbs."""
+    """Share of targets reached at the end of an undisturbed run."""
     there = stand(stage)
     return success(there.train(there.start(seed), UPDATES)[1])
 

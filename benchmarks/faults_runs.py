@@ -2,7 +2,7 @@
 
 Every trial is a function of its seed and of an empty folder, and returns the fields of its line.
 Runs are small (nine hundred updates of four arenas, a checkpoint after each tenth of the budget)
-and are compared with one that nobody disturbed.
+and are compared with an undisturbed run.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -41,21 +41,25 @@ WORDS = (
 )
 INTERVAL = UPDATES // 10  # updates between two checkpoints
 KILLS = 4  # of a run, before it may end
-_SECONDS = 8.0  # that a whole run takes, about
+SECONDS = 8.0  # that a whole run takes, about
 _POLL = 0.002  # s
 
 
-def start(run: Path) -> subprocess.Popen[str]:
-    """Starts or goes on with a run, in a process of its own."""
+def start(run: Path, environment: Mapping[str, str] | None = None) -> subprocess.Popen[str]:
+    """Starts or goes on with a run, in a process of its own, with more `environment`."""
     words = [sys.executable, "-m", "swarmjax.train", *WORDS, f"run.dir={run}"]
     return subprocess.Popen(
-        words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ
+        words,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | dict(environment or {}),
     )
 
 
 @functools.cache
 def undisturbed() -> str:
-    """Digest of the last state of a run that nobody disturbed."""
+    """Digest of the last state of an undisturbed run."""
     with tempfile.TemporaryDirectory() as folder:
         said, _ = start(Path(folder) / "run").communicate()
         found = checkpoint.find(Path(folder) / "run")
@@ -92,7 +96,7 @@ def kills(seed: int, folder: Path) -> dict[str, Any]:
         rows = [update for update in logged(run) if update >= newest(run)]
         repeated.append(len(rows))
     said, _ = (process := start(run)).communicate()
-    whole = _is_whole(run)
+    whole = is_whole(run)
     sound = process.returncode == 0 and whole["identical"] and whole["log_complete"]
     return {
         "outcome": "ok" if sound else "WRONG",
@@ -107,7 +111,7 @@ def kills(seed: int, folder: Path) -> dict[str, Any]:
 
 def _at_any_moment(process: subprocess.Popen[str], _: Path, random: np.random.Generator) -> None:
     with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(random.uniform(0.0, _SECONDS))
+        process.wait(random.uniform(0.0, SECONDS))
 
 
 def _while_saving(process: subprocess.Popen[str], run: Path, random: np.random.Generator) -> None:
@@ -142,8 +146,8 @@ _MOMENTS: dict[str, Callable[[subprocess.Popen[str], Path, np.random.Generator],
 }
 
 
-def _is_whole(run: Path) -> dict[str, bool]:
-    """Compares a run that has ended with one that nobody disturbed."""
+def is_whole(run: Path) -> dict[str, bool]:
+    """Compares a run that has ended with an undisturbed run."""
     with contextlib.suppress(CheckpointError, OSError, ValueError, KeyError):
         summary = json.loads((run / directory.SUMMARY).read_text())
         found = checkpoint.find(run)
@@ -160,7 +164,7 @@ def terms(seed: int, folder: Path) -> dict[str, Any]:
     number = (signal.SIGTERM, signal.SIGUSR1, signal.SIGINT)[seed % 3]
     process = start(run)
     with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(random.uniform(0.1, _SECONDS))
+        process.wait(random.uniform(0.1, SECONDS))
     ended = process.poll() is not None
     process.send_signal(number)
     said, _ = process.communicate()
@@ -170,7 +174,7 @@ def terms(seed: int, folder: Path) -> dict[str, Any]:
     code_is_right = process.returncode in ({wanted, 0} if done == UPDATES else {wanted})
     repeated = len([update for update in logged(run) if update >= done])
     start(run).communicate()
-    whole = _is_whole(run)
+    whole = is_whole(run)
     sound = code_is_right and not repeated and whole["identical"] and whole["log_complete"]
     return {
         "outcome": "ok" if sound else "WRONG",
@@ -211,7 +215,7 @@ def checkpoints(seed: int, folder: Path) -> dict[str, Any]:
     try:
         kept = checkpoint.find(run)
         found: int | str = kept.update
-        # Damage that changes nothing which counts, as in a file that nobody reads, is no error.
+        # Damage that changes nothing which counts, as in a file that is never read, is no error.
         wrong = sound.get(kept.update) != digest(kept.leaves) or (
             left is not None and kept.update < left
         )

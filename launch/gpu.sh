@@ -3,7 +3,7 @@
 # Needs the extra `gpu`: uv sync --extra gpu. Keys given here win over those below.
 #
 # The robots are MJX models on wheels, stepped by MJX-Warp with swarmjax's contact solver in the
-# place of its own: 85 s from the command on one H200, everything compiled anew, 22 s of it training.
+# place of its own: 85 s from the command on one H200, with nothing compiled before, 22 s of it training.
 #   sim.solver=mjx     MJX's own step, unpatched: a third of the environment's speed.
 #   robot=planar       the fast option: the same model in the plane, stepped as discs, as in
 #                      bash launch/gpu.sh robot=planar stage=s6 arenas=65536 budget=500e6

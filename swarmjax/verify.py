@@ -51,7 +51,7 @@ def load_digests(settings: VerifyConfig) -> dict[int, str]:
       CheckpointError: if its log is damaged.
     """
     rows = directory.read_rows(Path(settings.run) / directory.SAVED, None)
-    found = {row["update"]: row["digest"] for row in rows if row["update"] > 0}
+    found = {row["update"]: row["digest"] for row in rows if _is_replayable(row)}
     if not found:
         raise ConfigError(
             f"run is {settings.run}, which has no digests in {directory.SAVED}: give a run that "
@@ -65,6 +65,11 @@ def load_digests(settings: VerifyConfig) -> dict[int, str]:
             f"update {min(found)}: give at least {min(found)}."
         )
     return chosen
+
+
+def _is_replayable(row: directory.Row) -> bool:
+    """Tells whether training from the beginning leads to a checkpoint: lower rates do not."""
+    return row["update"] > 0 and row.get("rate_scale", 1.0) == 1.0
 
 
 def replay(trained: TrainConfig, updates: Sequence[int]) -> dict[int, str]:

@@ -231,7 +231,7 @@ def _begin_worker() -> None:
 
 
 def _end_with_parent() -> None:
-    """Ends this process when its parent has died: it would go on with what nobody collects."""
+    """Ends this process when its parent dies, which would otherwise leave it running."""
     parent = parent_process()
     assert parent is not None  # this one was spawned
     parent.join()

@@ -180,7 +180,8 @@ class Checkpoints:
         step = self._folder / str(update)
         directory.write_json(step / _MANIFEST, _file_digests(step))
         with directory.Log(self._run / directory.SAVED) as log:
-            log.write([{"update": update, "digest": meta["digest"], "score": score}])
+            row = {"update": update, "digest": meta["digest"], "score": score}
+            log.write([row | {"rate_scale": meta["rate_scale"]}])
         self._prune()
 
     def _prune(self) -> None:

@@ -10,4 +10,4 @@ class TrainingError(RuntimeError):
 
 
 class DivergedError(RuntimeError):
-    """A run whose gradient steps are no longer finite, in one sentence."""
+    """A run that learns nothing any more, in one sentence."""

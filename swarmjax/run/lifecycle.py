@@ -57,7 +57,8 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
       ConfigError: if it cannot begin as the config says, or needs more memory than there is, or
         another process writes the directory.
       CheckpointError: if what it goes on with is damaged.
-      TrainingError: if a loss is no longer finite, or the directory cannot be written any more.
+      TrainingError: if the run diverges again after it went back once, or its directory cannot be
+        written any more.
       StoppedError: if somebody asked to stop before there was anything to save.
     """
     with directory.locked(run):

@@ -36,9 +36,9 @@ from swarmjax.training.program import Program
 Built = Program[TrainConfig]  # the program of a run
 
 CALL_SECONDS = 1.0  # what a call should take when run.chunk is auto: the display's pace
-ALL_SECONDS = 10.0  # likewise, when it is all: how long a signal may have to wait
+ALL_SECONDS = 10.0  # what a call may take when run.chunk is all: so long a signal waits
 FIRST_UPDATES = 32  # of the first call then, by which the others are measured
-PATIENCE = 10  # updates in a row without a finite gradient step, after which a run has diverged
+PATIENCE = 10  # updates in a row that taught nothing, after which a run has diverged
 GROWTH = 4  # a call is at most this many times as long as the one before
 
 
@@ -77,8 +77,8 @@ class Tally:
       earlier_s: spent training before this process began.
       seconds: spent training by this process, compilation apart.
       decisions: promotions and demotions.
-      skipped_in_row: newest updates of each seed that taught nothing: every gradient step was
-        skipped, or every arena broke at every step.
+      barren: newest updates in a row, by seed, that taught nothing: every gradient step was skipped
+        or every arena broke at every step.
     """
 
     update: int
@@ -89,12 +89,12 @@ class Tally:
     earlier_s: float = 0.0
     seconds: float = 0.0
     decisions: list[dict] = field(default_factory=list)
-    skipped_in_row: Counter[int] = field(default_factory=Counter)
+    barren: Counter[int] = field(default_factory=Counter)
 
     @property
     def is_sound(self) -> bool:
-        """Whether the newest update of every seed took a gradient step."""
-        return not any(self.skipped_in_row.values())
+        """Whether the newest update of every seed taught something."""
+        return not any(self.barren.values())
 
 
 def compile_chunk(
@@ -214,8 +214,8 @@ def train(
       The last state, which is saved, and what came of the run.
 
     Raises:
-      DivergedError: if the gradient steps of a seed are no longer finite; the checkpoint before
-        that is kept.
+      DivergedError: if a seed learned nothing in `PATIENCE` updates in a row; the checkpoint before
+        them is kept.
       TrainingError: if the directory cannot be written.
     """
     settings, done = program.config, int(state.update[0])
@@ -240,7 +240,7 @@ def train(
             if tally.is_sound and saves.due(tally.update):
                 save(state, tally.update, record.sync(), score(settings, tally))
         if not tally.is_sound:
-            raise DivergedError(f"no gradient step was finite at the end, update {tally.update:,}.")
+            raise DivergedError(f"the last update taught nothing, update {tally.update:,}.")
         save(state, tally.update, record.sync(), score(settings, tally))
     return state, tally
 
@@ -432,14 +432,14 @@ def _watch_steps(settings: TrainConfig, tally: Tally, rows: list[Row]) -> None:
     """Counts the updates in a row that taught nothing; too many end the run."""
     for row in rows:
         seed, skipped = row["seed"], row["policy_loss"] is None or _broke(settings, row)
-        tally.skipped_in_row[seed] = tally.skipped_in_row[seed] + 1 if skipped else 0
-        if tally.skipped_in_row[seed] >= PATIENCE:
+        tally.barren[seed] = tally.barren[seed] + 1 if skipped else 0
+        if tally.barren[seed] >= PATIENCE:
             raise DivergedError(_diverged(settings, tally, row))
 
 
 def _diverged(settings: TrainConfig, tally: Tally, row: Row) -> str:
     where = f" of seed {row['seed']}" if settings.seeds > 1 else ""
-    count = words.count(tally.skipped_in_row[row["seed"]], "update")
+    count = words.count(tally.barren[row["seed"]], "update")
     last = f"in {count} up to update {row['update'] + 1:,}."
     if _broke(settings, row):
         return f"every arena{where} broke at every step {last}"

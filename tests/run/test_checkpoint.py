@@ -3,7 +3,7 @@
 import gc
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jax
@@ -184,26 +184,26 @@ def test_a_checkpoint_of_another_config_is_refused(tmp_path: Path) -> None:
         checkpoint.restore(tmp_path)
 
 
+def _forge(run: Path, changed: Callable[[dict], dict]) -> None:
+    """Changes what the first checkpoint says of itself, and drops the digests of its files."""
+    (_steps(run) / "1" / "files.json").unlink(missing_ok=True)
+    meta = _steps(run) / "1" / "meta" / "metadata"
+    meta.write_text(json.dumps(changed(json.loads(meta.read_text()))))
+
+
 def test_a_checkpoint_that_no_longer_says_what_it_is_of_is_refused(tmp_path: Path) -> None:
     _save(tmp_path, 1)
-    (_steps(tmp_path) / "1" / "files.json").unlink()
-    meta = _steps(tmp_path) / "1" / "meta" / "metadata"
-    found = json.loads(meta.read_text())
-    meta.write_text(json.dumps(found | {"rate_scale": 0.5}))
+    _forge(tmp_path, lambda found: found | {"rate_scale": 0.5})
     with pytest.raises(CheckpointError, match="does not match its digest"):
         checkpoint.restore(tmp_path)
-    del found["seal"]
-    meta.write_text(json.dumps(found))
+    _forge(tmp_path, lambda found: {key: x for key, x in found.items() if key != "seal"})
     with pytest.raises(CheckpointError, match="does not match its digest"):
         checkpoint.restore(tmp_path)
 
 
 def test_a_checkpoint_of_an_older_version_loads_with_a_sentence(tmp_path: Path) -> None:
     _save(tmp_path, 1)
-    (_steps(tmp_path) / "1" / "files.json").unlink()
-    meta = _steps(tmp_path) / "1" / "meta" / "metadata"
-    found = json.loads(meta.read_text())
-    meta.write_text(json.dumps({key: found[key] for key in ("digest", "update")}))
+    _forge(tmp_path, lambda found: {key: found[key] for key in ("digest", "update")})
     kept = checkpoint.find(tmp_path)
     assert kept.update == 1
     assert kept.logs == {}

@@ -314,6 +314,10 @@ def test_a_run_that_was_trained_otherwise_does_not_verify(
     [
         (None, "has no digests in checkpoints.jsonl: give a run that has saved a checkpoint"),
         ('{"update": 0, "digest": "a"}\n', "has no digests in checkpoints.jsonl"),
+        (
+            '{"update": 2, "digest": "a", "rate_scale": 0.1}\n',
+            "has no digests in checkpoints.jsonl",
+        ),
         ('{"update": 7, "digest": "a"}\n', "the first checkpoint of .* give at least 7"),
         ("{\n", "checkpoints.jsonl is damaged at line 1"),
     ],
