@@ -1,0 +1,187 @@
+"""Does a long run stay as it began: its memory, its descriptors, its speed?
+
+`python -m benchmarks.soak dir=DIR minutes=60 [key=value ...]` trains in `DIR`/run for so many
+minutes, asks the run to stop, and appends what it saw every ten seconds to `DIR`/samples.jsonl. The
+other words are those of `swarmjax.train`. The same command again goes on with the run, which is
+another leg. `python -m benchmarks.soak dir=DIR do=table` prints a JSON line: for each leg and
+quantity the median and the slope in percent of it an hour, by Theil and Sen with a 95 % interval.
+
+Speed is counted by the second, and by the second of processor time, which other processes on the
+machine do not change as much.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from scipy import stats
+
+from swarmjax import command, provenance
+from swarmjax.config import Section, about, build
+from swarmjax.run import directory
+from swarmjax.run.signals import REQUEUE
+
+EVERY_S = 10.0  # between two samples
+WARM_UP = 0.1  # share of a leg that is left out: caches fill, and the policy learns to move
+SAMPLES = "samples.jsonl"
+_OWN = ("dir", "minutes", "do")
+_TAIL = 65_536  # bytes at the end of the metrics, which hold its last line
+_LEVELS = ("memory_mb", "descriptors", "threads")
+_SPEEDS = ("arena_steps_per_s", "arena_steps_per_cpu_s")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SoakConfig(Section):
+    """How long is trained, and where."""
+
+    dir: str = field(metadata=about("folder of the run and of the samples"))
+    minutes: float = field(default=60.0, metadata=about("of this leg", above=0.0))
+    do: Literal["train", "table"] = field(default="train", metadata=about("what is done"))
+
+
+def sample(pid: int, run: Path) -> dict[str, float]:
+    """Looks at a process and at how far its run is.
+
+    Args:
+        pid: Of the process.
+        run: Its run directory.
+
+    Returns:
+        Resident memory, open descriptors, threads, processor seconds since it began, and arena
+        control steps of the run.
+
+    Raises:
+        OSError: If the process has ended.
+    """
+    place = Path("/proc") / str(pid)
+    status = (place / "stat").read_text().rpartition(")")[2].split()
+    user, system, threads, pages = (int(status[i]) for i in (11, 12, 17, 21))
+    return {
+        "memory_mb": pages * os.sysconf("SC_PAGE_SIZE") / 1e6,
+        "descriptors": len(list((place / "fd").iterdir())),
+        "threads": threads,
+        "cpu_s": (user + system) / os.sysconf("SC_CLK_TCK"),
+        "arena_steps": _arena_steps(run / directory.METRICS),
+    }
+
+
+def _arena_steps(metrics: Path) -> int:
+    """Reads how far a run is from the last whole line of its metrics; 0 before the first."""
+    if not metrics.exists():
+        return 0
+    with metrics.open("rb") as file:
+        file.seek(max(0, metrics.stat().st_size - _TAIL))
+        lines = file.read().splitlines(keepends=True)
+    whole = [line for line in lines if line.endswith(b"\n")]
+    return int(json.loads(whole[-1])["arena_steps"]) if whole else 0
+
+
+def leg(settings: SoakConfig, words: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Trains for a while and yields what was seen of it, which is also written down.
+
+    Args:
+        settings: Of the soak.
+        words: Of `swarmjax.train`.
+    """
+    folder = Path(settings.dir)
+    folder.mkdir(parents=True, exist_ok=True)
+    run, number = folder / "run", 1 + max((row["leg"] for row in read(folder)), default=0)
+    words = [sys.executable, "-m", "swarmjax.train", f"run.dir={run}", "resume=auto", *words]
+    with (folder / "said.txt").open("a") as said, (folder / SAMPLES).open("a") as file:
+        process = subprocess.Popen(words, stdout=said, stderr=said)
+        began = time.monotonic()
+        while (seconds := time.monotonic() - began) < 60.0 * settings.minutes:
+            time.sleep(EVERY_S)
+            if process.poll() is not None:
+                break
+            known = {"leg": number, "seconds": seconds + EVERY_S, "commit": provenance.commit()}
+            row = known | sample(process.pid, run)
+            file.write(json.dumps(row) + "\n")
+            file.flush()
+            yield row
+        process.terminate()
+        code = process.wait()
+    if code not in (0, REQUEUE):
+        raise SystemExit(f"training ended with {code}: see {folder / 'said.txt'}.")
+
+
+def read(folder: Path) -> list[dict[str, Any]]:
+    """Reads the samples of a soak; none before its first leg."""
+    path = folder / SAMPLES
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def sum_up(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Finds the median and the slope of each quantity of one leg.
+
+    Args:
+        rows: Samples of the leg, in their order.
+
+    Returns:
+        By quantity: `median`, `slope`, `slope_low` and `slope_high`; slopes in percent of the
+        median an hour.
+    """
+    rows = rows[int(WARM_UP * len(rows)) :]
+    hours = np.array([row["seconds"] for row in rows]) / 3600.0
+    found = {name: _trend(hours, np.array([row[name] for row in rows])) for name in _LEVELS}
+    steps = np.diff([row["arena_steps"] for row in rows])
+    spent = (np.diff(hours) * 3600.0, np.diff([row["cpu_s"] for row in rows]))
+    for name, seconds in zip(_SPEEDS, spent, strict=True):
+        found[name] = _trend(hours[1:], steps / seconds)
+    return found
+
+
+def _trend(hours: np.ndarray, values: np.ndarray) -> dict[str, float]:
+    middle = float(np.median(values))
+    slope, _, low, high = map(float, stats.theilslopes(values, hours))
+    percent = 100.0 / middle
+    return {
+        "median": middle,
+        "slope": slope * percent,
+        "slope_low": low * percent,
+        "slope_high": high * percent,
+    }
+
+
+def table(folder: Path) -> dict[str, Any]:
+    """Sums up all legs; returns the line."""
+    rows = read(folder)
+    legs = {
+        str(number): {
+            "minutes": round(mine[-1]["seconds"] / 60.0, 1),
+            "arena_steps": mine[-1]["arena_steps"],
+            **sum_up(mine),
+        }
+        for number in sorted({row["leg"] for row in rows})
+        if (mine := [row for row in rows if row["leg"] == number])
+    }
+    return {
+        "benchmark": "soak",
+        "legs": legs,
+        "run": json.loads((folder / "run" / directory.SUMMARY).read_text())["device"],
+        "commits": sorted({row["commit"] for row in rows}),
+        "versions": provenance.versions(),
+    }
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    own = [word for word in arguments if word.partition("=")[0] in _OWN]
+    settings = build(SoakConfig, {key: value for key, _, value in (w.partition("=") for w in own)})
+    if settings.do == "table":
+        sys.stdout.write(json.dumps(table(Path(settings.dir))) + "\n")
+        return 0
+    for _ in leg(settings, [word for word in arguments if word not in own]):
+        pass
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("soak", main, SoakConfig))
