@@ -46,6 +46,7 @@ _PROCESS_MEMORY = 2**34  # bytes of addresses; JAX reserves more than it uses
 _PROCESS_SECONDS = 180.0  # of one that runs, on a machine that others use too
 _EVERY = 10  # trials, of which one is a process
 _ROOT = Path(__file__).resolve().parents[1]
+_PYTHONPATH = os.pathsep.join([str(_ROOT), os.environ.get("PYTHONPATH", "")])
 Words = Sequence[str]
 
 
@@ -310,7 +311,7 @@ def _process(name: str, words: list[str], folder: Path) -> tuple[str, str]:
         done = subprocess.run(
             [sys.executable, "-m", f"swarmjax.{name}", *typed, *_TINY[name]],
             cwd=folder,
-            env=os.environ | {"PYTHONPATH": str(_ROOT), "JAX_PLATFORMS": "cpu"},
+            env=os.environ | {"PYTHONPATH": _PYTHONPATH, "JAX_PLATFORMS": "cpu"},
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=_PROCESS_SECONDS,

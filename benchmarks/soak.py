@@ -12,6 +12,7 @@ machine do not change as much.
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -33,7 +34,7 @@ WARM_UP = 0.1  # share of a leg that is left out: caches fill, and the policy le
 SAMPLES = "samples.jsonl"
 _OWN = ("dir", "minutes", "do")
 _TAIL = 65_536  # bytes at the end of the metrics, which hold its last line
-_LEVELS = ("memory_mb", "descriptors", "threads")
+_LEVELS = ("memory_mb", "device_memory_mb", "descriptors", "threads")
 _SPEEDS = ("arena_steps_per_s", "arena_steps_per_cpu_s")
 
 
@@ -54,8 +55,8 @@ def sample(pid: int, run: Path) -> dict[str, float]:
         run: Its run directory.
 
     Returns:
-        Resident memory, open descriptors, threads, processor seconds since it began, and arena
-        control steps of the run.
+        Resident memory and that of the GPU, if there is one; open descriptors, threads, processor
+        seconds since it began, and arena control steps of the run.
 
     Raises:
         OSError: If the process has ended.
@@ -63,13 +64,22 @@ def sample(pid: int, run: Path) -> dict[str, float]:
     place = Path("/proc") / str(pid)
     status = (place / "stat").read_text().rpartition(")")[2].split()
     user, system, threads, pages = (int(status[i]) for i in (11, 12, 17, 21))
-    return {
+    device = _device_memory()
+    return ({} if device is None else {"device_memory_mb": device}) | {
         "memory_mb": pages * os.sysconf("SC_PAGE_SIZE") / 1e6,
         "descriptors": len(list((place / "fd").iterdir())),
         "threads": threads,
         "cpu_s": (user + system) / os.sysconf("SC_CLK_TCK"),
         "arena_steps": _arena_steps(run / directory.METRICS),
     }
+
+
+def _device_memory() -> float | None:
+    """Reads how much memory of the first GPU is in use, MB; None without a GPU."""
+    if (command := shutil.which("nvidia-smi")) is None:
+        return None
+    words = [command, "--query-gpu=memory.used", "--format=csv,noheader,nounits", "--id=0"]
+    return float(subprocess.run(words, capture_output=True, text=True, check=True).stdout)
 
 
 def _arena_steps(metrics: Path) -> int:
@@ -130,7 +140,11 @@ def sum_up(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
     """
     rows = rows[int(WARM_UP * len(rows)) :]
     hours = np.array([row["seconds"] for row in rows]) / 3600.0
-    found = {name: _trend(hours, np.array([row[name] for row in rows])) for name in _LEVELS}
+    found = {
+        name: _trend(hours, np.array([row[name] for row in rows]))
+        for name in _LEVELS
+        if name in rows[0]
+    }
     steps = np.diff([row["arena_steps"] for row in rows])
     spent = (np.diff(hours) * 3600.0, np.diff([row["cpu_s"] for row in rows]))
     for name, seconds in zip(_SPEEDS, spent, strict=True):

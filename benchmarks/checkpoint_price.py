@@ -1,0 +1,160 @@
+"""What do checkpoints cost training?
+
+`python -m benchmarks.checkpoint_price [every=S] [seconds=S] [key=value ...]` compiles the program
+of a config once and trains with it in turn: with a checkpoint every `every` seconds, and without.
+The other words are those of `swarmjax.train`. It prints a JSON line: arena control steps a second
+of both, and the share of the speed that checkpoints take, the median over `PAIRS` pairs with a 95 %
+interval by order statistics. `price_at_60_s` is that share if one is written every minute: each
+checkpoint costs the same.
+"""
+
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from benchmarks.pairs import median
+from swarmjax import command, provenance
+from swarmjax.config import Section, about, build
+from swarmjax.curriculum.engine import Schedule
+from swarmjax.run import checkpoint, directory, lifecycle, memory, trainer
+from swarmjax.run.display import Display, Row
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.signals import Stop
+from swarmjax.run.trainer import Built, Compiled
+from swarmjax.sim import dispatch
+from swarmjax.training.loop import TrainState
+
+PAIRS = 6
+WARM_UP_S = 20.0  # of training before the clock starts: calls grow, and robots learn to arrive
+_OWN = ("every", "seconds")
+_NEVER = 1e6  # minutes
+
+
+@dataclass(frozen=True, kw_only=True)
+class PriceConfig(Section):
+    """How often a checkpoint is written, and how long is trained."""
+
+    every: float = field(default=5.0, metadata=about("seconds between checkpoints", above=0.0))
+    seconds: float = field(default=20.0, metadata=about("of training, each time", above=0.0))
+
+
+class Clock(Display):
+    """Notes when the calls of a run end, and shows nothing.
+
+    Attributes:
+        ends: Seconds of `time.perf_counter` and updates that were done, call by call.
+    """
+
+    def __init__(self) -> None:
+        """Has noted nothing."""
+        self.ends: list[tuple[float, int]] = []
+
+    def say(self, sentence: str) -> None:
+        """Shows nothing."""
+
+    def hear(self, rows: Sequence[Row]) -> None:
+        """Notes the end of a call."""
+        self.ends.append((time.perf_counter(), rows[-1]["update"]))
+
+    def show(self, summary: Row, speeds: Row, seconds_left: float) -> None:
+        """Shows nothing."""
+
+    def updates_per_s(self) -> float:
+        """Speed from the end of the first call to that of the last one."""
+        (began, first), (ended, last) = self.ends[0], self.ends[-1]
+        return (last - first) / (ended - began)
+
+
+@dataclass(frozen=True)
+class Stand:
+    """A compiled program with what it is called with."""
+
+    program: Built
+    schedule: Schedule
+    compiled: Compiled
+    state: TrainState
+
+    def train(self, minutes: float, seconds: float) -> tuple[float, int]:
+        """Trains a copy of the state; returns updates a second and how many were saved."""
+        clock, config = Clock(), self.program.config
+        run = replace(config.run, checkpoint_minutes=minutes, checkpoint_share=0.0)
+        program = replace(self.program, config=replace(config, run=run))
+        copy = jax.tree.map(jnp.copy, self.state)
+        with tempfile.TemporaryDirectory() as folder:
+            place, stop = Path(folder) / "run", Stop(until=time.monotonic() + seconds)
+            place.mkdir()
+            directory.write_json(place / directory.CONFIG, {})
+            trainer.train(place, program, self.schedule, self.compiled, copy, clock, stop)
+            saved = directory.read_rows(place / directory.SAVED, None)
+        # The first and the last are written with either.
+        return clock.updates_per_s(), len(saved) - 2
+
+
+def load(settings: TrainConfig) -> Stand:
+    """Compiles a config's program and trains until its speed is steady."""
+    program, schedule, state = lifecycle.begin(settings)
+    compiled, state = trainer.prepare(program, schedule, state, memory.limit())
+    began = time.perf_counter()
+    while time.perf_counter() - began < WARM_UP_S:
+        state, _ = jax.block_until_ready(compiled.call(schedule, state, jnp.int32(1)))
+    return Stand(program, schedule, compiled, state)
+
+
+def result(config: PriceConfig, settings: TrainConfig) -> dict[str, Any]:
+    """Trains in turn with checkpoints and without; returns the line."""
+    stand = load(settings)
+    pairs, saves = [], 0
+    for number in range(PAIRS):
+        # Each goes first half of the time, in case that the second finds a warmer machine.
+        both = [(config.every / 60.0, config.seconds), (_NEVER, config.seconds)]
+        found = [stand.train(*each) for each in (both if number % 2 else both[::-1])]
+        (saving, count), (free, _) = found if number % 2 else found[::-1]
+        pairs.append((saving, free))
+        saves += count
+    price, low, high = median([1.0 - saving / free for saving, free in pairs])
+    steps = settings.arenas * settings.algo.rollout_length
+    leaves = checkpoint.to_leaves(stand.state)
+    return {
+        "benchmark": "checkpoint_price",
+        "every_s": config.every,
+        "price": price,
+        "price_low": low,
+        "price_high": high,
+        "price_at_60_s": price * config.every / 60.0,
+        "price_at_60_s_high": high * config.every / 60.0,
+        "pairs": PAIRS,
+        "checkpoints": saves,
+        "checkpoint_mb": sum(leaf.nbytes for leaf in leaves.values()) / 1e6,
+        "arena_steps_per_s": median([saving for saving, _ in pairs])[0] * steps,
+        "arena_steps_per_s_without": median([free for _, free in pairs])[0] * steps,
+        "arenas": settings.arenas,
+        "robot": settings.robot.body,
+        "stages": [stage.name for stage in settings.stage],
+        "compile_s": stand.compiled.seconds,
+        "impl": dispatch.resolve_impl(settings.sim.impl),
+        "device": provenance.device(),
+        "versions": provenance.versions(),
+        "commit": provenance.commit(),
+    }
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    own = [word.partition("=") for word in arguments if word.partition("=")[0] in _OWN]
+    config = build(PriceConfig, {key: value for key, _, value in own})
+    words = [word for word in arguments if word.partition("=")[0] not in _OWN]
+    settings = load_train(["stage=s6", "run.tensorboard=false", *words])
+    sys.stdout.write(json.dumps(result(config, settings)) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("checkpoint_price", main, TrainConfig))
