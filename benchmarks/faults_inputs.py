@@ -231,7 +231,7 @@ def _mutate_words(words: list[str], cls: type[Section], draw: random.Random) -> 
     at = draw.randrange(len(words)) if words else 0
     nasty, key = draw.choice(_NASTY), draw.choice(keys)
     word = words[at] if words else "seed=0"
-    cut = draw.randrange(len(word))
+    cut = draw.randrange(max(1, len(word)))  # an earlier mutation may have left nothing
     changed = draw.choice(
         (
             *[f"{key}={nasty}"] * 5,

@@ -152,6 +152,7 @@ def test_a_run_goes_on(tmp_path: Path) -> None:
     chex.assert_trees_all_equal(second.policy.layers, whole.policy.layers)
 
 
+@pytest.mark.slow
 def test_as_many_arenas_as_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "fill", lambda settings, measure, limit: (settings, "why"))
     settings = TINY | {"run.dir": tmp_path / "run", "budget": 16, "arenas": "auto"}

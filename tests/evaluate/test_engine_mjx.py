@@ -237,7 +237,10 @@ def test_a_stage_that_does_not_fit_is_refused(world: World) -> None:
 
 @pytest.mark.parametrize(
     ("body", "shape", "learners", "deviation"),
-    [("planar", "ell", 3, 0.1), ("wheeled", "box", 1, 0.02)],
+    [
+        ("planar", "ell", 3, 0.1),
+        pytest.param("wheeled", "box", 1, 0.02, marks=pytest.mark.slow),
+    ],
 )
 def test_the_engines_of_the_command_agree(
     tmp_path: Path, body: Any, shape: Any, learners: int, deviation: float

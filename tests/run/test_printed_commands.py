@@ -37,7 +37,7 @@ def _pasted(text: str, name: str) -> list[str]:
     return words[3:]
 
 
-SLOW = ("grid", "seeds", "paper")
+SLOW = ("grid", "seeds", "paper", "hull", "own")
 
 
 @pytest.mark.parametrize(
