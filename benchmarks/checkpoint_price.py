@@ -74,7 +74,7 @@ class Clock(Display):
 
 
 @dataclass(frozen=True)
-class Stand:
+class Trained:
     """A compiled program with what it is called with."""
 
     program: Built
@@ -98,14 +98,14 @@ class Stand:
         return clock.updates_per_s(), len(saved) - 2
 
 
-def load(settings: TrainConfig) -> Stand:
+def load(settings: TrainConfig) -> Trained:
     """Compiles a config's program and trains until its speed is steady."""
     program, schedule, state = lifecycle.begin(settings)
     compiled, state = trainer.prepare(program, schedule, state, memory.limit())
     began = time.perf_counter()
     while time.perf_counter() - began < WARM_UP_S:
         state, _ = jax.block_until_ready(compiled.call(schedule, state, jnp.int32(1)))
-    return Stand(program, schedule, compiled, state)
+    return Trained(program, schedule, compiled, state)
 
 
 def result(config: PriceConfig, settings: TrainConfig) -> dict[str, Any]:
