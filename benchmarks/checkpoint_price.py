@@ -74,7 +74,7 @@ class Clock(Display):
 
 
 @dataclass(frozen=True)
-class Trained:
+class Steady:
     """A compiled program with what it is called with."""
 
     program: Built
@@ -98,14 +98,14 @@ class Trained:
         return clock.updates_per_s(), len(saved) - 2
 
 
-def load(settings: TrainConfig) -> Trained:
+def load(settings: TrainConfig) -> Steady:
     """Compiles a config's program and trains until its speed is steady."""
     program, schedule, state = lifecycle.begin(settings)
     compiled, state = trainer.prepare(program, schedule, state, memory.limit())
     began = time.perf_counter()
     while time.perf_counter() - began < WARM_UP_S:
         state, _ = jax.block_until_ready(compiled.call(schedule, state, jnp.int32(1)))
-    return Trained(program, schedule, compiled, state)
+    return Steady(program, schedule, compiled, state)
 
 
 def result(config: PriceConfig, settings: TrainConfig) -> dict[str, Any]:
