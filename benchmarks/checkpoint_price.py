@@ -20,9 +20,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from benchmarks.pairs import median
+from benchmarks import key_value
+from benchmarks.pairs import in_turn, median
 from swarmjax import command, provenance
-from swarmjax.config import Section, about, build
+from swarmjax.config import Section, about
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.run import checkpoint, directory, lifecycle, memory, trainer
 from swarmjax.run.display import Display, Row
@@ -34,7 +35,6 @@ from swarmjax.training.loop import TrainState
 
 PAIRS = 6
 WARM_UP_S = 20.0  # of training before the clock starts: calls grow, and robots learn to arrive
-_OWN = ("every", "seconds")
 _NEVER = 1e6  # minutes
 
 
@@ -110,18 +110,16 @@ def load(settings: TrainConfig) -> Steady:
 
 def result(config: PriceConfig, settings: TrainConfig) -> dict[str, Any]:
     """Trains in turn with checkpoints and without; returns the line."""
-    stand = load(settings)
-    pairs, saves = [], 0
-    for number in range(PAIRS):
-        # Each goes first half of the time, in case that the second finds a warmer machine.
-        both = [(config.every / 60.0, config.seconds), (_NEVER, config.seconds)]
-        found = [stand.train(*each) for each in (both if number % 2 else both[::-1])]
-        (saving, count), (free, _) = found if number % 2 else found[::-1]
-        pairs.append((saving, free))
-        saves += count
+    steady = load(settings)
+    found = in_turn(
+        lambda: steady.train(config.every / 60.0, config.seconds),
+        lambda: steady.train(_NEVER, config.seconds),
+        PAIRS,
+    )
+    pairs = [(saving, free) for (saving, _), (free, _) in found]
     price, low, high = median([1.0 - saving / free for saving, free in pairs])
     steps = settings.arenas * settings.algo.rollout_length
-    leaves = checkpoint.to_leaves(stand.state)
+    leaves = checkpoint.to_leaves(steady.state)
     return {
         "benchmark": "checkpoint_price",
         "every_s": config.every,
@@ -131,14 +129,14 @@ def result(config: PriceConfig, settings: TrainConfig) -> dict[str, Any]:
         "price_at_60_s": price * config.every / 60.0,
         "price_at_60_s_high": high * config.every / 60.0,
         "pairs": PAIRS,
-        "checkpoints": saves,
+        "checkpoints": sum(count for (_, count), _ in found),
         "checkpoint_mb": sum(leaf.nbytes for leaf in leaves.values()) / 1e6,
         "arena_steps_per_s": median([saving for saving, _ in pairs])[0] * steps,
         "arena_steps_per_s_without": median([free for _, free in pairs])[0] * steps,
         "arenas": settings.arenas,
         "robot": settings.robot.body,
         "stages": [stage.name for stage in settings.stage],
-        "compile_s": stand.compiled.seconds,
+        "compile_s": steady.compiled.seconds,
         "impl": dispatch.resolve_impl(settings.sim.impl),
         "device": provenance.device(),
         "versions": provenance.versions(),
@@ -148,9 +146,7 @@ def result(config: PriceConfig, settings: TrainConfig) -> dict[str, Any]:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    own = [word.partition("=") for word in arguments if word.partition("=")[0] in _OWN]
-    config = build(PriceConfig, {key: value for key, _, value in own})
-    words = [word for word in arguments if word.partition("=")[0] not in _OWN]
+    config, words = key_value.parse(PriceConfig, arguments)
     settings = load_train(["stage=s6", "run.tensorboard=false", *words])
     sys.stdout.write(json.dumps(result(config, settings)) + "\n")
     return 0

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import peers, steps_per_second
+from benchmarks import key_value, peers, steps_per_second
 from benchmarks.watched_run import MADE_WITH, Watched
 from swarmjax import command
 from swarmjax.config import Section, about
@@ -113,7 +113,7 @@ def results(given: SuccessConfig, words: Sequence[str]) -> Iterator[Row]:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    given, words = peers.parse(SuccessConfig, arguments)
+    given, words = key_value.parse(SuccessConfig, arguments)
     peers.write(results(given, words))
     return 0
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import mujoco_arena, peers, timing
+from benchmarks import key_value, mujoco_arena, peers, timing
 from benchmarks.mujoco_arena import Moved, MujocoArena
 from swarmjax import provenance
 from swarmjax.config import Section, about, to_dict
@@ -200,7 +200,7 @@ def results(given: PaperWayConfig, words: list[str]) -> Iterator[dict[str, Any]]
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    mine, rest = peers.parse(PaperWayConfig, arguments)
+    mine, rest = key_value.parse(PaperWayConfig, arguments)
     peers.write(results(mine, rest))
     return 0
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import mujoco_arena, peers, timing
+from benchmarks import key_value, mujoco_arena, peers, timing
 from benchmarks.mujoco_arena import MujocoArena
 from swarmjax import provenance
 from swarmjax.config import ConfigError, Section, about, to_dict
@@ -207,7 +207,7 @@ def results(given: Sb3Config, words: list[str]) -> Iterator[dict[str, Any]]:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    mine, rest = peers.parse(Sb3Config, arguments)
+    mine, rest = key_value.parse(Sb3Config, arguments)
     peers.write(results(mine, rest))
     return 0
 

@@ -11,8 +11,9 @@ from typing import Literal
 
 import numpy as np
 
-from swarmjax.config import ConfigError, Section, about, build
-from swarmjax.config.section import MAX_COUNT, names
+from benchmarks import key_value
+from swarmjax.config import ConfigError, Section, about
+from swarmjax.config.section import MAX_COUNT
 from swarmjax.run.settings import TrainConfig, load_train
 from swarmjax.task.stage_config import StageConfig
 
@@ -21,7 +22,6 @@ HELD_OUT = "expanded"
 GRID_GOAL = "s6"
 HELD_OUT_ROBOTS = 5  # policies that trained with more are judged on their goal alone
 _CHOSEN = {"stage": "goal", "algo.policy": "policies", "curriculum.mode": "arms"}
-_LISTS = ("arms", "policies")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,14 +64,10 @@ def parse(words: Sequence[str]) -> tuple[StudyConfig, list[str]]:
     Raises:
       ConfigError: if a word of the study is unsound, or one of training is what arms are about.
     """
-    mine = set(names(StudyConfig))
-    parts = [(word, *word.partition("=")[::2]) for word in words]
-    for _, key, _ in parts:
+    for key in (word.partition("=")[0] for word in words):
         if key in _CHOSEN:
             raise ConfigError(f"{key} cannot be given: choose it by {_CHOSEN[key]}.")
-    given = {key: value.split(",") if key in _LISTS else value for _, key, value in parts}
-    study = {key: value for key, value in given.items() if key in mine}
-    return build(StudyConfig, study), [word for word, key, _ in parts if key not in mine]
+    return key_value.parse(StudyConfig, words)
 
 
 def curriculum_of(goal: str) -> str:

@@ -16,9 +16,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks import faults_disk, faults_inputs, faults_nan, faults_policies, faults_runs
+from benchmarks import (
+    faults_disk,
+    faults_inputs,
+    faults_nan,
+    faults_policies,
+    faults_runs,
+    key_value,
+)
 from swarmjax import command, provenance
-from swarmjax.config import ConfigError, Section, about, build, show
+from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.config.section import MAX_COUNT
 
 Trial = Callable[[int, Path], dict[str, Any]]
@@ -77,11 +84,7 @@ def parse(words: Sequence[str]) -> FaultsConfig:
     Raises:
         ConfigError: a word is unsound.
     """
-    pairs = [word.partition("=") for word in words]
-    for key, equals, _ in pairs:
-        if not equals:
-            raise ConfigError(f"{show(key)} is not a setting: give key=value.")
-    return build(FaultsConfig, {key: value for key, _, value in pairs})
+    return key_value.load(FaultsConfig, words)
 
 
 def read(out: Path) -> list[dict[str, Any]]:

@@ -14,7 +14,6 @@ import functools
 import os
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -23,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.faults_runs import SECONDS, WORDS, is_whole, start
+from benchmarks.faults_runs import SECONDS, is_whole, start, train_command
 
 SIZES = 20
 PAGE = 4096  # bytes; a tmpfs has whole pages
@@ -109,7 +108,7 @@ def _on_a_disk(folder: Path, size: int, options: str, run: Path | None = None) -
     disk, kept = folder / "disk", folder / "run"
     disk.mkdir()
     before = "" if run is None else f"cp -r {run} {disk}/run;"
-    command = " ".join([sys.executable, "-m", "swarmjax.train", *WORDS, f"run.dir={disk}/run"])
+    command = " ".join(train_command(disk / "run"))
     script = (
         f"mount -t tmpfs -o size={size} tmpfs {disk} || exit 99; {before}"
         f"mount -o remount,{options} {disk}; {command}; code=$?;"
@@ -132,9 +131,9 @@ def _read_only(random: np.random.Generator, folder: Path) -> dict[str, Any]:
     return _on_a_disk(folder, 8 * _needed(), "ro", run if run.exists() else None)
 
 
-def _begin(run: Path, random: np.random.Generator, **environment: str) -> None:
+def _begin(run: Path, random: np.random.Generator) -> None:
     """Trains for a while, then asks the run to stop."""
-    process = start(run, environment)
+    process = start(run)
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(random.uniform(0.3, 1.0) * SECONDS)
     process.terminate()
@@ -144,10 +143,9 @@ def _begin(run: Path, random: np.random.Generator, **environment: str) -> None:
 def _removed(random: np.random.Generator, folder: Path) -> dict[str, Any]:
     """Removes the directory of a run while it trains."""
     run = folder / "run"
-    words = [sys.executable, "-m", "swarmjax.train", *WORDS, f"run.dir={run}"]
     wait = random.uniform(0.2, 1.0) * SECONDS
     gone = subprocess.Popen(["sh", "-c", f"sleep {wait:.3f}; rm -rf {run}"])
-    told = _hindered(words, {0, 1, 2})
+    told = _hindered(train_command(run), {0, 1, 2})
     gone.wait()
     return told
 
@@ -157,8 +155,7 @@ def _two(random: np.random.Generator, folder: Path) -> dict[str, Any]:
     run = folder / "run"
     first = start(run)
     time.sleep(random.uniform(0.0, 0.8) * SECONDS)
-    words = [sys.executable, "-m", "swarmjax.train", *WORDS, f"run.dir={run}"]
-    told = _hindered(words, {0, 2})
+    told = _hindered(train_command(run), {0, 2})
     first.communicate()
     # One of them trains and the other is refused; one that comes late finds nothing left to do.
     codes = {first.returncode, told["code"]}
@@ -172,9 +169,8 @@ def _clock(random: np.random.Generator, folder: Path) -> dict[str, Any]:
         return {"missing": "libfaketime"}
     run = folder / "run"
     _begin(run, random)
-    words = [sys.executable, "-m", "swarmjax.train", *WORDS, f"run.dir={run}"]
     clock = {"LD_PRELOAD": str(library), "FAKETIME": "-1d", "FAKETIME_DONT_FAKE_MONOTONIC": "1"}
-    return _hindered(words, {0}, env=os.environ | clock)
+    return _hindered(train_command(run), {0}, env=os.environ | clock)
 
 
 _KINDS: Mapping[str, Callable[[np.random.Generator, Path], dict[str, Any]]] = {

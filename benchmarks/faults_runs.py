@@ -8,14 +8,13 @@ and are compared with an undisturbed run.
 import contextlib
 import functools
 import json
-import os
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -45,15 +44,15 @@ SECONDS = 8.0  # that a whole run takes, about
 _POLL = 0.002  # s
 
 
-def start(run: Path, environment: Mapping[str, str] | None = None) -> subprocess.Popen[str]:
-    """Starts or goes on with a run, in a process of its own, with more `environment`."""
-    words = [sys.executable, "-m", "swarmjax.train", *WORDS, f"run.dir={run}"]
+def train_command(run: Path) -> list[str]:
+    """Returns the words that start or go on with a run."""
+    return [sys.executable, "-m", "swarmjax.train", *WORDS, f"run.dir={run}"]
+
+
+def start(run: Path) -> subprocess.Popen[str]:
+    """Starts or goes on with a run, in a process of its own."""
     return subprocess.Popen(
-        words,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env=os.environ | dict(environment or {}),
+        train_command(run), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
 
 

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import optax
 from jax.errors import JaxRuntimeError
 
-from benchmarks import peers, timing
+from benchmarks import key_value, timing
 from swarmjax import command, provenance
 from swarmjax.config import Section, about
 from swarmjax.ppo import losses, networks
@@ -193,7 +193,7 @@ def _about(
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    given, words = peers.parse(SpeedConfig, arguments)
+    given, words = key_value.parse(SpeedConfig, arguments)
     algo = load_train(words).algo
     for size in given.batch:
         for line in lines(given, algo, size):

@@ -1,7 +1,7 @@
 """Two programs timed in turn, and what can be said of the ratio of their times."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from math import comb
 
@@ -56,12 +56,26 @@ def time_in_turn(one: Arm, other: Arm, updates: int, pairs: int) -> list[tuple[f
     """
     for each in (one, other):
         each.time(updates)
-    times = []
+    return in_turn(partial(one.time, updates), partial(other.time, updates), pairs)
+
+
+def in_turn[T](one: Callable[[], T], other: Callable[[], T], pairs: int) -> list[tuple[T, T]]:
+    """Calls two functions in turn; which comes first changes from pair to pair.
+
+    Args:
+      one: a function.
+      other: another.
+      pairs: of calls.
+
+    Returns:
+      What `one` and `other` returned, a pair each.
+    """
+    found = []
     for i in range(pairs):
         first, second = (one, other) if i % 2 == 0 else (other, one)
-        a, b = first.time(updates), second.time(updates)
-        times.append((a, b) if i % 2 == 0 else (b, a))
-    return times
+        a, b = first(), second()
+        found.append((a, b) if i % 2 == 0 else (b, a))
+    return found
 
 
 def median(values: Sequence[float]) -> tuple[float, float, float]:

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from benchmarks import peer_vmas, peers, timing
+from benchmarks import key_value, peer_vmas, peers, timing
 from benchmarks.peers import PeerConfig
 from swarmjax import provenance
 from swarmjax.config import about, to_dict
@@ -144,7 +144,7 @@ def results(config: BenchmarlConfig) -> Iterator[dict[str, Any]]:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    peers.write(results(peers.load(BenchmarlConfig, arguments)))
+    peers.write(results(key_value.load(BenchmarlConfig, arguments)))
     return 0
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from benchmarks import peers, timing
+from benchmarks import key_value, peers, timing
 from benchmarks.peers import PeerConfig
 from swarmjax import epuck, provenance
 from swarmjax.config import about
@@ -111,7 +111,7 @@ def _steps(world: Any, config: PeerConfig, carry: Any, _: None) -> tuple[Any, ja
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    peers.write(results(peers.load(CamarConfig, arguments)))
+    peers.write(results(key_value.load(CamarConfig, arguments)))
     return 0
 
 

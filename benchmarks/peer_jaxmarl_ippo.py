@@ -22,7 +22,7 @@ import optax
 from flax import linen as nn
 from jax import Array
 
-from benchmarks import peer_jaxnav, peers, timing
+from benchmarks import key_value, peer_jaxnav, peers, timing
 from benchmarks.peers import PeerConfig
 from swarmjax import provenance
 from swarmjax.config import about, to_dict
@@ -249,7 +249,7 @@ def results(config: IppoConfig) -> Iterator[dict[str, Any]]:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    peers.write(results(peers.load(IppoConfig, arguments)))
+    peers.write(results(key_value.load(IppoConfig, arguments)))
     return 0
 
 

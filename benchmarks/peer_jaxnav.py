@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from benchmarks import peers, timing
+from benchmarks import key_value, peers, timing
 from benchmarks.peers import PeerConfig
 from swarmjax import epuck, provenance
 from swarmjax.config import about
@@ -164,7 +164,7 @@ def _steps(
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    peers.write(results(peers.load(JaxNavConfig, arguments)))
+    peers.write(results(key_value.load(JaxNavConfig, arguments)))
     return 0
 
 

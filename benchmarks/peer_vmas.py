@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal
 
-from benchmarks import peers, timing
+from benchmarks import key_value, peers, timing
 from benchmarks.peers import PeerConfig
 from swarmjax import provenance
 from swarmjax.config import about
@@ -96,7 +96,7 @@ def _wait(torch: Any) -> None:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    peers.write(results(peers.load(VmasConfig, arguments)))
+    peers.write(results(key_value.load(VmasConfig, arguments)))
     return 0
 
 

@@ -16,8 +16,7 @@ from typing import Any
 
 from benchmarks import timing
 from swarmjax import command, provenance
-from swarmjax.config import ConfigError, Section, about, build, section
-from swarmjax.config.section import keys
+from swarmjax.config import Section, about
 
 TORCH = "benchmarks/torch-peers.txt"
 
@@ -38,47 +37,6 @@ class PeerConfig(Section):
     repeats: int = field(default=5, metadata=about("calls that are timed", 1, 1000))
     step_limit: int = field(default=500, metadata=about("control steps of an episode", 1, 10**6))
     seed: int = field(default=0, metadata=about("random seed", 0, 2**31 - 1))
-
-
-def load(cls: type[Section], words: Sequence[str]) -> Any:
-    """Makes a config of `key=value` words; lists have commas between their values.
-
-    Args:
-      cls: of the config.
-      words: of the command line.
-
-    Returns:
-      An instance of `cls`.
-
-    Raises:
-      ConfigError: if a word is unsound.
-    """
-    lists = {name for name, item in keys(cls).items() if "tuple" in str(item.type)}
-    given = {}
-    for word in words:
-        key, equals, value = word.partition("=")
-        if not equals:
-            raise ConfigError(f"'{word}' is not a setting: give key=value.")
-        given[key] = value.split(",") if key in lists else value
-    return build(cls, given)
-
-
-def parse(cls: type[Section], words: Sequence[str]) -> tuple[Any, list[str]]:
-    """Makes a config of the words that are its keys.
-
-    Args:
-      cls: of the config.
-      words: of the command line.
-
-    Returns:
-      An instance of `cls`, and the other words.
-
-    Raises:
-      ConfigError: if a word of `cls` is unsound.
-    """
-    known = section.names(cls)
-    mine = [word for word in words if word.partition("=")[0] in known]
-    return load(cls, mine), [word for word in words if word not in mine]
 
 
 def find(module: str, source: str) -> Any:

@@ -31,7 +31,7 @@ import jax
 import numpy as np
 from flax import linen
 
-from benchmarks import curriculum, peers, steps_per_second, timing
+from benchmarks import curriculum, key_value, peers, steps_per_second, timing
 from benchmarks.curriculum_arms import StudyConfig
 from swarmjax.config import ConfigError, Section, about, to_dict
 from swarmjax.config.section import MAX_COUNT
@@ -336,7 +336,7 @@ def seconds_to(course: Course) -> dict[str, float | None]:
 
 def parse(words: Sequence[str]) -> tuple[RaceConfig, TrainConfig]:
     """Tells the words of the race from those of training; raises ConfigError."""
-    race, rest = peers.parse(RaceConfig, words)
+    race, rest = key_value.parse(RaceConfig, words)
     trained = load_train(["stage=s6", *rest])
     _check(race, trained)
     return race, trained

@@ -17,9 +17,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from benchmarks import key_value
 from swarmjax import command, provenance
 from swarmjax.config import Section, about, build, to_dict
-from swarmjax.config.section import MAX_COUNT, names
+from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate import engine_mjx
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.run import trainer
@@ -61,15 +62,8 @@ def parse(words: Sequence[str]) -> tuple[RecipeConfig, TrainConfig]:
     Raises:
       ConfigError: a word is unsound.
     """
-    mine = set(names(RecipeConfig))
-    parts = [(word, *word.partition("=")[::2]) for word in words]
-    given = {
-        key: value.split(",") if key == "judged" else value
-        for _, key, value in parts
-        if key in mine
-    }
-    trained = load_train(["seeds=5", *(word for word, key, _ in parts if key not in mine)])
-    return build(RecipeConfig, given), trained
+    recipe, rest = key_value.parse(RecipeConfig, words)
+    return recipe, load_train(["seeds=5", *rest])
 
 
 def load_judge(recipe: RecipeConfig, trained: TrainConfig) -> Judge:
@@ -165,7 +159,7 @@ def result(recipe: RecipeConfig, trained: TrainConfig, words: Sequence[str]) -> 
     return {
         "benchmark": "recipes",
         "label": recipe.label,
-        "words": [word for word in words if word.partition("=")[0] not in names(RecipeConfig)],
+        "words": key_value.parse(RecipeConfig, words)[1],
         "seeds": list(trained.numbers),
         "arenas": trained.arenas,
         "budget": trained.budget,

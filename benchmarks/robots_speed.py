@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from benchmarks import peers, steps_per_second
+from benchmarks import key_value, steps_per_second
 from swarmjax import command
 from swarmjax.config import Section, about
 from swarmjax.run.settings import TrainConfig, load_train
@@ -51,7 +51,7 @@ def load(robots: int, total: int, words: Sequence[str]) -> TrainConfig:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    given, words = peers.parse(RobotsConfig, arguments)
+    given, words = key_value.parse(RobotsConfig, arguments)
     points = [load(robots, given.total, words) for robots in given.robots]
     for lines in steps_per_second.sweep(points):
         for line in lines:

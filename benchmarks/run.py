@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
-from benchmarks import peers, run_page
+from benchmarks import key_value, run_page
 from benchmarks.suites import SUITES, SuiteEntry
 from swarmjax import command
 from swarmjax.config import ConfigError, Section, about
@@ -306,7 +306,7 @@ def run_suite(config: SuiteRunConfig, say: TextIO) -> None:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    config = peers.load(SuiteRunConfig, arguments)
+    config = key_value.load(SuiteRunConfig, arguments)
     if config.suite is not None:
         run_suite(config, sys.stderr)
     if config.docs is not None:

@@ -26,9 +26,10 @@ import jax
 import numpy as np
 
 import swarmjax
+from benchmarks import key_value
 from swarmjax import atomic_file, command, provenance
-from swarmjax.config import ConfigError, Section, about, build, show
-from swarmjax.config.section import MAX_COUNT, names
+from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate import cells, statistics, trials
 from swarmjax.evaluate.cells import Cell
 from swarmjax.evaluate.config import EvaluateConfig
@@ -37,7 +38,6 @@ from swarmjax.task.stage_files import load_levels
 
 MEASURES = ("targets_reached", "all_reached", "contacts_per_robot", "episode_time_s")
 ACTIONS = ("sampled", "mean")
-_LISTS = ("arenas", "transitions", "cells")
 _ROBOTS = 5  # of an arena, which a transition is counted by
 
 
@@ -234,22 +234,9 @@ def _load(
         return {name: file[name] for name in MEASURES}
 
 
-def parse(words: Sequence[str]) -> tuple[ScalingConfig, list[str]]:
-    """Takes the benchmark's own words out of those of training.
-
-    Raises:
-      ConfigError: a word is unsound.
-    """
-    mine, given = set(names(ScalingConfig)), {}
-    for key, _, value in (word.partition("=") for word in words):
-        if key in mine:
-            given[key] = value.split(",") if key in _LISTS else value
-    return build(ScalingConfig, given), [w for w in words if w.partition("=")[0] not in mine]
-
-
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    config, words = parse(arguments)
+    config, words = key_value.parse(ScalingConfig, arguments)
     lines = {
         "train": lambda: train(config, words),
         "judge": lambda: judge(config),

@@ -24,15 +24,15 @@ from typing import Any, Literal
 import numpy as np
 from scipy import stats
 
+from benchmarks import key_value
 from swarmjax import command, provenance
-from swarmjax.config import Section, about, build
+from swarmjax.config import Section, about
 from swarmjax.run import directory
 from swarmjax.run.signals import REQUEUE
 
 EVERY_S = 10.0  # between two samples
 WARM_UP = 0.1  # share of a leg that is left out: caches fill, and the policy learns to move
 SAMPLES = "samples.jsonl"
-_OWN = ("dir", "minutes", "do")
 _TAIL = 65_536  # bytes at the end of the metrics, which hold its last line
 _LEVELS = ("memory_mb", "device_memory_mb", "descriptors", "threads")
 _SPEEDS = ("arena_steps_per_s", "arena_steps_per_cpu_s")
@@ -187,12 +187,11 @@ def table(folder: Path) -> dict[str, Any]:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    own = [word for word in arguments if word.partition("=")[0] in _OWN]
-    settings = build(SoakConfig, {key: value for key, _, value in (w.partition("=") for w in own)})
+    settings, words = key_value.parse(SoakConfig, arguments)
     if settings.do == "table":
         sys.stdout.write(json.dumps(table(Path(settings.dir))) + "\n")
         return 0
-    for _ in leg(settings, [word for word in arguments if word not in own]):
+    for _ in leg(settings, words):
         pass
     return 0
 

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from benchmarks import peers, steps_per_second
+from benchmarks import key_value, peers, steps_per_second
 from benchmarks.watched_run import MADE_WITH, Watched
 from swarmjax import command
 from swarmjax.config import Section, about
@@ -78,7 +78,7 @@ def results(given: StartConfig, words: Sequence[str]) -> Iterator[Row]:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    given, words = peers.parse(StartConfig, arguments)
+    given, words = key_value.parse(StartConfig, arguments)
     peers.write(results(given, words))
     return 0
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from sentences import refusal
 
-from benchmarks import peers, robots_speed, run, run_page, run_tables, steps_per_second
+from benchmarks import key_value, peers, robots_speed, run, run_page, run_tables, steps_per_second
 from benchmarks.run import Line, Output, SuiteEntry, SuiteRunConfig
 from benchmarks.suites import SUITES
 from swarmjax.run.settings import load_train
@@ -189,7 +189,7 @@ def test_a_benchmark_without_its_peer_says_so(
 
 
 def test_words_of_a_peer() -> None:
-    found, rest = peers.parse(peers.PeerConfig, ["arenas=8,16", "stage=s6", "robots=2"])
+    found, rest = key_value.parse(peers.PeerConfig, ["arenas=8,16", "stage=s6", "robots=2"])
     assert (found.arenas, found.robots, rest) == ((8, 16), 2, ["stage=s6"])
 
 

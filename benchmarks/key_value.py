@@ -1,0 +1,48 @@
+"""A benchmark's own words of the command line, among those of `swarmjax.train`."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from swarmjax.config import ConfigError, Section, build, section, show
+from swarmjax.config.section import keys
+
+
+def load(cls: type[Section], words: Sequence[str]) -> Any:
+    """Makes a config of `key=value` words; lists have commas between their values.
+
+    Args:
+      cls: of the config.
+      words: of the command line.
+
+    Returns:
+      An instance of `cls`.
+
+    Raises:
+      ConfigError: if a word is unsound.
+    """
+    lists = {name for name, item in keys(cls).items() if "tuple" in str(item.type)}
+    given = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals:
+            raise ConfigError(f"{show(word)} is not a setting: give key=value.")
+        given[key] = value.split(",") if key in lists else value
+    return build(cls, given)
+
+
+def parse(cls: type[Section], words: Sequence[str]) -> tuple[Any, list[str]]:
+    """Makes a config of the words that are its keys.
+
+    Args:
+      cls: of the config.
+      words: of the command line.
+
+    Returns:
+      An instance of `cls`, and the other words.
+
+    Raises:
+      ConfigError: if a word of `cls` is unsound.
+    """
+    known = section.names(cls)
+    mine = [word for word in words if word.partition("=")[0] in known]
+    return load(cls, mine), [word for word in words if word not in mine]
