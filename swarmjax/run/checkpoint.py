@@ -24,7 +24,7 @@ import numpy as np
 from absl import logging as absl_logging
 
 from swarmjax.policy import digest
-from swarmjax.run import directory
+from swarmjax.run import directory, heap
 from swarmjax.run.errors import CheckpointError, TrainingError
 
 # Orbax takes half a second to import, which a run spends while it compiles (`trainer`).
@@ -164,6 +164,7 @@ class Checkpoints:
         except Exception as error:  # whatever a full disk makes Orbax raise
             reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
             raise TrainingError(f"checkpoint {update} cannot be written: {reason}.") from None
+        heap.release()
 
     def _write_step(self, leaves: Leaves, meta: dict[str, Any], score: float | None) -> None:
         import orbax.checkpoint as ocp
