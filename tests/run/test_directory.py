@@ -1,7 +1,9 @@
 """A run directory: one process at a time, and logs whose truth is what a checkpoint counts."""
 
+import resource
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -95,6 +97,22 @@ def test_a_full_disk_is_an_error_and_nothing_waits(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="No space left on device"):
         log.write([{"update": 0}])
     log.close()
+
+
+@pytest.fixture
+def room_for_10_bytes() -> Iterator[None]:
+    """Lets no file of this process grow beyond ten bytes, as a disk that is nearly full."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.usefixtures("room_for_10_bytes")
+def test_rows_that_a_disk_holds_in_part_are_an_error(tmp_path: Path) -> None:
+    with Log(tmp_path / "metrics.jsonl") as log, pytest.raises(OSError, match="No space left"):
+        log.write([{"update": 0}])
+    assert (tmp_path / "metrics.jsonl").read_text() == '{"update":'
 
 
 def test_rows_are_dropped_by_update_where_no_bytes_are_counted(tmp_path: Path) -> None:
