@@ -4,6 +4,7 @@ import resource
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -99,20 +100,33 @@ def test_a_full_disk_is_an_error_and_nothing_waits(tmp_path: Path) -> None:
     log.close()
 
 
-@pytest.fixture
-def room_for_10_bytes() -> Iterator[None]:
+@contextmanager
+def _room_for_10_bytes() -> Iterator[None]:
     """Lets no file of this process grow beyond ten bytes, as a disk that is nearly full."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-@pytest.mark.usefixtures("room_for_10_bytes")
 def test_rows_that_a_disk_holds_in_part_are_an_error(tmp_path: Path) -> None:
-    with Log(tmp_path / "metrics.jsonl") as log, pytest.raises(OSError, match="No space left"):
+    with (
+        Log(tmp_path / "metrics.jsonl") as log,
+        _room_for_10_bytes(),
+        pytest.raises(OSError, match="No space left"),
+    ):
         log.write([{"update": 0}])
     assert (tmp_path / "metrics.jsonl").read_text() == '{"update":'
+
+
+def test_a_log_is_cut_without_writing_it_again(tmp_path: Path) -> None:
+    lines = b'{"update": 0}\n{"update": 1}\n'
+    (tmp_path / "log").write_bytes(lines)
+    with _room_for_10_bytes():
+        directory.cut(tmp_path / "log", 14)
+    assert (tmp_path / "log").read_bytes() == lines[:14]
 
 
 def test_rows_are_dropped_by_update_where_no_bytes_are_counted(tmp_path: Path) -> None:

@@ -181,7 +181,7 @@ def test_two_processes_do_not_write_one_run(tmp_path: Path) -> None:
     _wait_for(tmp_path / "metrics.jsonl")
     try:
         with pytest.raises(ConfigError, match=f"process {first.pid} is writing"):
-            train.main([f"resume={tmp_path}"])
+            train.main([f"resume={tmp_path}", "run.stop_after=1"])
         with pytest.raises(ConfigError, match="holds a run already"):
             train.main([*TINY, f"run.dir={tmp_path}"])
     finally:
