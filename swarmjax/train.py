@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 
+from swarmjax.run import heap
 from swarmjax.run.signals import Stop
 
 
@@ -30,6 +31,7 @@ def _train(arguments: Sequence[str], stop: Stop) -> int:
 
 def _command() -> int:
     """Runs the command on the arguments of the command line."""
+    heap.share()
     with Stop() as stop:
         from swarmjax import command
         from swarmjax.run.errors import CheckpointError
