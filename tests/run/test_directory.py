@@ -30,12 +30,14 @@ def test_a_second_process_is_refused_until_the_first_is_dead(tmp_path: Path) -> 
     with subprocess.Popen(code, stdout=subprocess.PIPE, text=True) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == "held\n"
-        with (
-            pytest.raises(ConfigError, match=f"which process {holder.pid} is writing: wait"),
-            directory.locked(run),
-        ):
-            pass
-        holder.kill()
+        try:
+            with (
+                pytest.raises(ConfigError, match=f"which process {holder.pid} is writing: wait"),
+                directory.locked(run),
+            ):
+                pass
+        finally:
+            holder.kill()
     with directory.locked(run):
         assert run.exists()
 
