@@ -182,8 +182,9 @@ def judge(
     """
     if not alike:
         return "WRONG"
-    # A run goes back to its checkpoint after so many updates without a step (`trainer`).
-    if np.isnan(metrics["policy_loss"][-trainer.PATIENCE :]).all():
+    # A run goes back to its checkpoint after so many updates that taught nothing (`trainer`).
+    barren = np.isnan(metrics["policy_loss"]) | (metrics["broken_arenas"] >= ARENAS * ROLLOUT)
+    if barren[-trainer.PATIENCE :].all():
         held, kept = spoilt.learners.params, last.learners.params
         same = jax.tree.map(partial(np.array_equal, equal_nan=True), held, kept)
         return "goes back" if all(jax.tree.leaves(same)) else "WRONG"

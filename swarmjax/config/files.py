@@ -5,11 +5,12 @@ and changes no directory, and is imported when it is used. What comes out is for
 `section.build`.
 """
 
+import contextlib
 import difflib
 import itertools
 import re
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -339,7 +340,8 @@ def values(words: Mapping[str, str]) -> dict[str, Any]:
     given = OmegaConf.create({})
     for key, word in words.items():
         try:
-            OmegaConf.update(given, key, _parse(word))
+            with _explained([word]):
+                OmegaConf.update(given, key, _parse(word))
         except OmegaConfBaseException as error:
             raise ConfigError(f"{show(word)} cannot be used: {_first_line(error)}.") from None
     return _resolve(given)
@@ -400,7 +402,10 @@ def _hydra(command: str, overrides: list[str]) -> tuple["DictConfig", dict[str, 
     outer = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
     try:
-        with hydra.initialize_config_dir(config_dir=str(_config_dir()), version_base="1.3"):
+        with (
+            _explained(overrides),
+            hydra.initialize_config_dir(config_dir=str(_config_dir()), version_base="1.3"),
+        ):
             composed = hydra.compose(command, overrides=overrides, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
         raise ConfigError(f"the settings do not fit together: {_first_line(error)}.") from None
@@ -410,6 +415,21 @@ def _hydra(command: str, overrides: list[str]) -> tuple["DictConfig", dict[str, 
     with open_dict(composed):
         del composed["hydra"]
     return composed, chosen
+
+
+@contextlib.contextmanager
+def _explained(words: Iterable[str]) -> Iterator[None]:
+    """Say which key goes on where there is a list: OmegaConf takes its next part for an index."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        for word, part in itertools.product(words, re.findall(r"'([^']*)'", str(error))):
+            key = word.removeprefix("++").partition("=")[0]
+            start, within, _ = f"{key}.".partition(f".{part}.")
+            if within and not isinstance(error, ConfigError):
+                said = f"{key} is not a key: {start} is a list, give {start}=[...]."
+                raise ConfigError(said) from None
+        raise
 
 
 def _resolve(config: "DictConfig") -> dict[str, Any]:

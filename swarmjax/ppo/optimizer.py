@@ -11,7 +11,7 @@ from swarmjax.ppo.losses import Metrics
 from swarmjax.ppo.networks import Params
 
 # The metrics of a step: those of `losses.ppo_loss`, the norm of the gradient before clipping, and 1
-# if the step was skipped.
+# if the step was taken, and if it was skipped.
 METRICS = (
     "approx_kl",
     "bound_loss",
@@ -20,6 +20,7 @@ METRICS = (
     "policy_loss",
     "value_loss",
     "grad_norm",
+    "taken_steps",
     "skipped_steps",
 )
 
@@ -113,8 +114,8 @@ def take(
         any_valid: [], whether the gradient is of any valid sample.
 
     Returns:
-        Parameters and the optimiser's state after, and the metrics with `grad_norm` and
-        `skipped_steps`, which are zero in a skipped step but for the last.
+        Parameters and the optimiser's state after, and the metrics with `grad_norm`,
+        `taken_steps` and `skipped_steps`, which are zero in a skipped step but for the last.
     """
     (params, optimizer_state), (gradient, metrics) = progress, found
     metrics["grad_norm"] = optax.tree.norm(gradient)
@@ -124,6 +125,7 @@ def take(
     metrics = {name: jnp.where(finite, metric, 0.0) for name, metric in metrics.items()}
     metrics["skipped_steps"] = (any_valid & ~finite).astype(jnp.float32)
     taken = any_valid & finite
+    metrics["taken_steps"] = taken.astype(jnp.float32)
     # Adam moves by its momentum even where the gradient is zero.
     return jax.tree.map(lambda new, old: jnp.where(taken, new, old), stepped, progress), metrics
 
@@ -140,12 +142,13 @@ def mean_of_taken(metrics: Metrics) -> Metrics:
         metrics: Of its steps, any shape, as `take` gives them.
 
     Returns:
-        The means over the steps that were taken, [], NaN if all were skipped, and the number of
-        `skipped_steps`.
+        The means over the steps that were taken, [], and the number of `skipped_steps`. Without a
+        step that was taken, the means are NaN if one was skipped, and 0 if there was none.
     """
-    skipped = jnp.sum(metrics["skipped_steps"])
-    count = metrics["skipped_steps"].size
+    taken, skipped = jnp.sum(metrics["taken_steps"]), jnp.sum(metrics["skipped_steps"])
     # Exactly 1 in an update whose steps were all taken.
-    share = count / (count - skipped)
+    share = metrics["taken_steps"].size / jnp.maximum(taken, 1.0)
+    share = jnp.where((taken == 0) & (skipped > 0), jnp.nan, share)
     means = {name: jnp.mean(metric) * share for name, metric in metrics.items()}
+    del means["taken_steps"]
     return means | {"skipped_steps": skipped}

@@ -35,6 +35,20 @@ def test_groups_and_keys_in_any_order():
     assert train.algo.clip_epsilon == 0.1
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["stage=curriculum", "stage.sequence.a=1"],
+        ["stage.sequence=[s1]", "stage.sequence.a=1"],
+        ["stage.sequence=[s1]", "stage.sequence.a.b=1"],
+    ],
+)
+def test_a_key_within_a_list_is_refused(words):
+    key = words[-1].removesuffix("=1")
+    expected = f"{key} is not a key: stage.sequence is a list, give stage.sequence=[...]."
+    assert refusal(load_train, words) == expected
+
+
 def test_of_a_key_given_twice_the_last_counts():
     train = load_train(["stage=s1", "seed=1", "stage=s2", "seed=2"])
     assert (train.stage_name, train.seed) == ("s2", 2)

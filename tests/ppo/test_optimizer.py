@@ -41,12 +41,24 @@ def test_epochs_and_minibatches_count_as_gradient_steps() -> None:
 
 def test_means_are_those_of_the_steps_that_were_taken() -> None:
     metrics = {
-        "loss": jnp.array([[1.0, 0.0], [2.0, 6.0]]),
-        "skipped_steps": jnp.array([[0.0, 1.0], [0, 0]]),
+        "loss": jnp.array([[1.0, 0.0, 0.0], [0.0, 2.0, 6.0]]),
+        "taken_steps": jnp.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]]),
+        "skipped_steps": jnp.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]),
     }
     found = optimizer.mean_of_taken(metrics)
     assert found["loss"] == pytest.approx((1.0 + 2.0 + 6.0) / 3)
     assert found["skipped_steps"] == 1.0
+
+
+def test_an_update_that_took_no_step_has_no_means_if_one_was_skipped() -> None:
+    metrics = {
+        "loss": jnp.zeros(3),
+        "taken_steps": jnp.zeros(3),
+        "skipped_steps": jnp.array([1.0, 0.0, 1.0]),
+    }
+    assert np.isnan(optimizer.mean_of_taken(metrics)["loss"])
+    nothing = metrics | {"skipped_steps": jnp.zeros(3)}
+    assert optimizer.mean_of_taken(nothing)["loss"] == 0.0
 
 
 def test_one_broken_gradient_leaves_parameters_and_optimiser_as_they_are() -> None:

@@ -282,6 +282,7 @@ def test_a_learner_steps_through_the_tiles_that_it_has_shuffled(
         progress, metrics = optimizer.take(config, 5, progress, slope, jnp.bool_(True))
         told.append(metrics)
     means = jax.tree.map(lambda *x: np.mean(x), *told)
+    del means["taken_steps"]
     means["std"] = np.mean(np.exp(progress[0]["actor"]["log_std"]))
     _assert_learned_alike(found, (*progress, means))
 
@@ -343,7 +344,11 @@ def test_tiles_with_valid_samples_are_dealt_out_once_a_pass(
 def test_what_the_kernels_tell_are_the_metrics_of_the_loss() -> None:
     params = _params(SMALL)
     _, expected = _expected(params, _minibatch(params, SMALL, 8), SMALL, 8.0)
-    of_the_step = ("grad_norm", "skipped_steps")  # what `optimizer.take` adds to the loss's own
+    of_the_step = (
+        "grad_norm",
+        "taken_steps",
+        "skipped_steps",
+    )  # what `optimizer.take` adds to the loss's own
     assert sorted(expected) == [name for name in optimizer.METRICS if name not in of_the_step]
 
 
