@@ -13,6 +13,7 @@ import hashlib
 import json
 import logging
 import shutil
+import sys
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -210,10 +211,23 @@ class Checkpoints:
                 self._manager.close()
 
 
+@functools.cache
 def _quieten() -> None:
-    """Keeps Orbax from telling every step of its own, and its errors beside our sentence."""
+    """Keeps Orbax from telling every step of its own, and its errors beside our sentence.
+
+    When a file cannot be written, Orbax closes its event loop, and TensorStore goes on to tell it
+    about the other files.
+    """
     absl_logging.set_verbosity(absl_logging.FATAL)
     logging.getLogger("absl").setLevel(logging.CRITICAL)
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
+    tell = sys.unraisablehook
+
+    def leave_out(unraisable: "sys.UnraisableHookArgs") -> None:
+        if str(unraisable.exc_value) != "Event loop is closed":
+            tell(unraisable)
+
+    sys.unraisablehook = leave_out
 
 
 def _is_sound(leaves: Leaves) -> bool:

@@ -2,7 +2,10 @@
 
 import gc
 import json
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -231,6 +234,34 @@ def test_a_state_is_copied_before_the_run_goes_on(tmp_path: Path) -> None:
         checkpoints.save(state, 1)
         state["weights"][:] = 1.0  # as the next call of the program does with a donated state
     assert not checkpoint.restore(tmp_path)[0]["weights"].any()
+
+
+# Saves where no file may have more than 2,000 bytes, as on a disk that is full.
+_FULL = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from swarmjax.run import checkpoint
+state = {f"a{i}": np.random.default_rng(i).random(500) for i in range(40)}
+resource.setrlimit(resource.RLIMIT_FSIZE, (2000, resource.RLIM_INFINITY))
+try:
+    with checkpoint.Checkpoints(Path(sys.argv[1]), keep=2) as checkpoints:
+        checkpoints.save(state, 0)
+except checkpoint.TrainingError as error:
+    print(error)
+"""
+
+
+def test_a_disk_that_is_full_is_one_sentence(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _FULL, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert done.stdout.startswith("checkpoint 0 cannot be written: ")
+    assert done.stdout.count("\n") == 1
+    assert done.stderr == ""
 
 
 def test_what_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
