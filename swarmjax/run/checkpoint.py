@@ -8,10 +8,12 @@ arrays, so that it can be read without the program that wrote it. Those of a run
 axis of seeds.
 """
 
+import errno
 import functools
 import hashlib
 import json
 import logging
+import os
 import shutil
 import sys
 from collections.abc import Mapping
@@ -163,8 +165,7 @@ class Checkpoints:
             if _is_sound(leaves) and update not in self._manager.all_steps():
                 self._write_step(leaves, meta, score)
         except Exception as error:  # whatever a full disk makes Orbax raise
-            reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
-            raise TrainingError(f"checkpoint {update} cannot be written: {reason}.") from None
+            raise TrainingError(f"checkpoint {update} cannot be written: {_why(error)}.") from None
         heap.release()
 
     def _write_step(self, leaves: Leaves, meta: dict[str, Any], score: float | None) -> None:
@@ -209,6 +210,14 @@ class Checkpoints:
             self._thread.shutdown()
             if "_manager" in self.__dict__:
                 self._manager.close()
+
+
+def _why(error: Exception) -> str:
+    """Says why a checkpoint could not be written; TensorStore names the reason at the very end."""
+    full = os.strerror(errno.ENOSPC)
+    if full in str(error):
+        return full
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]
 
 
 @functools.cache

@@ -264,6 +264,18 @@ def test_a_disk_that_is_full_is_one_sentence(tmp_path: Path) -> None:
     assert done.stderr == ""
 
 
+def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise ValueError(f"RESOURCE_EXHAUSTED: {'x' * 300} [OS error 28: No space left on device]")
+
+    monkeypatch.setattr(Checkpoints, "_write_step", fail)
+    with (
+        pytest.raises(TrainingError, match=r"checkpoint 1 cannot be written: No space left on dev"),
+        Checkpoints(tmp_path, keep=1) as checkpoints,
+    ):
+        checkpoints.save(_state(1.0), 1)
+
+
 def test_what_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "checkpoints").write_text("a file in the place of the folder")
     with (
