@@ -136,7 +136,7 @@ def sum_up(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
     Returns:
         By quantity: `median`, `slope`, `slope_low` and `slope_high`; slopes in percent of the
-        median an hour.
+        median an hour. Speeds are left out of a leg that stood still in most samples.
     """
     rows = rows[int(WARM_UP * len(rows)) :]
     hours = np.array([row["seconds"] for row in rows]) / 3600.0
@@ -148,7 +148,8 @@ def sum_up(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
     steps = np.diff([row["arena_steps"] for row in rows])
     spent = (np.diff(hours) * 3600.0, np.diff([row["cpu_s"] for row in rows]))
     for name, seconds in zip(_SPEEDS, spent, strict=True):
-        found[name] = _trend(hours[1:], steps / seconds)
+        if np.median(steps) > 0:
+            found[name] = _trend(hours[1:], steps / seconds)
     return found
 
 

@@ -38,6 +38,13 @@ def test_speeds_are_counted_by_the_second_and_by_the_processor_second() -> None:
     assert found["arena_steps_per_cpu_s"]["median"] == pytest.approx(250.0)
 
 
+def test_a_leg_that_stood_still_has_no_speed() -> None:
+    rows = [row | {"arena_steps": 5} for row in _rows(memory_slope=0.0)]
+    found = soak.sum_up(rows)
+    assert "memory_mb" in found
+    assert "arena_steps_per_s" not in found
+
+
 def test_a_sample_reads_the_last_whole_line_of_the_metrics(tmp_path: Path) -> None:
     rows = [json.dumps({"arena_steps": steps}) for steps in (10, 20)]
     (tmp_path / "metrics.jsonl").write_text("\n".join(rows) + '\n{"arena_st')
