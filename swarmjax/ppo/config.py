@@ -88,12 +88,16 @@ class AlgoConfig(Section):
     advantage: Literal["gae", "monte_carlo"] = field(
         default="gae",
         metadata=about(
-            "gae: bootstrapped, advantages normalised; monte_carlo: summed to the end of episode "
-            "or rollout and normalised, for the critic and for advantages"
+            "gae: bootstrapped; monte_carlo: summed to the end of episode or rollout and "
+            "normalised, for the critic and for advantages"
         ),
     )
     gae_lambda: float | None = field(
         default=None, metadata=about("of the advantages; null: 0.95 [advantage=gae]", 0.0, 1.0)
+    )
+    normalize_advantages: bool = field(
+        default=True,
+        metadata=about("those of gae, to mean 0 and deviation 1 over the rollout"),
     )
     time_out: Literal["bootstrap", "terminal", "leak"] | None = field(
         default=None,

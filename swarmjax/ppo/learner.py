@@ -55,8 +55,8 @@ class Batch:
         observation: [G, N, O], raw.
         action: [G, N, U], as drawn.
         log_prob: [G, N], as `act` returned it.
-        advantage: [G, N]; normalised over the valid samples before use, but not those of
-            Monte-Carlo returns, which are normalised themselves.
+        advantage: [G, N]; normalised over the valid samples before use if the config says so,
+            but not those of Monte-Carlo returns, which are normalised themselves.
         return_: [G, N], target of the critic.
         valid: [G, N], bool or 0/1.
     """
@@ -236,7 +236,7 @@ def _check(config: AlgoConfig, batch: Batch) -> None:
 def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch) -> Minibatch:
     """What the loss takes, still [G, N, ...]: normalised, and zero where not valid."""
     valid, advantage = batch.valid.astype(bool), batch.advantage
-    if config.advantage == "gae":
+    if config.advantage == "gae" and config.normalize_advantages:
         advantage = _normalize_advantages(advantage, valid)
     samples = Minibatch(
         observation=normalize(learner, batch.observation),
