@@ -127,7 +127,7 @@ class SwarmEnv(Env):
 
     def _draw(self, key: Array, each: int) -> EnvState:
         """Draws so many fresh episodes for each arena, packed."""
-        index = jnp.zeros(each * self.program.config.arenas, jnp.int32)
+        index = jnp.zeros((each, self.program.config.arenas), jnp.int32)
         return rollout.draw_starts(self.world, self.stages, index, jnp.int32(0), key)
 
     def _refill(self, inner: BraxArenas) -> BraxArenas:

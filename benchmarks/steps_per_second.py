@@ -134,7 +134,7 @@ def environment(
 
     def rolled(arenas: EnvState, key: Array) -> tuple[EnvState, dict[str, Array]]:
         level_key, key = jax.random.split(key)
-        index = jnp.zeros(program.config.arenas, jnp.int32)
+        index = jnp.zeros((1, program.config.arenas), jnp.int32)
         starts = rollout.draw_starts(world, schedule.stages, index, jnp.int32(0), level_key)
         keys = jax.random.split(key, program.config.algo.rollout_length)
         return jax.lax.scan(partial(body, starts=starts), arenas, keys)

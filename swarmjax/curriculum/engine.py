@@ -20,6 +20,7 @@ from jax import Array
 
 from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.extension import LevelDrawing
+from swarmjax.shards import ALONE, Shards
 from swarmjax.task import stage as task_stage
 from swarmjax.task.episode import Ended
 from swarmjax.task.stage import Stage
@@ -309,12 +310,13 @@ def assign(curriculum: Curriculum, arenas: int) -> Array:
     return jnp.minimum(stage, last).astype(jnp.int32)
 
 
-def count(curriculum: Curriculum, ended: Ended) -> Curriculum:
+def count(curriculum: Curriculum, ended: Ended, shards: Shards = ALONE) -> Curriculum:
     """Adds episodes that have ended to the cohort and the stage in which they began.
 
     Args:
       curriculum: before.
       ended: [T, A]; episodes of any other cohort than the last two are left out.
+      shards: how the arenas are spread over devices.
 
     Returns:
       The curriculum with new tallies.
@@ -323,8 +325,8 @@ def count(curriculum: Curriculum, ended: Ended) -> Curriculum:
     chex.assert_equal_shape([ended.cohort, ended.stage, ended.targets, ended.reached])
     return replace(
         curriculum,
-        current=_add(curriculum.current, ended, curriculum.cohort),
-        previous=_add(curriculum.previous, ended, curriculum.cohort - 1),
+        current=_add(curriculum.current, ended, curriculum.cohort, shards),
+        previous=_add(curriculum.previous, ended, curriculum.cohort - 1, shards),
     )
 
 
@@ -370,7 +372,7 @@ def _no_episodes(stages: int) -> CohortTally:
     return CohortTally(zero, zero, zero, zero, zero, jnp.zeros(stages, jnp.float32))
 
 
-def _add(tally: CohortTally, ended: Ended, cohort: Array) -> CohortTally:
+def _add(tally: CohortTally, ended: Ended, cohort: Array, shards: Shards) -> CohortTally:
     """Adds the episodes of one cohort to its tally."""
     stages = jnp.arange(tally.episodes.shape[0])[:, None, None]
     mine = (ended.cohort == cohort) & (ended.stage == stages)  # [S, T, A]
@@ -386,7 +388,7 @@ def _add(tally: CohortTally, ended: Ended, cohort: Array) -> CohortTally:
         contacts=total(jnp.sum(ended.contacts, axis=-1)),
         reward=total(ended.reward),
     )
-    return CohortTally(*(a + b for a, b in zip(tally, new, strict=True)))
+    return CohortTally(*(a + b for a, b in zip(tally, shards.sum(new), strict=True)))
 
 
 def _judge(record: Record, tally: CohortTally, judged: Array, options: CurriculumConfig) -> Record:

@@ -10,6 +10,7 @@ from swarmjax.config import ConfigError, show
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.optimizer import Progress
+from swarmjax.shards import Shards
 
 # XLA takes Triton's kernels from this generation on (Ampere, compute capability 8).
 _LEAST_GENERATION = 8
@@ -18,7 +19,9 @@ _FULL = ("highest", "float32", "F32_F32_F32")
 
 # autodiff: `learner` alone; blocks: autodiff of a whole batch, block by block; fused: kernels.
 Backend = Literal["autodiff", "blocks", "fused"]
-Learn = Callable[[AlgoConfig, int, Progress, Minibatch, jax.Array], tuple[Progress, Metrics]]
+Learn = Callable[
+    [AlgoConfig, int, Progress, Minibatch, jax.Array, Shards], tuple[Progress, Metrics]
+]
 
 
 def resolve(config: AlgoConfig, observation_size: int, action_size: int) -> Backend:

@@ -21,6 +21,7 @@ from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
 from swarmjax.ppo.normalizer import Normalizer
 from swarmjax.ppo.optimizer import Progress
+from swarmjax.shards import ALONE, Shards
 
 # Huang et al. 2022, "The 37 Implementation Details of Proximal Policy Optimization":
 # bound of normalised observations, continuous-action detail 7.
@@ -177,6 +178,7 @@ def update(
     key: jax.Array,
     updates: int,
     backend: Backend = "autodiff",
+    shards: Shards = ALONE,
 ) -> tuple[LearnerState, Metrics]:
     """Learns from one batch: `config.epochs` passes in `config.num_minibatches` steps each.
 
@@ -192,26 +194,28 @@ def update(
         key: Random key, consumed.
         updates: As given to `init`.
         backend: How the update is computed; `dispatch.resolve` chooses.
+        shards: How the groups are spread over devices. All devices come to the same state.
 
     Returns:
         The state after, and metrics, each []: those of `losses.ppo_loss` and `grad_norm` (before
         clipping), as means over the minibatches that were learned from, the number of
         `skipped_steps`, which were not finite, and the policy's mean `std` after the update.
     """
-    _check(config, batch)
+    _check(config, batch, shards)
     counted = batch.valid.astype(bool)
     batch = replace(batch, valid=counted & _is_finite(batch))
-    samples = _samples(learner, config, batch)
+    samples = _samples(learner, config, batch, shards)
     begun = (learner.params, learner.optimizer_state)
     learn = dispatch.find(backend) or _learn
-    (params, optimizer_state), metrics = learn(config, updates, begun, samples, key)
-    lost = jnp.any(counted) & ~jnp.any(batch.valid)  # no sample is finite: nor is any step
+    (params, optimizer_state), metrics = learn(config, updates, begun, samples, key, shards)
+    # If no sample is finite, nor is any step.
+    lost = shards.any(jnp.any(counted)) & ~shards.any(jnp.any(batch.valid))
     metrics["skipped_steps"] = jnp.where(lost, 1.0, metrics["skipped_steps"])
     metrics = optimizer.mean_of_taken(metrics)
     metrics["std"] = jnp.mean(jnp.exp(params["actor"]["log_std"]))
     moments = learner.normalizer
     if config.normalize_observations:
-        moments = normalizer.update(moments, batch.observation, batch.valid)
+        moments = normalizer.update(moments, batch.observation, batch.valid, shards)
     learned = replace(learner, params=params, optimizer_state=optimizer_state, normalizer=moments)
     return learned, metrics
 
@@ -225,19 +229,19 @@ def _is_finite(batch: Batch) -> jax.Array:
     return functools.reduce(jnp.logical_and, found)
 
 
-def _check(config: AlgoConfig, batch: Batch) -> None:
+def _check(config: AlgoConfig, batch: Batch, shards: Shards) -> None:
     chex.assert_rank([batch.observation, batch.action], 3)
     chex.assert_rank([batch.valid], 2)
     chex.assert_equal_shape([batch.log_prob, batch.advantage, batch.return_, batch.valid])
     chex.assert_equal_shape_prefix([batch.observation, batch.action, batch.valid], 2)
-    chex.assert_is_divisible(batch.valid.shape[0], config.num_minibatches)
+    chex.assert_is_divisible(batch.valid.shape[0], config.num_minibatches * shards.local_streams)
 
 
-def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch) -> Minibatch:
+def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Shards) -> Minibatch:
     """What the loss takes, still [G, N, ...]: normalised, and zero where not valid."""
     valid, advantage = batch.valid.astype(bool), batch.advantage
     if config.advantage == "gae" and config.normalize_advantages:
-        advantage = _normalize_advantages(advantage, valid)
+        advantage = _normalize_advantages(advantage, valid, shards)
     samples = Minibatch(
         observation=normalize(learner, batch.observation),
         action=batch.action,
@@ -252,21 +256,26 @@ def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch) -> Minibat
     )
 
 
-def _normalize_advantages(advantage: jax.Array, valid: jax.Array) -> jax.Array:
+def _normalize_advantages(advantage: jax.Array, valid: jax.Array, shards: Shards) -> jax.Array:
     """Advantages with mean 0 and standard deviation 1 over the valid samples, [G, N]."""
-    count = jnp.maximum(jnp.sum(valid), 1)
-    mean = jnp.sum(jnp.where(valid, advantage, 0.0)) / count
-    variance = jnp.sum(jnp.where(valid, (advantage - mean) ** 2, 0.0)) / count
+    count = jnp.maximum(shards.sum(jnp.sum(valid)), 1)
+    mean = shards.sum(jnp.sum(jnp.where(valid, advantage, 0.0))) / count
+    variance = shards.sum(jnp.sum(jnp.where(valid, (advantage - mean) ** 2, 0.0))) / count
     return (advantage - mean) / (jnp.sqrt(variance) + _ADVANTAGE_EPSILON)
 
 
 def _learn(
-    config: AlgoConfig, updates: int, begun: Progress, samples: Minibatch, key: jax.Array
+    config: AlgoConfig,
+    updates: int,
+    begun: Progress,
+    samples: Minibatch,
+    key: jax.Array,
+    shards: Shards,
 ) -> tuple[Progress, Metrics]:
     """All epochs, in minibatches; the metrics of each are [epochs, minibatches]."""
-    expected_valid = jnp.sum(samples.valid) / config.num_minibatches
-    step = functools.partial(_step, config, updates, expected_valid)
-    epoch = functools.partial(_epoch, config, step, samples)
+    expected_valid = shards.sum(jnp.sum(samples.valid)) / config.num_minibatches
+    step = functools.partial(_step, config, updates, expected_valid, shards)
+    epoch = functools.partial(_epoch, config, step, samples, shards)
     return jax.lax.scan(epoch, begun, jax.random.split(key, config.epochs))
 
 
@@ -274,12 +283,12 @@ def _epoch(
     config: AlgoConfig,
     step: functools.partial[tuple[Progress, Metrics]],
     samples: Minibatch,
+    shards: Shards,
     progress: Progress,
     key: jax.Array,
 ) -> tuple[Progress, Metrics]:
     """One pass over all samples. Whole groups are shuffled: rows to gather, not single samples."""
-    groups = samples.valid.shape[0]
-    order = jax.random.permutation(key, groups).reshape(config.num_minibatches, -1)
+    order = _shuffle(key, samples.valid.shape[0], config.num_minibatches, shards)
 
     def learn(progress: Progress, rows: jax.Array) -> tuple[Progress, Metrics]:
         minibatch = jax.tree.map(lambda x: x[rows].reshape(-1, *x.shape[2:]), samples)
@@ -288,14 +297,27 @@ def _epoch(
     return jax.lax.scan(learn, progress, order)
 
 
+def _shuffle(key: jax.Array, groups: int, minibatches: int, shards: Shards) -> jax.Array:
+    """Deals the groups [G] of this device out to M minibatches, [M, G / M]; each stream apart."""
+    streams = shards.local_streams
+    size = groups // streams
+
+    def order(key: jax.Array) -> jax.Array:
+        return jax.random.permutation(key, size).reshape(minibatches, -1)
+
+    first = size * jnp.arange(streams)
+    return shards.draw(key, order, axis=1) + jnp.repeat(first, size // minibatches)
+
+
 def _step(
     config: AlgoConfig,
     updates: int,
     expected_valid: jax.Array,
+    shards: Shards,
     progress: Progress,
     minibatch: Minibatch,
 ) -> tuple[Progress, Metrics]:
     """One step of the optimiser on a minibatch."""
     gradient = jax.grad(losses.ppo_loss, has_aux=True)
     found = gradient(progress[0], minibatch, config, expected_valid)
-    return optimizer.take(config, updates, progress, found, jnp.any(minibatch.valid))
+    return optimizer.take(config, updates, progress, found, jnp.any(minibatch.valid), shards)

@@ -4,6 +4,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from swarmjax.shards import ALONE, Shards
+
 _EPSILON = 1e-7  # PPO-PyTorch's
 
 
@@ -37,7 +39,7 @@ def monte_carlo_returns(reward: jax.Array, boundary: jax.Array, *, discount: flo
     return returns
 
 
-def normalize(returns: jax.Array, valid: jax.Array) -> jax.Array:
+def normalize(returns: jax.Array, valid: jax.Array, shards: Shards = ALONE) -> jax.Array:
     """Shifts and scales returns to mean 0 and deviation 1 over the valid samples.
 
     The deviation is the unbiased one, of N - 1, plus 1e-7.
@@ -45,13 +47,14 @@ def normalize(returns: jax.Array, valid: jax.Array) -> jax.Array:
     Args:
         returns: [...].
         valid: [...], bool or 0/1, of the same shape.
+        shards: How the samples are spread over devices.
 
     Returns:
         The normalised returns, [...], of the others too.
     """
     chex.assert_equal_shape([returns, valid])
     valid = valid.astype(bool)
-    count = jnp.sum(valid)
-    mean = jnp.sum(jnp.where(valid, returns, 0.0)) / jnp.maximum(count, 1)
-    squares = jnp.sum(jnp.where(valid, (returns - mean) ** 2, 0.0))
+    count = shards.sum(jnp.sum(valid))
+    mean = shards.sum(jnp.sum(jnp.where(valid, returns, 0.0))) / jnp.maximum(count, 1)
+    squares = shards.sum(jnp.sum(jnp.where(valid, (returns - mean) ** 2, 0.0)))
     return (returns - mean) / (jnp.sqrt(squares / jnp.maximum(count - 1, 1)) + _EPSILON)

@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from swarmjax.shards import ALONE, Shards
+
 # An observation that has hardly moved so far is magnified by at most 1 / this.
 MIN_STD = 1e-3
 
@@ -44,7 +46,9 @@ def init(observation_size: int) -> Normalizer:
     )
 
 
-def update(normalizer: Normalizer, observation: jax.Array, valid: jax.Array) -> Normalizer:
+def update(
+    normalizer: Normalizer, observation: jax.Array, valid: jax.Array, shards: Shards = ALONE
+) -> Normalizer:
     """Takes a batch of observations in.
 
     Merges the moments of two sets as in Chan, Golub and LeVeque 1983, "Algorithms for Computing
@@ -55,6 +59,7 @@ def update(normalizer: Normalizer, observation: jax.Array, valid: jax.Array) -> 
         normalizer: Moments so far.
         observation: [..., O]; may hold anything, NaN included, where not valid.
         valid: [...], bool or 0/1, the observations to count.
+        shards: How the observations are spread over devices.
 
     Returns:
         The moments of all observations; the same as before if none is valid.
@@ -62,11 +67,11 @@ def update(normalizer: Normalizer, observation: jax.Array, valid: jax.Array) -> 
     chex.assert_shape(observation, (*valid.shape, *normalizer.mean.shape))
     axes = tuple(range(valid.ndim))
     keep = valid.astype(bool)[..., None]
-    batch_count = jnp.sum(keep, dtype=jnp.float32)
+    batch_count = shards.sum(jnp.sum(keep, dtype=jnp.float32))
     divisor = jnp.maximum(batch_count, 1.0)
-    batch_mean = jnp.sum(jnp.where(keep, observation, 0.0), axis=axes) / divisor
+    batch_mean = shards.sum(jnp.sum(jnp.where(keep, observation, 0.0), axis=axes)) / divisor
     deviation = jnp.where(keep, observation - batch_mean, 0.0)
-    batch_variance = jnp.sum(deviation**2, axis=axes) / divisor
+    batch_variance = shards.sum(jnp.sum(deviation**2, axis=axes)) / divisor
 
     count = normalizer.count + batch_count
     share = batch_count / jnp.maximum(count, 1.0)

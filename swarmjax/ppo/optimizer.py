@@ -9,6 +9,7 @@ import optax
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.losses import Metrics
 from swarmjax.ppo.networks import Params
+from swarmjax.shards import ALONE, Shards
 
 # The metrics of a step: those of `losses.ppo_loss`, the norm of the gradient before clipping, and 1
 # if the step was taken, and if it was skipped.
@@ -99,8 +100,11 @@ def take(
     progress: Progress,
     found: tuple[Params, Metrics],
     any_valid: jax.Array,
+    shards: Shards = ALONE,
 ) -> tuple[Progress, Metrics]:
     """Takes a step along a gradient; none at all if no sample is valid.
+
+    Devices add up their gradients and metrics, and take the same step.
 
     A step is skipped, and counted, if a number of its gradient, or of what it leads to, is not
     finite. `optax.apply_if_finite` looks at the gradient alone, so that an optimiser whose state is
@@ -112,12 +116,14 @@ def take(
         progress: Parameters and the optimiser's state before.
         found: The gradient, and the metrics of its loss.
         any_valid: [], whether the gradient is of any valid sample.
+        shards: How the samples are spread over devices.
 
     Returns:
         Parameters and the optimiser's state after, and the metrics with `grad_norm`,
         `taken_steps` and `skipped_steps`, which are zero in a skipped step but for the last.
     """
-    (params, optimizer_state), (gradient, metrics) = progress, found
+    (params, optimizer_state), (gradient, metrics) = progress, shards.sum(found)
+    any_valid = shards.any(any_valid)
     metrics["grad_norm"] = optax.tree.norm(gradient)
     steps, stepped_state = make(config, updates).update(gradient, optimizer_state, params)
     stepped = (optax.apply_updates(params, steps), stepped_state)

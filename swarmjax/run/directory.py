@@ -27,7 +27,7 @@ METRICS, DECISIONS, EPISODES = "metrics.jsonl", "curriculum.jsonl", "episodes.js
 LOGS = (METRICS, DECISIONS, EPISODES)
 SAVED = "checkpoints.jsonl"  # a row for each checkpoint that was written, of those removed too
 # Keys of a stored config that may change when its run goes on: they fix nothing that was computed.
-MAY_CHANGE = ("budget", "resume", "run")
+MAY_CHANGE = ("budget", "devices", "resume", "run", "streams")
 
 Row = dict[str, Any]
 

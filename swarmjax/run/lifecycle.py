@@ -6,7 +6,6 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +21,14 @@ from swarmjax.run.checkpoint import Checkpoints, Kept, Leaves
 from swarmjax.run.display import Display, working
 from swarmjax.run.errors import DivergedError, TrainingError
 from swarmjax.run.policy_export import POLICY, seed_path, write_policy
-from swarmjax.run.settings import TrainConfig, read_config
+from swarmjax.run.settings import TrainConfig, from_stored, read_config
 from swarmjax.run.signals import Stop
 from swarmjax.run.trainer import Built, Tally, begin_tally, compile_chunk, prepare, train
 from swarmjax.run.warm_start import Source
 from swarmjax.task import pieces
 from swarmjax.task.config import describe
+from swarmjax.training import mesh, seeds
 from swarmjax.training import program as programs
-from swarmjax.training import seeds
 from swarmjax.training.loop import TrainState
 
 _LOWERED = 0.1  # what the learning rates of a run that diverged are multiplied by
@@ -145,12 +144,25 @@ def _first_sentences(
         yield f"{sentence}."
     if settings.resume is not None and kept is None:
         yield f"{settings.resume} has no checkpoint yet: it begins from its seed."
+    if kept is not None:
+        yield from _dealt_again(settings)
     if source is not None:
         updates = words.count(source.update, "update")
         as_there = describe(settings.robot, settings.task, settings.realism)
         yield (
             f"starting with what {source.run} had learned after {updates}; robot, task, realism "
             f"and network as there, unless told otherwise: {as_there}"
+        )
+
+
+def _dealt_again(settings: TrainConfig) -> Iterator[str]:
+    """Says that a run goes on with other random streams than it had."""
+    before = from_stored(read_config(Path(settings.resume or ""))).shards.streams
+    now = settings.shards.streams
+    if now != before:
+        yield (
+            f"random numbers come in {words.count(now, 'stream')} from here on, and not in "
+            f"{before}: what was learned is kept, and other levels are drawn than would have been."
         )
 
 
@@ -208,7 +220,7 @@ def _is_summed_up(run: Path, update: int) -> bool:
 def _load(settings: TrainConfig) -> tuple[Built, Schedule, Any, TrainState]:
     """Builds the program, the curriculum's numbers, what starts a run, and its state's shapes."""
     program, schedule = programs.load(settings, by_robot=settings.run.episodes)
-    init = jax.jit(partial(seeds.init, program))  # traced once, for the shapes and for the state
+    init = jax.jit(mesh.init(program))  # traced once, for the shapes and for the state
     template = init.eval_shape(schedule)
     memory.check_state(settings, memory.size(template), memory.limit())
     return program, schedule, init, template
@@ -249,7 +261,7 @@ def _first_state(
     skipped = kept.skipped
     if any(name.startswith(_PRICE) for name in kept.leaves):
         skipped = [*skipped, f"a price on contacts (algo.contact_limit) in {settings.resume}"]
-    return checkpoint.from_leaves(kept.leaves, template), skipped
+    return mesh.put(program, checkpoint.from_leaves(kept.leaves, template)), skipped
 
 
 def find_run(settings: TrainConfig) -> Path:

@@ -33,7 +33,7 @@ AUTO = "auto"  # what `arenas` may be instead of a number
 
 # What may change when a run goes on; everything else fixes what it has computed so far. The same
 # keys, as they are stored, are `directory.MAY_CHANGE`.
-_RESUME_KEYS = ("budget", "resume", "run.*")
+_RESUME_KEYS = ("budget", "devices", "resume", "run.*", "streams")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,16 +115,14 @@ class TrainConfig(ProgramConfig):
                 f"{MAX_COUNT}: give at most {MAX_COUNT - self.seeds + 1}."
             )
         self._check_stages()
-        if self.arenas % self.algo.num_minibatches:
-            raise ConfigError(
-                f"arenas is {self.arenas}, but algo.num_minibatches is "
-                f"{self.algo.num_minibatches}: give a multiple of {self.algo.num_minibatches}."
-            )
+        self._check_devices()
         self._check_budget()
         self._check_counts()
         self._check_algo()
         self._check_episodes()
         check_realism(self.realism, self.robot, self.task, self.task.step_limit)
+        if self.devices > 1:
+            object.__setattr__(self, "streams", self.shards.streams)
         names = [stage.name for stage in self.stage]
         if len(names) == 1 or not self.stage_name:
             object.__setattr__(self, "stage_name", "-".join(names))
@@ -145,6 +143,25 @@ class TrainConfig(ProgramConfig):
                         f"{where}{key} is {value}, but sim.max_{key} is {most}: "
                         f"give {least} to {most}."
                     )
+
+    def _check_devices(self) -> None:
+        if self.streams is not None and self.streams % self.devices:
+            raise ConfigError(
+                f"streams is {self.streams}, but devices is {self.devices}: give a multiple of "
+                f"{self.devices}, or null."
+            )
+        streams, minibatches = self.shards.streams, self.algo.num_minibatches
+        if self.arenas % (streams * minibatches):
+            which = "streams" if self.streams else "devices"
+            spread = "" if streams == 1 else f"{which} is {streams} and "
+            raise ConfigError(
+                f"arenas is {self.arenas}, but {spread}algo.num_minibatches is {minibatches}: "
+                f"give a multiple of {streams * minibatches}."
+            )
+        if self.devices > 1 and self.seeds_by == "cores":
+            raise ConfigError(
+                f"seeds_by is cores, but devices is {self.devices}: give vmap or map, or devices=1."
+            )
 
     def _check_counts(self) -> None:
         steps = max(self.task.step_limit, self.algo.rollout_length)
@@ -323,7 +340,7 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
 
     Args:
         stored: configuration of the run, as `to_dict` gave it.
-        overrides: `key=value` words; only `budget`, `resume` and `run.*` may be given.
+        overrides: `key=value` words, of what may change alone.
 
     Raises:
         ConfigError: another key is given, the stored configuration is unsound, or see the module.
@@ -339,7 +356,14 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
     given = files.values(words)
     kept = to_dict(from_stored(stored, "stored "))
     run = kept["run"] | {"stop_after": None} | given.get("run", {})
-    return settle(build(TrainConfig, kept | given | {"run": run}))
+    spread = _spread_again(kept["streams"], given.get("devices", kept["devices"]))
+    return settle(build(TrainConfig, kept | spread | given | {"run": run}))
+
+
+def _spread_again(streams: int | None, devices: Any) -> dict[str, Any]:
+    """Spreads a run that goes on over devices, with the random streams that it has if they fit."""
+    fits = isinstance(devices, int) and streams and streams % devices == 0
+    return {"devices": devices, "streams": streams if fits else None}
 
 
 def load_run(
@@ -387,7 +411,11 @@ def _go_on_or_begin(
         typed = replace(typed, arenas=stored.arenas)
     _check_unchanged(run, to_dict(typed), to_dict(stored))
     kept = replace(typed.run, id=stored.run.id)
-    return settle(replace(stored, budget=typed.budget, resume=str(run), run=kept)), False
+    spread = _spread_again(stored.streams, typed.devices)
+    if typed.streams is not None and "streams" in given:
+        spread["streams"] = typed.streams
+    settled = replace(stored, budget=typed.budget, resume=str(run), run=kept, **spread)
+    return settle(settled), False
 
 
 def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
@@ -400,7 +428,7 @@ def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, A
         shown = ", ".join(f"{k} is {show(mine[k])} and not {show(its.get(k))}" for k in changed[:3])
         raise ConfigError(
             f"resume is auto, but {run} holds a run of other settings: {shown}. Of a run that goes "
-            "on, budget and run.* may change: give its own settings, or another run.dir."
+            f"on, {', '.join(_RESUME_KEYS)} may change: give its own settings, or another run.dir."
         )
 
 

@@ -28,7 +28,7 @@ from swarmjax.run.settings import TrainConfig
 from swarmjax.run.signals import Stop
 from swarmjax.sim import physics
 from swarmjax.sim.config import physics_substeps
-from swarmjax.training import episodes, loop, seeds
+from swarmjax.training import episodes, loop, mesh, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
 from swarmjax.training.program import Program
@@ -116,7 +116,7 @@ def compile_chunk(
     """
     began = time.perf_counter()
     groups = programs.groups(program.config, provenance.cores())
-    chunk = jax.jit(partial(seeds.train_chunk, program), donate_argnums=1)
+    chunk = mesh.jit_chunk(program)
     part = jax.eval_shape(partial(seeds.split, parts=groups), state)[0]
     lowered = chunk.lower(schedule, part, np.int32(1))
     if meanwhile is not None:
@@ -181,7 +181,7 @@ def prepare(
 def measure(settings: TrainConfig) -> int:
     """Compiles a config's program and returns the device memory that training needs, bytes."""
     program, schedule = programs.load(settings, by_robot=settings.run.episodes)
-    template = jax.eval_shape(partial(seeds.init, program), schedule)
+    template = jax.eval_shape(mesh.init(program), schedule)
     return compile_chunk(program, schedule, template).total_bytes
 
 
@@ -343,7 +343,7 @@ def _build_kernels(program: Built, state: TrainState) -> float:
     began = time.perf_counter()
     loaded = program.world.physics
     if loaded.engine.builds_kernels:
-        physics.build_kernels(loaded, seeds.stepped_together(program, state))
+        physics.build_kernels(loaded, mesh.stepped_together(program, state))
     return time.perf_counter() - began
 
 

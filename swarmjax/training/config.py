@@ -7,6 +7,7 @@ from swarmjax.config import Section, about
 from swarmjax.config.section import MAX_COUNT, ByName
 from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.ppo.config import AlgoConfig
+from swarmjax.shards import Shards
 from swarmjax.sim.config import RobotConfig, SimConfig
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig
@@ -49,6 +50,18 @@ class ProgramConfig(Section):
         default=128,
         metadata=about("arenas simulated at once; auto: by run.memory_share", 1, 2**20),
     )
+    devices: int = field(
+        default=1, metadata=about("that share the arenas of every seed; divides arenas", 1, 2**16)
+    )
+    streams: int | None = field(
+        default=None,
+        metadata=about(
+            "of random numbers, a multiple of devices: with as many, a run draws the same on fewer "
+            "or more devices; null: devices",
+            1,
+            2**16,
+        ),
+    )
     budget: int = field(
         default=3_000_000, metadata=about("control steps of all arenas together", 1, 10**15)
     )
@@ -60,6 +73,11 @@ class ProgramConfig(Section):
         default_factory=ByName,
         metadata=about("digest of each piece of extensions, by kind and name", derived=True),
     )
+
+    @property
+    def shards(self) -> Shards:
+        """How the arenas are spread over devices."""
+        return Shards(self.devices, self.streams or self.devices)
 
     @property
     def updates(self) -> int:

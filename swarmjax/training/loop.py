@@ -16,6 +16,7 @@ from swarmjax.curriculum import engine as curricula
 from swarmjax.curriculum.engine import Curriculum, Decision, Schedule
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import Batch, LearnerState
+from swarmjax.shards import Shards
 from swarmjax.sim import gaps
 from swarmjax.task.episode import Ended
 from swarmjax.training import episodes, promotion, rollout
@@ -65,9 +66,13 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
     start_key = jax.random.key(config.seed if seed is None else seed)
     run_key, learner_key, level_key = jax.random.split(start_key, 3)
     curriculum = curricula.init(schedule, config.curriculum, program.mode)
-    index = curricula.assign(curriculum, config.arenas)
     starts = rollout.draw_starts(
-        program.world, schedule.stages, index, curriculum.cohort, level_key
+        program.world,
+        schedule.stages,
+        _assigned(program, curriculum)[None],
+        curriculum.cohort,
+        level_key,
+        program.shards,
     )
     size = program.world.observation_size
     learners = jax.vmap(lambda key: ppo.init(key, config.algo, size, ACTION_SIZE, config.updates))(
@@ -120,21 +125,23 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     Returns:
       The state after, and the metrics of this update.
     """
-    config, world = program.config, program.world
+    config, shards = program.config, program.shards
     key, level_key, rollout_key, learn_key = jax.random.split(state.key, 4)
-    index = jnp.tile(curricula.assign(state.curriculum, config.arenas), config.waiting)
-    starts = rollout.draw_starts(world, schedule.stages, index, state.curriculum.cohort, level_key)
     arenas, trajectory, ended = rollout.collect(
-        program, state.learners, state.arenas, starts, rollout_key
+        program,
+        state.learners,
+        state.arenas,
+        _draw_waiting(program, schedule, state.curriculum, level_key),
+        rollout_key,
     )
-    batch = rollout.batch(trajectory, config.algo)
+    batch = rollout.batch(trajectory, config.algo, shards)
     explored = rollout.explore(program, state.learners, config.algo.rollout_length)
     learners, learned = jax.vmap(
         lambda learner, b, k: ppo.update(
-            learner, config.algo, b, k, config.updates, program.backend
+            learner, config.algo, b, k, config.updates, program.backend, shards
         )
     )(explored, batch, jax.random.split(learn_key, config.learners))
-    counted = curricula.count(state.curriculum, ended)
+    counted = curricula.count(state.curriculum, ended, shards)
     curriculum, decision = curricula.advance(
         counted, schedule, config.curriculum, program.mode, state.update
     )
@@ -144,14 +151,20 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     metrics = {
         "update": state.update,
         "stage": state.curriculum.stage,
-        **_curriculum_metrics(state.curriculum, curriculum, decision, arenas.stage),
-        "robots": jnp.sum(arenas.level.present),
-        "transitions": jnp.sum(trajectory.valid),
-        **_learner_metrics(learned, batch),
-        **_episode_metrics(ended, state.curriculum.stage),
+        **_curriculum_metrics(state.curriculum, curriculum, decision),
+        **_learner_metrics(learned, batch, shards),
+        **shards.sum(
+            {
+                "mix": _mix(arenas.stage, state.curriculum.weights.shape[0]),
+                "robots": jnp.sum(arenas.level.present),
+                "transitions": jnp.sum(trajectory.valid),
+                **_episode_metrics(ended, state.curriculum.stage),
+            }
+        ),
     }
     if program.by_robot:
-        metrics[episodes.KEY] = episodes.pack(ended, episodes.room(config))
+        every = jax.tree.map(partial(shards.gather, axis=1), ended)
+        metrics[episodes.KEY] = episodes.pack(every, episodes.room(config))
     new = TrainState(
         learners=learners,
         arenas=arenas,
@@ -162,21 +175,33 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     return new, metrics
 
 
-def _curriculum_metrics(
-    before: Curriculum, after: Curriculum, decision: Decision, stage: Array
-) -> Metrics:
-    """What was decided, the weights that were decided by it or held, and how each stage goes.
+def _assigned(program: Program, curriculum: Curriculum) -> Array:
+    """Says on which stage the next episode of each arena of this device begins."""
+    return program.shards.local(curricula.assign(curriculum, program.config.arenas))
 
-    `mix` counts the arenas by the stages [A] that they are on.
-    """
-    stages = jnp.arange(before.weights.shape[0])
+
+def _draw_waiting(
+    program: Program, schedule: Schedule, curriculum: Curriculum, key: Array
+) -> Arena:
+    """Draws the episodes that wait for the arenas of this device during a rollout."""
+    index = jnp.tile(_assigned(program, curriculum), (program.config.waiting, 1))
+    cohort = curriculum.cohort
+    return rollout.draw_starts(program.world, schedule.stages, index, cohort, key, program.shards)
+
+
+def _mix(stage: Array, stages: int) -> Array:
+    """Counts the arenas by the stages [A] that they are on."""
+    return jnp.sum(stage == jnp.arange(stages)[:, None], axis=-1, dtype=jnp.int32)
+
+
+def _curriculum_metrics(before: Curriculum, after: Curriculum, decision: Decision) -> Metrics:
+    """What was decided, the weights that were decided by it or held, and how each stage goes."""
     record = after.record
     return {
         "decision": decision.reason,
         "decided_stage": decision.stage,
         "next_stage": decision.next_stage,
         "stage_success": decision.success,
-        "mix": jnp.sum(stage == stages[:, None], axis=-1, dtype=jnp.int32),
         "weights": after.weights,
         "episodes_by_stage": record.episodes,
         "success_by_stage": record.success,
@@ -188,9 +213,9 @@ def _curriculum_metrics(
     }
 
 
-def _learner_metrics(learned: Metrics, batch: Batch) -> Metrics:
+def _learner_metrics(learned: Metrics, batch: Batch, shards: Shards) -> Metrics:
     """Averages [L] over the learners that had anything to learn from."""
-    learns = jnp.any(batch.valid, axis=(1, 2))
+    learns = shards.any(jnp.any(batch.valid, axis=(1, 2)))
     count = jnp.maximum(jnp.sum(learns), 1)
     return {name: jnp.sum(jnp.where(learns, x, 0.0)) / count for name, x in learned.items()}
 

@@ -11,6 +11,7 @@ from swarmjax.curriculum.modes import MODES
 from swarmjax.ppo import dispatch, networks
 from swarmjax.ppo.dispatch import Backend
 from swarmjax.provenance import cores
+from swarmjax.shards import Shards
 from swarmjax.task import env
 from swarmjax.task.env import World
 from swarmjax.training import episodes
@@ -35,6 +36,11 @@ class Program[C: ProgramConfig]:
     world: World
     backend: Backend = "autodiff"
     by_robot: bool = False
+
+    @property
+    def shards(self) -> Shards:
+        """How the arenas are spread over devices."""
+        return self.config.shards
 
     @property
     def rows(self) -> int:
@@ -79,7 +85,7 @@ def load_world(config: ProgramConfig) -> World:
         config.task,
         config.realism,
         config.sim,
-        arenas=config.arenas * side_by_side(config),
+        arenas=config.arenas // config.devices * side_by_side(config),
         extensions=extension.load(config.extensions),
     )
 

@@ -17,6 +17,7 @@ from swarmjax.ppo import gae, monte_carlo
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch, LearnerState
+from swarmjax.shards import ALONE, Shards
 from swarmjax.sim import gaps, physics
 from swarmjax.task import env, extended, level
 from swarmjax.task import stage as task_stage
@@ -98,7 +99,9 @@ def to_arenas(x: Array) -> Array:
     return jnp.moveaxis(x[:, :, 0], 0, 1)
 
 
-def draw_starts(world: World, stages: Stage, index: Array, cohort: Array, key: Array) -> Arena:
+def draw_starts(
+    world: World, stages: Stage, index: Array, cohort: Array, key: Array, shards: Shards = ALONE
+) -> Arena:
     """Draws fresh levels: episodes that wait until their arena is free.
 
     They are drawn ahead of a rollout, not at every step, `config.waiting` for each arena. An arena
@@ -108,14 +111,17 @@ def draw_starts(world: World, stages: Stage, index: Array, cohort: Array, key: A
     Args:
       world: the compiled environment.
       stages: [S].
-      index: [W A] stage of each episode: the first of every arena, then the second, and so on.
+      index: [W, A] stage of each episode: the first of every arena, then the second, and so on.
       cohort: [] the curriculum's cohort.
       key: random key, consumed.
+      shards: how the arenas are spread over devices; A counts those of this one.
 
     Returns:
       [W A] the episodes that wait, packed.
     """
-    uniforms = jax.random.uniform(key, (*index.shape, level.uniform_count(world.spacing)))
+    waiting, arenas = index.shape
+    size = (waiting, arenas // shards.local_streams, level.uniform_count(world.spacing))
+    uniforms = shards.draw(key, lambda key: jax.random.uniform(key, size), axis=1)
     stages = jax.tree.map(jnp.asarray, stages)
 
     def start(uniform: Array, i: Array) -> Arena:
@@ -124,7 +130,7 @@ def draw_starts(world: World, stages: Stage, index: Array, cohort: Array, key: A
         begun = vars(env.reset(world, drawn))
         return Arena(**begun, stage=i.astype(jnp.int32), cohort=jnp.asarray(cohort, jnp.int32))
 
-    return jax.vmap(start)(uniforms, index)
+    return jax.vmap(start)(uniforms.reshape(-1, size[-1]), index.ravel())
 
 
 def collect(
@@ -137,7 +143,7 @@ def collect(
       learners: [L].
       arenas: [A], packed.
       starts: [W A] episodes that wait, as `draw_starts` orders them, packed.
-      key: random key, consumed.
+      key: random key, consumed; the same on all devices.
 
     Returns:
       The arenas, packed; the trajectory; the episodes that ended.
@@ -162,18 +168,19 @@ def explore(program: Program, learners: LearnerState, steps: Array | int) -> Lea
     return jax.vmap(lambda learner: ppo.explore(learner, config, steps * arenas))(learners)
 
 
-def batch(trajectory: Trajectory, config: AlgoConfig) -> Batch:
+def batch(trajectory: Trajectory, config: AlgoConfig, shards: Shards = ALONE) -> Batch:
     """Turns a rollout into what the learners learn from.
 
     Args:
       trajectory: [T, L, A, N, ...].
       config: says what a return is.
+      shards: how the arenas are spread over devices.
 
     Returns:
       [L] batches of A groups of T * N samples.
     """
     advantages, returns = {"gae": _bootstrapped, "monte_carlo": _monte_carlo}[config.advantage](
-        trajectory, config
+        trajectory, config, shards
     )
 
     def group(x: Array) -> Array:
@@ -190,7 +197,7 @@ def batch(trajectory: Trajectory, config: AlgoConfig) -> Batch:
     )
 
 
-def _bootstrapped(trajectory: Trajectory, config: AlgoConfig) -> tuple[Array, Array]:
+def _bootstrapped(trajectory: Trajectory, config: AlgoConfig, _: Shards) -> tuple[Array, Array]:
     """Returns the advantages and returns of generalised advantage estimation."""
     assert config.gae_lambda is not None  # the config has filled it in
     terminated = trajectory.terminated
@@ -207,13 +214,14 @@ def _bootstrapped(trajectory: Trajectory, config: AlgoConfig) -> tuple[Array, Ar
     )
 
 
-def _monte_carlo(trajectory: Trajectory, config: AlgoConfig) -> tuple[Array, Array]:
+def _monte_carlo(trajectory: Trajectory, config: AlgoConfig, shards: Shards) -> tuple[Array, Array]:
     """Returns what the normalised Monte-Carlo returns have above the values, and themselves."""
     boundary = trajectory.terminated | trajectory.truncated
     if config.time_out == "leak":
         boundary = boundary & ~_timed_out(trajectory)
     returns = monte_carlo.monte_carlo_returns(trajectory.reward, boundary, discount=config.discount)
-    normal = jax.vmap(monte_carlo.normalize, in_axes=1, out_axes=1)(returns, trajectory.valid)
+    normalize = functools.partial(monte_carlo.normalize, shards=shards)
+    normal = jax.vmap(normalize, in_axes=1, out_axes=1)(returns, trajectory.valid)
     return normal - trajectory.value, normal
 
 
@@ -264,7 +272,7 @@ def _step(
     (arenas, value, begun), (key, number) = carry, now
     count = value.shape[0]
     mine = to_learners(arenas.observation, count)
-    noise = jax.random.normal(key, (*mine.shape[:-1], ACTION_SIZE))
+    noise = _noise(program.shards, key, mine.shape[:-1])
     config = program.config.algo
     action, log_prob = jax.vmap(lambda learner, o, n: ppo.act(learner, config, o, n))(
         explore(program, learners, number), mine, noise
@@ -288,6 +296,13 @@ def _step(
     )
     carry = (arenas, jnp.where(over, start_value, next_value), begun + came.done)
     return carry, (transition, _to_counts(ended))
+
+
+def _noise(shards: Shards, key: Array, shape: tuple[int, ...]) -> Array:
+    """Draws the noise [L, A, N, U] of actions; `shape` is [L, A, N]."""
+    learners, arenas, robots = shape
+    size = (learners, arenas // shards.local_streams, robots, ACTION_SIZE)
+    return shards.draw(key, lambda key: jax.random.normal(key, size), axis=1)
 
 
 def _next(waits: _Waiting, begun: Array) -> tuple[Arena, Array]:

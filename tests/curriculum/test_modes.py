@@ -372,7 +372,7 @@ def step() -> Step:
         index: jax.Array, arenas: Arena | None, cohort: jax.Array, key: jax.Array
     ) -> tuple[Arena, Ended]:
         level_key, rollout_key = jax.random.split(key)
-        starts = draw(index, cohort, level_key)
+        starts = draw(index[None], cohort, level_key)
         before = starts if arenas is None else arenas
         after, _, ended = collect(learners, before, starts, rollout_key)
         return after, ended

@@ -91,7 +91,7 @@ def _round(
     """One rollout as in `loop.update`, and what is needed to see with which deviation."""
     config, world = program.config, program.world
     key, level_key, rollout_key = jax.random.split(state.key, 3)
-    index = jnp.zeros(config.waiting, jnp.int32)
+    index = jnp.zeros((config.waiting, 1), jnp.int32)
     starts = rollout.draw_starts(world, schedule.stages, index, jnp.int32(0), level_key)
     arenas, path, ended = rollout.collect(
         program, state.learners, state.arenas, starts, rollout_key

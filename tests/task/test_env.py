@@ -463,7 +463,9 @@ def real() -> Drawn:
     size = [f"arenas={FEW}", f"task.step_limit={LIFE}", "algo.num_minibatches=2", "budget=1000000"]
     config = load_train([*arena, *size, "realism=real", "sim.impl=jax"])
     world, stages = programs.load_world(config), task_stage.stack(config.stage)
-    draw = jax.jit(functools.partial(rollout.draw_starts, world, stages, np.zeros(FEW, np.int32)))
+    draw = jax.jit(
+        functools.partial(rollout.draw_starts, world, stages, np.zeros((1, FEW), np.int32))
+    )
     starts = [draw(jnp.int32(cohort), jax.random.key(cohort)) for cohort in range(2)]
     traces = []
 

@@ -75,7 +75,7 @@ def learners(tiny_config: TrainConfig) -> LearnerState:
 @pytest.fixture(scope="module")
 def draw(tiny_config: TrainConfig, tiny_world: World) -> Draw:
     """Draws starts of either stage in turn, from a seed, for a cohort."""
-    stages, index = task_stage.stack(tiny_config.stage), jnp.arange(ARENAS) % 2
+    stages, index = task_stage.stack(tiny_config.stage), jnp.arange(ARENAS)[None] % 2
     draw = jax.jit(functools.partial(rollout.draw_starts, tiny_world, stages, index))
     return lambda seed, cohort: draw(jnp.int32(cohort), jax.random.key(seed))
 

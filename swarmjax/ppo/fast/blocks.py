@@ -19,6 +19,7 @@ from swarmjax.ppo.fast.valid_first import valid_first
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
 from swarmjax.ppo.optimizer import Progress
+from swarmjax.shards import ALONE, Shards
 
 # Samples of a block: of 100 to 6,000, with layers of 64, 250 to 400 took least CPU time.
 BLOCK = 256
@@ -37,7 +38,12 @@ class Blocks(NamedTuple):
 
 
 def learn(
-    config: AlgoConfig, updates: int, begun: Progress, samples: Minibatch, _: jax.Array
+    config: AlgoConfig,
+    updates: int,
+    begun: Progress,
+    samples: Minibatch,
+    _: jax.Array,
+    shards: Shards = ALONE,
 ) -> tuple[Progress, Metrics]:
     """Learns from a batch: each epoch is one step on all samples, so their order does not matter.
 
@@ -46,22 +52,23 @@ def learn(
         updates: Number of updates of the whole run.
         begun: Parameters and the optimiser's state.
         samples: [G, N, ...], zero where not valid.
+        shards: How the samples are spread over devices.
 
     Returns:
         Parameters and the optimiser's state after, and the metrics of each step, [epochs].
     """
-    return in_turn(functools.partial(_learn, config, updates))(begun, samples)
+    return in_turn(functools.partial(_learn, config, updates, shards))(begun, samples)
 
 
 def _learn(
-    config: AlgoConfig, updates: int, begun: Progress, samples: Minibatch
+    config: AlgoConfig, updates: int, shards: Shards, begun: Progress, samples: Minibatch
 ) -> tuple[Progress, Metrics]:
     """All epochs, each one step on all samples; the metrics of each are [epochs]."""
-    blocks, count = arrange(samples), jnp.sum(samples.valid)
+    blocks, count = arrange(samples), shards.sum(jnp.sum(samples.valid))
 
     def epoch(progress: Progress, _: None) -> tuple[Progress, Metrics]:
         found = gradient(progress[0], blocks, config, count)
-        return optimizer.take(config, updates, progress, found, count > 0)
+        return optimizer.take(config, updates, progress, found, count > 0, shards)
 
     return jax.lax.scan(epoch, begun, length=config.epochs)
 

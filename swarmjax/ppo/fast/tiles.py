@@ -18,12 +18,21 @@ from swarmjax.ppo.fast.valid_first import valid_first
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
 from swarmjax.ppo.optimizer import METRICS, Progress
+from swarmjax.shards import ALONE, Shards
 
 
 def learn(
-    config: AlgoConfig, updates: int, begun: Progress, samples: Minibatch, key: jax.Array
+    config: AlgoConfig,
+    updates: int,
+    begun: Progress,
+    samples: Minibatch,
+    key: jax.Array,
+    shards: Shards = ALONE,
 ) -> tuple[Progress, Metrics]:
     """Learns from a batch, in minibatches of tiles of valid samples.
+
+    Each device deals out its own tiles. How samples come together then depends on the number of
+    devices, and not on random streams alone.
 
     Networks and what the optimiser has of them are one vector each on the way: of a minibatch's
     kernels most would otherwise add up, compare and move one of two dozen small arrays.
@@ -34,6 +43,7 @@ def learn(
         begun: Parameters and the optimiser's state.
         samples: [G, N, ...], zero where not valid.
         key: Random key, consumed.
+        shards: How the samples are spread over devices.
 
     Returns:
         Parameters and the optimiser's state after, and the metrics of each step, [steps].
@@ -45,8 +55,9 @@ def learn(
     arranged = replace(arranged, valid=arranged.valid.astype(jnp.float32))
     count, size = arranged.observation.shape
     launch = fused.choose_launch(config, size, arranged.action.shape[-1], count)
-    keys = jax.random.split(key, config.epochs)
+    keys = jax.random.split(shards.own_key(key), config.epochs)
     dealt = fused.shuffle(keys, count, valid, config.num_minibatches, launch)
+    expected_valid = shards.sum(valid) / config.num_minibatches
 
     def step(progress: Progress, span: jax.Array) -> tuple[Progress, jax.Array]:
         tiles = dealt._replace(span=span)
@@ -56,11 +67,11 @@ def learn(
             arranged,
             tiles,
             config,
-            valid / config.num_minibatches,
+            expected_valid,
             launch=launch,
         )
         progress, metrics = optimizer.take(
-            config, updates, progress, (gradient, metrics), taken > 0
+            config, updates, progress, (gradient, metrics), taken > 0, shards
         )
         return progress, jnp.stack([metrics[name] for name in METRICS])
 

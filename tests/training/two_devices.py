@@ -1,0 +1,46 @@
+"""Trains a small run over devices, and writes what came of it: `OUT DEVICES [COORDINATOR RANK]`.
+
+With a coordinator it is one of two processes, which have a device each.
+"""
+
+import sys
+
+import jax
+import numpy as np
+
+from swarmjax.run import trainer
+from swarmjax.run.settings import load_train
+from swarmjax.training import mesh
+from swarmjax.training import program as programs
+
+# Episodes of two updates: cohorts are judged, and stages change, within twenty.
+WORDS = [
+    "arenas=64",
+    "budget=40960",
+    "streams=2",
+    "task.step_limit=64",
+    "curriculum.threshold=0.02",
+    "curriculum.budget_share=null",
+]
+
+
+def main(out: str, devices: str, *more: str) -> None:
+    """Trains, and writes the learners and the metrics of all updates."""
+    if more:
+        jax.distributed.initialize(more[0], 2, int(more[1]))
+    config = load_train([*WORDS, f"devices={devices}"])
+    program, schedule = programs.load(config)
+    state = jax.jit(mesh.init(program))(schedule)
+    call = trainer.compile_chunk(program, schedule, state).call
+    state, metrics = call(schedule, state, np.int32(config.updates))
+    found = {
+        jax.tree_util.keystr(path): np.asarray(leaf)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(state.learners)
+    }
+    found |= {f"metrics/{name}": np.asarray(values) for name, values in metrics.items()}
+    if jax.process_index() == 0:
+        np.savez(out, allow_pickle=False, **found)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
