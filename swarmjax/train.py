@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 
-from swarmjax.run import heap
+from swarmjax.run import heap, rank
 from swarmjax.run.signals import Stop
 
 
@@ -25,6 +25,8 @@ def _train(arguments: Sequence[str], stop: Stop) -> int:
         from swarmjax.run.settings import load_run
 
         settings, auto = load_run(arguments)
+        if settings.run.coordinator is not None and not rank.is_child():
+            return rank.supervise(stop)
         from swarmjax.run.execute import execute
     return execute(settings, stop, auto=auto)
 
@@ -32,7 +34,9 @@ def _train(arguments: Sequence[str], stop: Stop) -> int:
 def _command() -> int:
     """Runs the command on the arguments of the command line."""
     heap.share()
-    with Stop() as stop:
+    if rank.is_child():
+        rank.begin()
+    with Stop(patient=rank.is_child()) as stop:
         from swarmjax import command
         from swarmjax.run.errors import CheckpointError
         from swarmjax.run.settings import TrainConfig

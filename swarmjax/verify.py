@@ -40,8 +40,12 @@ class VerifyConfig(Section):
     )
 
 
-def load_digests(settings: VerifyConfig) -> dict[int, str]:
+def load_digests(settings: VerifyConfig, trained: TrainConfig) -> dict[int, str]:
     """Reads the digests that can be compared.
+
+    Args:
+      settings: Of this command.
+      trained: Config of the run.
 
     Returns:
       Digest of the state by update, in their order.
@@ -50,12 +54,17 @@ def load_digests(settings: VerifyConfig) -> dict[int, str]:
       ConfigError: if the run has written none of the updates asked for.
       CheckpointError: if its log is damaged.
     """
-    rows = directory.read_rows(Path(settings.run) / directory.SAVED, None)
-    found = {row["update"]: row["digest"] for row in rows if _is_replayable(row)}
+    log = Path(settings.run) / directory.SAVED
+    rows = directory.read_rows(log, None)
+    try:
+        found = {row["update"]: row["digest"] for row in rows if _is_replayable(row, trained)}
+    except (KeyError, TypeError):
+        raise CheckpointError(f"{log} is damaged: put the file back.") from None
     if not found:
         raise ConfigError(
-            f"run is {settings.run}, which has no digests in {directory.SAVED}: give a run that "
-            "has saved a checkpoint after its first update."
+            f"run is {settings.run}, which has no digests in {directory.SAVED} that training from "
+            "its beginning leads to: give a run that has saved a checkpoint after its first "
+            "update, with the budget and the random streams that its config.json has."
         )
     most = min(found) if settings.updates is None else settings.updates
     chosen = {update: found[update] for update in sorted(found) if update <= most}
@@ -67,9 +76,14 @@ def load_digests(settings: VerifyConfig) -> dict[int, str]:
     return chosen
 
 
-def _is_replayable(row: directory.Row) -> bool:
-    """Tells whether training from the beginning leads to a checkpoint: lower rates do not."""
-    return row["update"] > 0 and row.get("rate_scale", 1.0) == 1.0
+def _is_replayable(row: directory.Row, trained: TrainConfig) -> bool:
+    """Tells whether training from the beginning leads to a checkpoint.
+
+    It does not with lower rates, nor with another budget, which the rates fall to 0 by, nor with
+    other random streams.
+    """
+    same = {"rate_scale": 1.0, "budget": trained.budget, "streams": trained.stream_count}
+    return row["update"] > 0 and all(row.get(key, value) == value for key, value in same.items())
 
 
 def replay(trained: TrainConfig, updates: Sequence[int]) -> dict[int, str]:
@@ -105,7 +119,7 @@ def main(arguments: Sequence[str]) -> int:
     trained = from_stored(read_config(Path(settings.run)), "stored ")
     if settings.extensions is not None:
         trained = replace(trained, extensions=settings.extensions)
-    saved = load_digests(settings)
+    saved = load_digests(settings, trained)
     found = replay(settle(trained), list(saved))
     differing = [update for update in saved if found[update] != saved[update]]
     sys.stdout.write(_verdict(settings.run, list(saved), differing) + "\n")

@@ -27,7 +27,7 @@ import numpy as np
 from absl import logging as absl_logging
 
 from swarmjax.policy import digest
-from swarmjax.run import directory, heap
+from swarmjax.run import directory, heap, hosts
 from swarmjax.run.errors import CheckpointError, TrainingError
 
 # Orbax takes half a second to import, which a run spends while it compiles (`trainer`).
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 Leaves = dict[str, np.ndarray]
 
-FOLDER = "checkpoints"
+FOLDER = hosts.CHECKPOINTS
 _OLD_META = {"digest", "update"}  # all that checkpoints held before they were bound to their run
 # In each step: the SHA-256 of its files. Given damaged files Orbax fails too, but it prints the
 # tracebacks of its threads as well.
@@ -95,7 +95,7 @@ class Checkpoints:
     def __init__(self, run: Path, keep: int, update: int | None = None) -> None:
         """Opens `run`/checkpoints, keeping the `keep` newest.
 
-        With `update`, where the run goes on, checkpoints after it are removed: they were passed
+        With `update`, where the run goes on, checkpoints after it are put aside: they were passed
         over as damaged, and Orbax would save nothing before them. Otherwise nothing is done until
         the first is saved, so that a run need not wait for Orbax before it begins.
         """
@@ -103,12 +103,12 @@ class Checkpoints:
         self._folder = (run / FOLDER).resolve()
         self._thread = ThreadPoolExecutor(1)
         self._pending: Future[None] | None = None
-        if update is not None:
+        if update is not None and hosts.is_first():
             for left in self._folder.glob(_UNFINISHED):
                 shutil.rmtree(left, ignore_errors=True)
-            for step in self._manager.all_steps():
+            for step in steps(run):
                 if step > update:
-                    self._manager.delete(step)
+                    _put_aside(self._folder / str(step))
             directory.cut_rows(run / directory.SAVED, update + 1)
 
     @functools.cached_property
@@ -116,8 +116,8 @@ class Checkpoints:
         import orbax.checkpoint as ocp
 
         _quieten()
-        options = ocp.CheckpointManagerOptions(create=True, enable_async_checkpointing=False)
-        return ocp.CheckpointManager(self._folder, options=options)
+        self._folder.mkdir(parents=True, exist_ok=True)
+        return ocp.CheckpointManager(self._folder, options=_options())
 
     @functools.cached_property
     def _binding(self) -> Binding | None:
@@ -130,6 +130,7 @@ class Checkpoints:
         logs: Mapping[str, int] | None = None,
         score: float | None = None,
         rate_scale: float = 1.0,
+        of: Mapping[str, Any] | None = None,
     ) -> None:
         """Begins to write a state, unless its update is there or what it learned is not finite.
 
@@ -139,15 +140,20 @@ class Checkpoints:
           logs: Bytes of each log that belong to it, by name.
           score: How good it is; None if that is not known.
           rate_scale: What the learning rates were multiplied by.
+          of: What else its line in the list of checkpoints says.
 
         Raises:
           TrainingError: If the checkpoint before could not be written.
         """
+        state = hosts.gather(state)
+        if not hosts.is_first():
+            return
         self.wait()
         meta = {"update": update, "logs": dict(logs or {}), "rate_scale": rate_scale}
+        told = {"score": score, "rate_scale": rate_scale, **(of or {})}
         # The next call of the program writes over the state, which NumPy may share on a CPU.
         leaves = {name: np.array(leaf) for name, leaf in to_leaves(state).items()}
-        self._pending = self._thread.submit(self._write, leaves, meta, score)
+        self._pending = self._thread.submit(self._write, leaves, meta, told)
 
     def wait(self) -> None:
         """Waits until what was begun is written.
@@ -159,39 +165,44 @@ class Checkpoints:
         if pending is not None:
             pending.result()
 
-    def _write(self, leaves: Leaves, meta: dict[str, Any], score: float | None) -> None:
+    def _write(self, leaves: Leaves, meta: dict[str, Any], told: directory.Row) -> None:
         update = meta["update"]
         try:
             if _is_sound(leaves) and update not in self._manager.all_steps():
-                self._write_step(leaves, meta, score)
+                self._write_step(leaves, meta, told)
         except Exception as error:  # whatever a full disk makes Orbax raise
             raise TrainingError(f"checkpoint {update} cannot be written: {_why(error)}.") from None
         heap.release()
 
-    def _write_step(self, leaves: Leaves, meta: dict[str, Any], score: float | None) -> None:
+    def _write_step(self, leaves: Leaves, meta: dict[str, Any], told: directory.Row) -> None:
         import orbax.checkpoint as ocp
 
         update = meta["update"]
         meta |= {"digest": digest(leaves), "of": None if self._binding is None else self._binding}
-        self._manager.save(
+        saved = self._manager.save(
             update,
             args=ocp.args.Composite(
                 state=ocp.args.StandardSave(leaves),
                 meta=ocp.args.JsonSave(meta | {"seal": _seal(meta)}),
             ),
         )
+        if not saved:
+            raise FileExistsError("a newer one is there")
         step = self._folder / str(update)
         directory.write_json(step / _MANIFEST, _file_digests(step))
         with directory.Log(self._run / directory.SAVED) as log:
-            row = {"update": update, "digest": meta["digest"], "score": score}
-            log.write([row | {"rate_scale": meta["rate_scale"]}])
+            log.write([{"update": update, "digest": meta["digest"], **told}])
         self._prune()
 
     def _prune(self) -> None:
         """Removes all but the newest and the best."""
         steps = sorted(self._manager.all_steps())
         rows = directory.read_rows(self._run / directory.SAVED, None, whole=False)
-        scores = {row["update"]: row["score"] for row in rows if row.get("score") is not None}
+        scores = {
+            row.get("update"): row["score"]
+            for row in rows
+            if isinstance(row.get("score"), int | float)
+        }
         rated = [step for step in steps if step in scores]
         best = max(rated, key=lambda step: (scores[step], step), default=None)
         for step in steps[: -self._keep]:
@@ -210,6 +221,27 @@ class Checkpoints:
             self._thread.shutdown()
             if "_manager" in self.__dict__:
                 self._manager.close()
+
+
+def _options() -> "ocp.CheckpointManagerOptions":
+    """Lets a process read and write by itself, without waiting for the others of its run."""
+    import orbax.checkpoint as ocp
+
+    found = ocp.CheckpointManagerOptions(create=False, enable_async_checkpointing=False)
+    if hosts.count() > 1:
+        own = jax.process_index()
+        found.multiprocessing_options = ocp.options.MultiprocessingOptions(
+            primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
+        )
+    return found
+
+
+def _put_aside(step: Path) -> None:
+    """Moves a step to where nobody looks for one; what had that name is replaced."""
+    aside = step.parents[1] / "passed_over" / step.name
+    shutil.rmtree(aside, ignore_errors=True)
+    aside.parent.mkdir(exist_ok=True)
+    step.rename(aside)
 
 
 def _why(error: Exception) -> str:
@@ -380,7 +412,7 @@ def find(run: Path, update: int | None = None) -> Kept:
     if update is not None and update not in there:
         raise CheckpointError(f"{run} has no checkpoint of update {update}: it has {there}.")
     skipped, bound = [], binding(run)
-    with ocp.CheckpointManager((run / FOLDER).resolve()) as manager:
+    with ocp.CheckpointManager((run / FOLDER).resolve(), options=_options()) as manager:
         for step in [update] if update is not None else there:
             try:
                 leaves, meta = _read(manager, step, bound)

@@ -55,13 +55,15 @@ def locked(run: Path) -> Iterator[None]:
     with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             file.seek(0)
             holder = file.read().strip() or "another process"
             raise ConfigError(
                 f"run.dir is {run}, which {holder} is writing: wait for its end, or give another "
                 "directory."
             ) from None
+        except OSError as error:  # a file system without locks
+            raise unwritable(run, error) from None
         _sign(file)
         try:
             yield
@@ -199,11 +201,13 @@ def bring(source: Path, run: Path, logs: Mapping[str, int]) -> None:
 
     Args:
       source: The directory of the run.
-      run: The other one; what it has already is left as it is.
+      run: The other one; the logs of a run that has begun there are left as they are.
       logs: Bytes of each log that belong to the run, by name; without them all are copied.
     """
+    if (run / CONFIG).exists():
+        return
     for name in LOGS:
-        if (source / name).exists() and not (run / name).exists():
+        if (source / name).exists():
             found = (source / name).read_bytes()
             with replacing(run / name) as temporary:
                 temporary.write_bytes(found[: logs.get(name, 0)] if logs else found)

@@ -132,19 +132,30 @@ def working(what: str, console: Console | None = None) -> Iterator[None]:
         yield
 
 
+class _Console(Console):
+    """A console whose reader may go away: rich would end the process, with the run."""
+
+    def on_broken_pipe(self) -> None:
+        """Goes on without a reader."""
+
+
 class Display:
-    """Shows the run on a console. Use it with `with`."""
+    """Shows the run on a console. Use it with `with`.
+
+    A terminal that is gone, or a pipe without a reader, does not stop the run.
+    """
 
     def __init__(self, updates: int, console: Console | None = None) -> None:
         """Prepares a display for a run of `updates` updates."""
         self._updates = updates
-        self._console = console or Console()
+        self._console = console or _Console()
         self._live = Live(console=self._console, auto_refresh=False)
         self._last_line = -LINE_SECONDS
 
     def say(self, sentence: str) -> None:
         """Prints a sentence that stays."""
-        self._console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+        with contextlib.suppress(OSError):
+            self._console.print(sentence, highlight=False, markup=False, soft_wrap=True)
 
     @contextlib.contextmanager
     def working(self, what: str) -> Iterator[None]:
@@ -160,8 +171,10 @@ class Display:
     def show(self, summary: Row, speeds: Row, seconds_left: float) -> None:
         """Shows where the run stands."""
         if self._console.is_terminal:
-            self._live.start()  # not before there is a table: what is `working` stands there
-            self._live.update(_table(summary, speeds, self._updates, seconds_left), refresh=True)
+            with contextlib.suppress(OSError):
+                self._live.start()  # not before there is a table: what is `working` stands there
+                table = _table(summary, speeds, self._updates, seconds_left)
+                self._live.update(table, refresh=True)
             return
         now = time.monotonic()
         if now - self._last_line >= LINE_SECONDS or summary["update"] == self._updates:
@@ -174,7 +187,8 @@ class Display:
 
     def __exit__(self, *_: object) -> None:
         """Leaves the last table standing."""
-        self._live.stop()
+        with contextlib.suppress(OSError):
+            self._live.stop()
 
 
 def _table(summary: Row, speeds: Row, updates: int, seconds_left: float) -> Group:

@@ -11,3 +11,7 @@ class TrainingError(RuntimeError):
 
 class DivergedError(RuntimeError):
     """A run that learns nothing any more, in one sentence."""
+
+
+class LostPeerError(RuntimeError):
+    """A process of a run whose others are gone, in one sentence."""

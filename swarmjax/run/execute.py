@@ -1,19 +1,20 @@
 """From the checked settings of a run to its exit code: caches, memory, and the closing lines."""
 
 import math
+import os
 import sys
 from pathlib import Path
 
 import jax
 
 from swarmjax import command, words
-from swarmjax.run import compile_cache, memory
+from swarmjax.run import compile_cache, hosts, memory
 from swarmjax.run.display import Display, measured, spread, working
-from swarmjax.run.errors import TrainingError
+from swarmjax.run.errors import LostPeerError, TrainingError
 from swarmjax.run.lifecycle import carry_out, dry_run, find_run
 from swarmjax.run.policy_export import POLICY, seed_path
 from swarmjax.run.settings import TrainConfig
-from swarmjax.run.signals import Stop, StoppedError
+from swarmjax.run.signals import REQUEUE, Stop, StoppedError
 from swarmjax.run.trainer import Tally, measure
 
 FAILED = 1
@@ -30,12 +31,17 @@ def execute(settings: TrainConfig, stop: Stop, *, auto: bool) -> int:
     Returns:
       The exit code of the command.
     """
+    hosts.join(settings)
     with compile_cache.use(settings.run.compile_cache):
         if auto:
             settings, why = fill(settings)
             sys.stdout.write(f"{why}\n")
-        with memory.refusal(settings):
-            return _run(settings, stop)
+        try:
+            with hosts.lost_peers(), memory.refusal(settings):
+                return _run(settings, stop)
+        except LostPeerError as error:
+            sys.stderr.write(f"swarmjax.train: {error} Go on with resume=auto.\n")
+            return hosts.leave(REQUEUE)
 
 
 def fill(settings: TrainConfig) -> tuple[TrainConfig, str]:
@@ -50,7 +56,12 @@ def _run(settings: TrainConfig, stop: Stop) -> int:
     if settings.run.dry:
         with Display(settings.updates) as display:
             return dry_run(settings, display)
-    run = find_run(settings)
+    found = find_run(settings) if hosts.is_first() else Path()
+    with hosts.own_directory(found) as run:
+        return _train(run, settings, stop)
+
+
+def _train(run: Path, settings: TrainConfig, stop: Stop) -> int:
     with Display(settings.updates) as display:
         try:
             tally = carry_out(settings, run, stop, display)
@@ -60,8 +71,18 @@ def _run(settings: TrainConfig, stop: Stop) -> int:
         except StoppedError:
             display.say("stopped before the first update: nothing was trained, and nothing is lost")
             return stop.code or command.INTERRUPTED
-    sys.stdout.write(f"{_success(settings, tally)}\n{_closing(run, settings, tally)}\n")
+    _tell(f"{_success(settings, tally)}\n{_closing(run, settings, tally)}\n")
     return stop.code or 0
+
+
+def _tell(text: str) -> None:
+    """Writes to standard output, whose reader may be gone."""
+    try:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except OSError:
+        # Python flushes it again at exit, and would end with code 120.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _success(settings: TrainConfig, tally: Tally) -> str:

@@ -15,8 +15,9 @@ from swarmjax import extension, provenance, words
 from swarmjax.config import ConfigError, to_dict
 from swarmjax.curriculum import engine as curriculum
 from swarmjax.curriculum.engine import Schedule
+from swarmjax.policy import PolicyError
 from swarmjax.ppo import optimizer
-from swarmjax.run import checkpoint, directory, memory, warm_start
+from swarmjax.run import checkpoint, directory, hosts, memory, warm_start
 from swarmjax.run.checkpoint import Checkpoints, Kept, Leaves
 from swarmjax.run.display import Display, working
 from swarmjax.run.errors import DivergedError, TrainingError
@@ -62,7 +63,7 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
     """
     with directory.locked(run):
         check_free(run, settings)
-        name = settings.run.id or directory.new_id()
+        name = settings.run.id or hosts.share_text(directory.new_id())
         settings = replace(settings, run=replace(settings.run, id=name))
         try:
             return _carry_out(settings, run, stop, display)
@@ -115,7 +116,7 @@ def _train(
     display.say(f"compiled in {words.duration(compiled.seconds)}")
     _open_run(run, settings, kept)
     state, tally = train(run, program, schedule, compiled, state, display, stop, kept)
-    leaves = checkpoint.to_leaves(state)
+    leaves = checkpoint.to_leaves(hosts.gather(state))
     _write_policies(run, settings, leaves, tally.update)
     _write_summary(run, program, tally)
     return tally
@@ -144,7 +145,7 @@ def _first_sentences(
         yield f"{sentence}."
     if settings.resume is not None and kept is None:
         yield f"{settings.resume} has no checkpoint yet: it begins from its seed."
-    if kept is not None:
+    if kept is not None and settings.resume is not None:
         yield from _dealt_again(settings)
     if source is not None:
         updates = words.count(source.update, "update")
@@ -157,8 +158,8 @@ def _first_sentences(
 
 def _dealt_again(settings: TrainConfig) -> Iterator[str]:
     """Says that a run goes on with other random streams than it had."""
-    before = from_stored(read_config(Path(settings.resume or ""))).shards.streams
-    now = settings.shards.streams
+    before = from_stored(read_config(Path(settings.resume or ""))).stream_count
+    now = settings.stream_count
     if now != before:
         yield (
             f"random numbers come in {words.count(now, 'stream')} from here on, and not in "
@@ -186,7 +187,7 @@ def _complete(run: Path, settings: TrainConfig, kept: Kept, display: Display) ->
     if not current:
         _open_run(run, settings, kept)
         with Checkpoints(run, settings.run.keep_checkpoints) as checkpoints:
-            checkpoints.save(kept.leaves, kept.update, kept.logs)
+            checkpoints.save(kept.leaves, kept.update, kept.logs, rate_scale=kept.rate_scale)
     _write_policies(run, settings, kept.leaves, kept.update, only_missing=current)
     steps = words.count(
         kept.update * settings.arenas * settings.algo.rollout_length, "arena control step"
@@ -213,7 +214,7 @@ def _is_summed_up(run: Path, update: int) -> bool:
     try:
         found = json.loads((run / directory.SUMMARY).read_text())
         return found["budget_spent"] is True and found["updates"] == update
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return False
 
 
@@ -286,6 +287,11 @@ def check_free(run: Path, settings: TrainConfig) -> None:
         raise ConfigError(
             f"run.dir is {run}, which holds a run already: give another directory, or "
             f"resume={run} to go on with it."
+        )
+    if not (run / directory.CONFIG).exists() and checkpoint.steps(run):
+        raise ConfigError(
+            f"run.dir is {run}, which holds {checkpoint.FOLDER}/ of a run that has lost its "
+            f"{directory.CONFIG}: give another directory, or remove that one."
         )
 
 
@@ -386,7 +392,10 @@ def _write_policies(
     for seed in seeds.numbers(settings):
         file = seed_path(run / POLICY, settings, seed)
         if not (only_missing and file.exists()):
-            write_policy(file, leaves, settings, update, seed)
+            try:
+                write_policy(file, leaves, settings, update, seed)
+            except PolicyError as error:  # such as a full disk
+                raise TrainingError(str(error)) from None
 
 
 def _write_summary(run: Path, program: Built, tally: Tally) -> None:

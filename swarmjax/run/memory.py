@@ -31,7 +31,7 @@ def limit() -> int | None:
     Returns:
       Bytes; None where nobody tells.
     """
-    device = jax.devices()[0]
+    device = jax.local_devices()[0]
     if device.platform == "cpu":
         return _host_memory()
     stats = device.memory_stats()
@@ -159,7 +159,8 @@ def line(
 
 def _sizes(settings: TrainConfig) -> list[int]:
     """Numbers that `arenas` may be by all the rest of the config, rising."""
-    found = [replace(settings, arenas=settings.algo.num_minibatches).arenas]
+    least = settings.algo.num_minibatches * settings.stream_count
+    found = [replace(settings, arenas=least).arenas]
     with contextlib.suppress(ConfigError):
         while True:
             found.append(replace(settings, arenas=2 * found[-1]).arenas)

@@ -113,6 +113,8 @@ class Recorder:
                 directory.cut(run / name, logs.get(name, 0))
         names = [METRICS, DECISIONS, *([EPISODES] if episodes else [])]
         self._logs = {name: Log(run / name) for name in names}
+        # A log that this process does not write still belongs to the run.
+        self._closed = {k: length for k, length in (logs or {}).items() if k not in names}
         purge = arena_steps + 1 if update else None  # TensorBoard hides what it has from here on
         folder = run / "tensorboard"
         folders = {k: folder / f"seed{k}" if len(seeds) > 1 else folder for k in seeds[:BOARDS]}
@@ -132,7 +134,7 @@ class Recorder:
 
     def sync(self) -> dict[str, int]:
         """Makes sure that the disk has all rows; returns the bytes of each log, by name."""
-        return {name: log.sync() for name, log in self._logs.items()}
+        return self._closed | {name: log.sync() for name, log in self._logs.items()}
 
     def __enter__(self) -> "Recorder":
         """Returns itself."""

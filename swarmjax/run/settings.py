@@ -68,6 +68,19 @@ class RunConfig(Section):
     episodes: bool = field(
         default=False, metadata=about("write episodes.jsonl: each episode, robot by robot")
     )
+    coordinator: Literal["auto"] | str | None = field(
+        default=None,
+        metadata=about(
+            "HOST:PORT of the first of several processes; auto: as Slurm, Open MPI or Kubernetes "
+            "say; null: this process is alone"
+        ),
+    )
+    processes: int | None = field(
+        default=None, metadata=about("of the run [coordinator=HOST:PORT]", 1, 2**16)
+    )
+    process: int | None = field(
+        default=None, metadata=about("number of this one, from 0 [coordinator=HOST:PORT]", 0, 2**16)
+    )
     deterministic: bool = field(
         default=False, metadata=about("compute the same bits each time on a GPU; slower")
     )
@@ -80,6 +93,28 @@ class RunConfig(Section):
         default=0.8,
         metadata=about("of the GPU's memory, what arenas=auto fills", above=0.0, high=1.0),
     )
+
+    def _check(self) -> None:
+        given = (self.processes, self.process)
+        if self.coordinator in (None, "auto"):
+            if given != (None, None):
+                where = "null" if self.coordinator is None else "auto"
+                raise ConfigError(
+                    f"processes is {show(self.processes)} and process {show(self.process)}, but "
+                    f"coordinator is {where}: give them with coordinator=HOST:PORT alone."
+                )
+            return
+        host, _, port = str(self.coordinator).rpartition(":")
+        if not host or not port.isdecimal() or not 0 < int(port[:9]) < 2**16:
+            raise ConfigError(
+                f"coordinator is {show(self.coordinator)}: give HOST:PORT, auto or null."
+            )
+        if self.processes is None or self.process is None or self.process >= self.processes:
+            raise ConfigError(
+                f"coordinator is {show(self.coordinator)}, but processes is "
+                f"{show(self.processes)} and process {show(self.process)}: give the number of "
+                "processes, and that of this one from 0."
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +157,7 @@ class TrainConfig(ProgramConfig):
         self._check_episodes()
         check_realism(self.realism, self.robot, self.task, self.task.step_limit)
         if self.devices > 1:
-            object.__setattr__(self, "streams", self.shards.streams)
+            object.__setattr__(self, "streams", self.stream_count)
         names = [stage.name for stage in self.stage]
         if len(names) == 1 or not self.stage_name:
             object.__setattr__(self, "stage_name", "-".join(names))
@@ -150,7 +185,7 @@ class TrainConfig(ProgramConfig):
                 f"streams is {self.streams}, but devices is {self.devices}: give a multiple of "
                 f"{self.devices}, or null."
             )
-        streams, minibatches = self.shards.streams, self.algo.num_minibatches
+        streams, minibatches = self.stream_count, self.algo.num_minibatches
         if self.arenas % (streams * minibatches):
             which = "streams" if self.streams else "devices"
             spread = "" if streams == 1 else f"{which} is {streams} and "

@@ -37,9 +37,14 @@ class Stop:
       signalled: Whether somebody asked to stop, by a signal or by setting it.
     """
 
-    def __init__(self, until: float = math.inf) -> None:
-        """Nobody has asked yet; it stops by itself at `until`, of `time.monotonic`."""
+    def __init__(self, until: float = math.inf, *, patient: bool = False) -> None:
+        """Nobody has asked yet; it stops by itself at `until`, of `time.monotonic`.
+
+        One that is `patient` does not stop at once at a second signal: a scheduler sends each to a
+        process and to its parent, which hands it on.
+        """
         self.signalled = False
+        self._patient = patient
         self.code: int | None = None
         self._until = until
 
@@ -59,7 +64,9 @@ class Stop:
         os.set_blocking(self._write, False)
         self._before = {number: signal.signal(number, self._ask) for number in CODES}
         self._wakeup = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
-        self._thread = threading.Thread(target=_watch, args=(self._read,), daemon=True)
+        self._thread = threading.Thread(
+            target=_watch, args=(self._read, self._patient), daemon=True
+        )
         self._thread.start()
         return self
 
@@ -77,7 +84,7 @@ class Stop:
         self.signalled = True
 
 
-def _watch(read: int) -> None:
+def _watch(read: int, patient: bool) -> None:
     """Says what the first signal does, and ends the process at the second.
 
     Python calls a handler only between its own instructions, and a compiled program may run for
@@ -88,6 +95,8 @@ def _watch(read: int) -> None:
         while number := pipe.read(1):
             found = signal.Signals(number[0])
             if found not in CODES:
+                continue
+            if first is not None and patient:
                 continue
             if first is not None:
                 _end(CODES[first])

@@ -18,11 +18,11 @@ import numpy as np
 from swarmjax import provenance, words
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.curriculum.log import log
-from swarmjax.run import memory, recorder
+from swarmjax.run import hosts, memory, recorder
 from swarmjax.run.checkpoint import Checkpoints, Kept
-from swarmjax.run.directory import EPISODES, Row
+from swarmjax.run.directory import EPISODES, METRICS, Row
 from swarmjax.run.display import Display, summarize
-from swarmjax.run.errors import DivergedError
+from swarmjax.run.errors import CheckpointError, DivergedError
 from swarmjax.run.recorder import Recorder
 from swarmjax.run.settings import TrainConfig
 from swarmjax.run.signals import Stop
@@ -226,9 +226,12 @@ def train(
         Checkpoints(run, keep, resumed) as checkpoints,
     ):
         saves = Saves(settings, done)
-        save = partial(checkpoints.save, rate_scale=1.0 if kept is None else kept.rate_scale)
-        if kept is None:
-            save(state, done, record.sync())
+        save = partial(
+            checkpoints.save,
+            rate_scale=1.0 if kept is None else kept.rate_scale,
+            of={"budget": settings.budget, "streams": settings.stream_count},
+        )
+        save(state, done, record.sync())  # nothing is done if it is there
         for n in _calls(program, tally, stop):
             began = time.perf_counter()
             state, metrics = compiled.call(schedule, state, np.int32(n))
@@ -237,10 +240,8 @@ def train(
             _report(program, tally, metrics, n, time.perf_counter() - began, record, display)
             if log is not None:
                 _log_episodes(program.config, log, np.arange(tally.update)[-n:], record, display)
-            if tally.is_sound and saves.due(tally.update):
+            if tally.is_sound and hosts.share(saves.due(tally.update))[0]:
                 save(state, tally.update, record.sync(), score(settings, tally))
-        if not tally.is_sound:
-            raise DivergedError(f"the last update taught nothing, update {tally.update:,}.")
         save(state, tally.update, record.sync(), score(settings, tally))
     return state, tally
 
@@ -308,8 +309,14 @@ def begin_tally(
     if kept is None:
         return tally
     rows, decisions = recorder.history(run, done, kept.logs)
-    _add(settings, tally, rows, decisions)
-    tally.earlier_s = rows[-1]["train_s"] if rows else 0.0
+    try:
+        _add(settings, tally, rows, decisions)
+        tally.earlier_s = float(rows[-1]["train_s"]) if rows else 0.0
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"{run / METRICS} is damaged ({type(error).__name__}: {error}): put the file back, or "
+            "delete it to go on without its rows."
+        ) from None
     return tally
 
 
@@ -354,7 +361,7 @@ def _calls(program: Built, tally: Tally, stop: Stop) -> Iterator[int]:
     if settings.run.stop_after is not None:
         goal = min(goal, settings.run.stop_after)
     n = 1
-    while tally.update < goal and not stop.asked:
+    while tally.update < goal and not stop_together(stop):
         left = min(goal - tally.update, program.rows)
         if settings.run.chunk == "all" and not tally.seconds:
             n = min(left, FIRST_UPDATES)
@@ -365,7 +372,17 @@ def _calls(program: Built, tally: Tally, stop: Stop) -> Iterator[int]:
         elif tally.seconds:
             pace = tally.seconds / (tally.update - tally.first)
             n = int(np.clip(CALL_SECONDS / pace, 1, GROWTH * n))
-        yield min(n, left)
+        yield int(hosts.share(min(n, left))[0])
+
+
+def stop_together(stop: Stop) -> bool:
+    """Tells whether a process of the run was asked to stop; all then end with the same code."""
+    if hosts.count() == 1:
+        return stop.asked
+    asked = hosts.share((stop.code or 1) if stop.asked else 0).max()
+    if asked > 1 and stop.code is None:
+        stop.code = int(asked)
+    return bool(asked)
 
 
 def _report(
@@ -385,11 +402,11 @@ def _report(
     tally.seconds += seconds
     rows = recorder.rows(metrics, n, names, seeds.numbers(settings), control_steps)
     rows: list[Row] = [row | {"train_s": tally.earlier_s + tally.seconds} for row in rows]
-    _watch_steps(settings, tally, rows)
     decisions = _decisions(settings, rows)
     speeds = _speeds(program, rows, seconds) | {"compile_s": tally.compile_s}
     _add(settings, tally, rows, decisions)
     record.write(rows, decisions, speeds)
+    _watch_steps(settings, tally, rows)
     for entry in decisions:
         if "to" in entry:  # the rest is many, and stands in the log
             display.say(_sentence(settings, entry))

@@ -7,7 +7,6 @@ from swarmjax.config import Section, about
 from swarmjax.config.section import MAX_COUNT, ByName
 from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.shards import Shards
 from swarmjax.sim.config import RobotConfig, SimConfig
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig
@@ -75,9 +74,9 @@ class ProgramConfig(Section):
     )
 
     @property
-    def shards(self) -> Shards:
-        """How the arenas are spread over devices."""
-        return Shards(self.devices, self.streams or self.devices)
+    def stream_count(self) -> int:
+        """Streams of random numbers."""
+        return self.streams or self.devices
 
     @property
     def updates(self) -> int:

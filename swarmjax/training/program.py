@@ -40,7 +40,7 @@ class Program[C: ProgramConfig]:
     @property
     def shards(self) -> Shards:
         """How the arenas are spread over devices."""
-        return self.config.shards
+        return Shards(self.config.devices, self.config.stream_count)
 
     @property
     def rows(self) -> int:

@@ -1,5 +1,8 @@
 """A run directory: one process at a time, and logs whose truth is what a checkpoint counts."""
 
+import errno
+import fcntl
+import os
 import resource
 import subprocess
 import sys
@@ -156,3 +159,15 @@ def test_logs_are_brought_to_another_directory(tmp_path: Path) -> None:
     directory.bring(source, run, {directory.METRICS: length})
     assert directory.read_rows(run / directory.METRICS, None) == [{"update": 0}]
     assert not (run / directory.DECISIONS).exists()
+
+
+def test_a_file_system_without_locks_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    refused = pytest.raises(ConfigError, match="cannot be written: No locks available")
+    with refused, directory.locked(tmp_path):
+        pass

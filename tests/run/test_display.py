@@ -1,7 +1,9 @@
 """What a run shows."""
 
 import io
+import sys
 
+import pytest
 from rich.console import Console
 
 from swarmjax.run.display import Display, StageState, summarize, working
@@ -173,3 +175,25 @@ def test_a_single_stage_has_no_table_of_stages() -> None:
     row = ROW | {"stage": "s1", "mix": [8], "success_by_stage": [0.25], "complete_by_stage": [0.25]}
     assert "stages above" not in _shown(True, [row], ["s1"])
     assert "stages above" not in _shown(False, [row], ["s1"])
+
+
+class _Gone(io.StringIO):
+    """A terminal that was closed, or a pipe without a reader."""
+
+    def __init__(self, error: type[OSError]) -> None:
+        """Fails with this error."""
+        super().__init__()
+        self._error = error
+
+    def write(self, _: str) -> int:
+        """Fails."""
+        raise self._error
+
+
+@pytest.mark.parametrize("error", [OSError, BrokenPipeError])
+def test_a_reader_that_is_gone_does_not_stop_the_run(
+    error: type[OSError], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stdout", _Gone(error))
+    with Display(10) as display:
+        display.say("a sentence")

@@ -22,6 +22,7 @@ from swarmjax.config import ConfigError
 from swarmjax.policy import digest
 from swarmjax.run import checkpoint, directory, execute, lifecycle, trainer
 from swarmjax.run.directory import LOCK
+from swarmjax.run.errors import CheckpointError
 from swarmjax.run.settings import RunConfig, load_run
 from swarmjax.run.signals import REQUEUE
 
@@ -44,7 +45,8 @@ def _compiled_once() -> Iterator[None]:
     compile_chunk, found = trainer.compile_chunk, {}
 
     def look_up(program: Any, *arguments: Any, **given: Any) -> trainer.Compiled:
-        key = repr(replace(program.config, run=RunConfig(), resume=None))
+        config = replace(program.config, run=RunConfig(), resume=None)
+        key = (repr(config), program.by_robot)
         if key not in found:
             found[key] = compile_chunk(program, *arguments, **given)
         return found[key]
@@ -138,6 +140,47 @@ def test_rows_after_the_checkpoint_are_not_doubled(whole: Path, tmp_path: Path) 
     assert train.main([f"resume={run}"]) == 0
     assert _updates(run) == list(range(9))
     assert _digest(run) == _digest(whole)
+
+
+def test_a_run_that_goes_on_elsewhere_has_a_checkpoint_there_at_once(tmp_path: Path) -> None:
+    run, on = _stopped(tmp_path / "run", after=5), tmp_path / "on"
+    assert train.main([f"resume={run}", f"run.dir={on}", "run.stop_after=5"]) == 0
+    assert checkpoint.find(on).update == 5
+
+
+def test_episodes_stay_where_a_run_writes_none_for_a_while(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    assert train.main([*TINY, f"run.dir={run}", "run.episodes=true", "run.stop_after=4"]) == 0
+    written = (run / "episodes.jsonl").read_bytes()
+    assert train.main([f"resume={run}", "run.episodes=false", "run.stop_after=6"]) == 0
+    assert train.main([f"resume={run}"]) == 0
+    assert written
+    assert (run / "episodes.jsonl").read_bytes().startswith(written)
+
+
+def test_checkpoints_without_their_config_are_not_added_to(tmp_path: Path) -> None:
+    run = _stopped(tmp_path / "run", after=5)
+    (run / "config.json").unlink()
+    with pytest.raises(ConfigError, match="a run that has lost its config"):
+        train.main([*TINY, f"run.dir={run}"])
+
+
+def test_damaged_rows_of_a_run_that_goes_on_are_one_sentence(tmp_path: Path) -> None:
+    run = _stopped(tmp_path / "run", after=5)
+    log = run / "metrics.jsonl"
+    log.write_text(log.read_text().replace('"transitions"', '"transitionz"', 1))
+    with pytest.raises(CheckpointError, match=r"metrics.jsonl is damaged \(KeyError"):
+        train.main([f"resume={run}"])
+
+
+def test_digests_of_another_budget_are_not_compared(tmp_path: Path) -> None:
+    run = _stopped(tmp_path / "run", after=5)
+    assert train.main([f"resume={run}", "budget=160"]) == 0
+    log = [json.loads(line) for line in (run / "checkpoints.jsonl").read_text().splitlines()]
+    assert {row["budget"] for row in log} == {144, 160}
+    settings = verify.VerifyConfig(run=str(run), updates=9)
+    found = verify.load_digests(settings, load_run([*TINY, "budget=160"])[0])
+    assert set(found) == {row["update"] for row in log if row["budget"] == 160} & set(range(1, 10))
 
 
 def test_a_run_that_goes_on_elsewhere_takes_its_logs_along(whole: Path, tmp_path: Path) -> None:
@@ -245,7 +288,7 @@ def test_auto_refuses_other_settings_key_by_key(whole: Path) -> None:
         load_run(words)
     assert "algo.discount is 0.9 and not 0.998" in str(error.value)
     assert "seed is 3 and not 0" in str(error.value)
-    assert "budget and run.* may change" in str(error.value)
+    assert "run.*, streams may change" in str(error.value)
 
 
 def test_auto_needs_a_directory() -> None:
@@ -310,7 +353,7 @@ def test_a_run_that_was_trained_otherwise_does_not_verify(
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (None, "has no digests in checkpoints.jsonl: give a run that has saved a checkpoint"),
+        (None, "has no digests in checkpoints.jsonl .* give a run that has saved a checkpoint"),
         ('{"update": 0, "digest": "a"}\n', "has no digests in checkpoints.jsonl"),
         (
             '{"update": 2, "digest": "a", "rate_scale": 0.1}\n',
@@ -408,3 +451,15 @@ def test_lower_rates_are_kept_when_the_run_is_resumed(
     assert train.main([f"resume={run}"]) == 0
     assert "learning rates 3e-05 (actor)" in " ".join(capsys.readouterr().out.split())
     assert checkpoint.find(run).rate_scale == 0.1
+
+
+def test_a_run_that_stops_before_it_has_diverged_does_not_go_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _spoil(monkeypatch, at=20)
+    run, words = tmp_path / "run", [*TINY, "budget=640", "run.chunk=1", "run.stop_after=25"]
+    assert train.main([*words, f"run.dir={run}"]) == 0
+    assert "goes back" not in capsys.readouterr().out
+    kept = checkpoint.find(run)
+    assert kept.update <= 20
+    assert kept.rate_scale == 1.0

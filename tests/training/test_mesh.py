@@ -40,7 +40,9 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Found:
     return dict(np.load(out))
 
 
-@pytest.fixture(scope="module", params=["one process", "two processes"])
+@pytest.fixture(
+    scope="module", params=[pytest.param("one process", marks=pytest.mark.slow), "two processes"]
+)
 def spread(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Found:
     """The run on two devices."""
     out = tmp_path_factory.mktemp("spread") / "found.npz"

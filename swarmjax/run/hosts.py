@@ -1,0 +1,228 @@
+"""Several processes that train one run, on one host or on many.
+
+The first process shows the run and writes its directory; the others write into a folder that is
+thrown away. All of them call the program in step, so whatever the clock or a signal decides is
+decided together.
+"""
+
+import contextlib
+import json
+import os
+import sys
+import tempfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from swarmjax import provenance
+from swarmjax.config import ConfigError, show, to_dict
+from swarmjax.run import rank
+from swarmjax.run.errors import LostPeerError
+from swarmjax.run.settings import TrainConfig
+
+AUTO = "auto"
+CHECKPOINTS = "checkpoints"  # folder of a run directory
+# A sentence within a minute, where a process never comes; within half of one, where one is lost.
+_JOIN_S, _HEARTBEAT_S = 45, 20
+_OWN = ("coordinator", "processes", "process")  # keys of `run` that differ between processes
+
+
+def join(settings: TrainConfig) -> None:
+    """Joins the other processes of a run, if its settings name any.
+
+    Args:
+      settings: of the run.
+
+    Raises:
+      ConfigError: if the others do not come, or have other settings or versions.
+    """
+    run = settings.run
+    if run.coordinator is None:
+        return
+    import jax
+
+    given: dict[str, Any] = {}
+    if run.coordinator != AUTO:
+        given["coordinator_address"] = run.coordinator
+        given |= {"num_processes": run.processes, "process_id": run.process}
+    try:
+        jax.distributed.initialize(
+            **given,
+            initialization_timeout=_JOIN_S,
+            heartbeat_timeout_seconds=_HEARTBEAT_S,
+            shutdown_timeout_seconds=_HEARTBEAT_S,
+        )
+    except Exception as error:  # JAX raises whatever its transport does
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        raise ConfigError(
+            f"run.coordinator is {show(run.coordinator)}, but the processes of the run did not "
+            f"meet within {_JOIN_S} s ({reason}): start all of them, and check address and counts."
+        ) from None
+    rank.tell_joined()
+    _check_alike(settings)
+    _check_devices(settings)
+
+
+def count() -> int:
+    """Counts the processes of this run."""
+    import jax
+
+    return jax.process_count()
+
+
+def is_first() -> bool:
+    """Tells whether this process shows the run and writes it."""
+    import jax
+
+    return jax.process_index() == 0
+
+
+def share(value: int) -> np.ndarray:
+    """Tells all processes a number of each.
+
+    Args:
+      value: of this process, of 32 bits.
+
+    Returns:
+      [P], that of every process, in their order.
+    """
+    if count() == 1:
+        return np.array([value])
+    from jax.experimental import multihost_utils
+
+    return np.asarray(multihost_utils.process_allgather(np.int32(value))).reshape(-1)
+
+
+def share_text(text: str) -> str:
+    """Gives all processes the text of the first."""
+    if count() == 1:
+        return text
+    from jax.experimental import multihost_utils
+
+    mine = text.encode()
+    padded = np.zeros(int(share(len(mine)).max()), np.uint8)
+    padded[: len(mine)] = np.frombuffer(mine, np.uint8)
+    found = np.asarray(multihost_utils.broadcast_one_to_all(padded))
+    return bytes(found.astype(np.uint8)).rstrip(b"\0").decode()
+
+
+def gather(tree: Any) -> Any:
+    """Brings arrays that are spread over hosts together, on every process."""
+    if count() == 1:
+        return tree
+    import jax
+    from jax.experimental import multihost_utils
+
+    def whole(x: jax.Array) -> Any:
+        if jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key):
+            x = jax.random.key_data(x)
+        if x.is_fully_addressable or x.is_fully_replicated:
+            return np.asarray(x)
+        return multihost_utils.process_allgather(x, tiled=True)
+
+    return jax.tree.map(whole, tree)
+
+
+@contextlib.contextmanager
+def lost_peers() -> Iterator[None]:
+    """Turns what JAX raises when another process is gone into a sentence.
+
+    Raises:
+      LostPeerError: if one is gone.
+    """
+    import jax
+
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        if count() == 1:
+            raise
+        reason = (str(error).splitlines() or [""])[0][:120]
+        raise LostPeerError(f"another process of the run is gone ({reason}).") from None
+
+
+@contextlib.contextmanager
+def own_directory(run: Path) -> Iterator[Path]:
+    """Gives the first process the run directory, and the others one that is thrown away.
+
+    The others are quiet besides, and find the checkpoints of the first there.
+
+    Args:
+      run: The run directory, of the first process.
+    """
+    shared = Path(share_text(str(run.resolve())))
+    if is_first():
+        yield run
+        return
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Path(os.devnull).open("w") as nowhere,
+        contextlib.redirect_stdout(nowhere),
+    ):
+        own = Path(folder) / "run"
+        own.mkdir()
+        (own / CHECKPOINTS).symlink_to(shared / CHECKPOINTS)
+        yield own
+
+
+def leave(code: int) -> NoReturn:
+    """Ends a process whose peers are gone at once: at exit, JAX would wait for them.
+
+    Args:
+      code: Of the exit.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def _check_alike(settings: TrainConfig) -> None:
+    """Refuses processes that would not run the same program."""
+    mine = json.dumps(_comparable(settings), sort_keys=True)
+    first = share_text(mine)
+    digests = share(zlib.crc32(mine.encode()) >> 1)
+    other = [i for i, digest in enumerate(digests.tolist()) if digest != digests[0]]
+    if not other:
+        return
+    if mine == first:
+        raise ConfigError(
+            f"process {other[0]} has other settings or versions than process 0: give all the same."
+        )
+    theirs, own = json.loads(first), json.loads(mine)
+    key = next(key for key in own if own[key] != theirs.get(key))
+    raise ConfigError(
+        f"{key} is {show(own[key])} here and {show(theirs.get(key))} in process 0: give all "
+        "processes the same."
+    )
+
+
+def _comparable(settings: TrainConfig) -> dict[str, Any]:
+    """Flattens what all processes must have alike to dotted keys."""
+    found: dict[str, Any] = {}
+
+    def add(where: str, value: Any) -> None:
+        if isinstance(value, dict):
+            for key, inner in value.items():
+                add(f"{where}.{key}" if where else key, inner)
+        else:
+            found[where] = value
+
+    add("", to_dict(settings))
+    for key in _OWN:
+        found.pop(f"run.{key}", None)
+    found.pop("run.id", None)
+    return found | {f"version of {name}": value for name, value in provenance.versions().items()}
+
+
+def _check_devices(settings: TrainConfig) -> None:
+    import jax
+
+    found = jax.device_count()
+    if settings.devices != found:
+        raise ConfigError(
+            f"devices is {settings.devices}, but the {count()} processes of the run have {found}: "
+            f"give devices={found}."
+        )

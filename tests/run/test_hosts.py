@@ -1,0 +1,114 @@
+"""Several processes train one run: who refuses, who writes, and what becomes of a lost one."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from swarmjax.run import rank
+
+ROOT = Path(__file__).parents[2]
+WORDS = ["arenas=64", "algo.num_minibatches=4", "run.tensorboard=false"]
+
+
+def _start(run: Path, coordinator: str, process: int, *words: str) -> subprocess.Popen[str]:
+    given = [
+        *WORDS,
+        f"run.dir={run}",
+        f"run.coordinator={coordinator}",
+        "run.processes=2",
+        f"run.process={process}",
+        *words,
+    ]
+    return subprocess.Popen(
+        [sys.executable, "-m", "swarmjax.train", *given],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+
+
+@pytest.fixture
+def coordinator() -> str:
+    """An address that is free."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{free.getsockname()[1]}"
+
+
+def _said(process: subprocess.Popen[str]) -> tuple[int, str]:
+    _, errors = process.communicate(timeout=300)
+    return process.returncode, errors
+
+
+def test_processes_of_other_settings_are_refused(tmp_path: Path, coordinator: str) -> None:
+    run = tmp_path / "run"
+    both = [_start(run, coordinator, i, "devices=2", f"seed={i}") for i in range(2)]
+    (first, said), (second, named) = map(_said, both)
+    assert (first, second) == (2, 2)
+    assert "process 1 has other settings" in said
+    assert "seed is 1 here and 0 in process 0" in named
+    assert "Traceback" not in said + named
+    assert not run.exists()
+
+
+def test_devices_are_those_of_all_processes(tmp_path: Path, coordinator: str) -> None:
+    both = [_start(tmp_path / "run", coordinator, i) for i in range(2)]
+    for code, said in map(_said, both):
+        assert code == 2
+        assert "devices is 1, but the 2 processes of the run have 2: give devices=2." in said
+
+
+def test_lines_of_an_abort_are_left_out() -> None:
+    said = [
+        "F1124 02:00:00.000000 12 client.h:80] Terminating process\n",
+        "*** Check failure stack trace: ***\n",
+        "    @     0x7f2d5a6a666d  main\n",
+        "swarmjax.train: error: a sentence\n",
+    ]
+    assert list(rank._sentences(said)) == said[-1:]
+
+
+@pytest.mark.parametrize(("joined", "code"), [(False, 2), (True, 75)])
+def test_a_death_is_a_sentence(joined: bool, code: int, capsys: pytest.CaptureFixture) -> None:
+    assert rank._died(-signal.SIGABRT, joined=joined) == code
+    assert capsys.readouterr().err.startswith("swarmjax.train: error: ")
+
+
+@pytest.mark.slow
+def test_a_lost_process_ends_the_others_and_the_run_goes_on_alone(
+    tmp_path: Path, coordinator: str
+) -> None:
+    run = tmp_path / "run"
+    words = ["devices=2", "run.chunk=1", "run.checkpoint_minutes=0", "budget=1e6"]
+    both = [_start(run, coordinator, i, *words) for i in range(2)]
+    while not (run / "metrics.jsonl").exists():
+        assert all(process.poll() is None for process in both)
+        time.sleep(0.1)
+    time.sleep(5.0)
+    (child,) = psutil.Process(both[1].pid).children()
+    child.kill()
+    began = time.monotonic()
+    for code, said in map(_said, both):
+        assert code == 75
+        assert "Traceback" not in said
+    assert time.monotonic() - began < 30.0
+    given = [*WORDS, f"run.dir={run}", "resume=auto", "run.chunk=1", "run.checkpoint_minutes=0"]
+    subprocess.run(
+        [sys.executable, "-m", "swarmjax.train", *given, "budget=1e6", "run.stop_after=100"],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        timeout=300,
+    )
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert [row["update"] for row in rows] == list(range(100))
