@@ -120,16 +120,19 @@ def result(config: PriceConfig, settings: TrainConfig) -> dict[str, Any]:
     price, low, high = median([1.0 - saving / free for saving, free in pairs])
     steps = settings.arenas * settings.algo.rollout_length
     leaves = checkpoint.to_leaves(steady.state)
+    written = sum(count for (_, count), _ in found)
+    apart_s = PAIRS * config.seconds / max(1, written)
     return {
         "benchmark": "checkpoint_price",
         "every_s": config.every,
         "price": price,
         "price_low": low,
         "price_high": high,
-        "price_at_60_s": price * config.every / 60.0,
-        "price_at_60_s_high": high * config.every / 60.0,
+        "price_at_60_s": price * apart_s / 60.0,
+        "price_at_60_s_high": high * apart_s / 60.0,
         "pairs": PAIRS,
-        "checkpoints": sum(count for (_, count), _ in found),
+        "seconds": config.seconds,
+        "checkpoints": written,
         "checkpoint_mb": sum(leaf.nbytes for leaf in leaves.values()) / 1e6,
         "arena_steps_per_s": median([saving for saving, _ in pairs])[0] * steps,
         "arena_steps_per_s_without": median([free for _, free in pairs])[0] * steps,

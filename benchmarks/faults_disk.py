@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.faults_runs import SECONDS, is_whole, start, train_command
+from swarmjax.run import directory
 
 SIZES = 20
 PAGE = 4096  # bytes; a tmpfs has whole pages
@@ -141,12 +142,15 @@ def _begin(run: Path, random: np.random.Generator) -> None:
 
 
 def _removed(random: np.random.Generator, folder: Path) -> dict[str, Any]:
-    """Removes the directory of a run while it trains."""
+    """Removes the directory of a run while it trains, and starts the run once more."""
     run = folder / "run"
-    wait = random.uniform(0.2, 1.0) * SECONDS
-    gone = subprocess.Popen(["sh", "-c", f"sleep {wait:.3f}; rm -rf {run}"])
-    told = _hindered(train_command(run), {0, 1, 2})
+    wait = random.uniform(0.0, 0.3) * SECONDS
+    log = run / directory.METRICS
+    remove = f"while ! [ -e {log} ]; do sleep 0.05; done; sleep {wait:.3f}; rm -rf {run}"
+    gone = subprocess.Popen(["sh", "-c", remove])
+    told = _hindered(train_command(run), {0, 1})
     gone.wait()
+    shutil.rmtree(run, ignore_errors=True)  # what was written after
     return told
 
 

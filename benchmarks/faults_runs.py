@@ -89,9 +89,10 @@ def kills(seed: int, folder: Path) -> dict[str, Any]:
         how = ("any", "save", "any", "resume")[number % 4]
         process = start(run)
         _MOMENTS[how](process, run, random)
+        if process.poll() is None:  # otherwise the run ended before
+            moments.append(how)
         process.kill()
         process.communicate()
-        moments.append(how)
         rows = [update for update in logged(run) if update >= newest(run)]
         repeated.append(len(rows))
     said, _ = (process := start(run)).communicate()

@@ -171,7 +171,9 @@ class Checkpoints:
             if _is_sound(leaves) and update not in self._manager.all_steps():
                 self._write_step(leaves, meta, told)
         except Exception as error:  # whatever a full disk makes Orbax raise
-            raise TrainingError(f"checkpoint {update} cannot be written: {_why(error)}.") from None
+            gone = self._binding is not None and binding(self._run) is None
+            why = f"{self._run} was removed" if gone else _why(error)
+            raise TrainingError(f"checkpoint {update} cannot be written: {why}.") from None
         heap.release()
 
     def _write_step(self, leaves: Leaves, meta: dict[str, Any], told: directory.Row) -> None:

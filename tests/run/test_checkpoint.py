@@ -284,3 +284,22 @@ def test_what_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
     ):
         checkpoints.save(_state(1.0), 1)
     assert "\n" not in str(error.value)
+
+
+def test_a_directory_that_was_removed_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.json").write_text("{}")
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError("NOT_FOUND: whatever Orbax says")
+
+    named = pytest.raises(TrainingError, match=r"checkpoint 2 .* written: .*run was removed\.")
+    with named, Checkpoints(run, keep=2) as checkpoints:
+        checkpoints.save(_state(1.0), 1)
+        checkpoints.wait()
+        shutil.rmtree(run)
+        monkeypatch.setattr(checkpoints._manager, "save", fail)
+        checkpoints.save(_state(2.0), 2)
