@@ -1,0 +1,20 @@
+#!/usr/bin/env bash
+# Trains one run in two processes of this machine, with a CPU device each, over gloo:
+#   bash launch/local_2proc.sh DIR [key=value ...]
+# It shows that several processes work where there are no GPUs; one process is faster on one machine.
+set -euo pipefail
+run=${1:?give a run directory, as in: bash launch/local_2proc.sh runs/two}
+shift
+coordinator="127.0.0.1:${PORT:-12355}"
+
+start() {
+  JAX_PLATFORMS=cpu uv run python -m swarmjax.train devices=2 run.dir="$run" resume=auto \
+    run.coordinator="$coordinator" run.processes=2 run.process="$1" "${@:2}"
+}
+
+start 1 "$@" &
+other=$!
+code=0
+start 0 "$@" || code=$?
+wait "$other" || code=$?
+exit "$code"
