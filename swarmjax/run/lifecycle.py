@@ -80,6 +80,7 @@ def _carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) -
     try:
         return _train(settings, run, stop, display, source, kept)
     except DivergedError as error:
+        hosts.share(0)  # by now the first process has written its newest checkpoint
         kept = checkpoint.find(run)
         if kept.rate_scale < 1.0:
             raise TrainingError(f"{error} {_GIVE_UP}") from None
