@@ -30,6 +30,7 @@ from swarmjax.config.section import MAX_COUNT
 
 Trial = Callable[[int, Path], dict[str, Any]]
 TABLE = "table"
+_BEGINNING = b'{"campaign'  # of a line
 _STRIDE = 1_000_000  # trials of a campaign at most: each has a seed of its own
 
 
@@ -138,7 +139,10 @@ def _drop_torn(out: Path) -> None:
     if not out.exists():
         return
     content = out.read_bytes()
-    os.truncate(out, content.rfind(b"\n") + 1)
+    whole = content.rfind(b"\n") + 1
+    if content and not whole and not content.startswith(_BEGINNING):
+        raise ConfigError(f"out is {out}, which holds no line of a campaign: give another file.")
+    os.truncate(out, whole)
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:

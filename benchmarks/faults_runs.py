@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
+from swarmjax.exit_codes import INTERRUPTED, REQUEUE
 from swarmjax.policy import digest
 from swarmjax.run import checkpoint, directory
 from swarmjax.run.errors import CheckpointError
-from swarmjax.run.signals import INTERRUPTED, REQUEUE
 
 UPDATES = 900
 WORDS = (

@@ -27,8 +27,8 @@ from scipy import stats
 from benchmarks import key_value
 from swarmjax import command, provenance
 from swarmjax.config import Section, about
+from swarmjax.exit_codes import REQUEUE
 from swarmjax.run import directory
-from swarmjax.run.signals import REQUEUE
 
 EVERY_S = 10.0  # between two samples
 WARM_UP = 0.1  # share of a leg that is left out: caches fill, and the policy learns to move

@@ -12,8 +12,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from swarmjax.command import USER_ERROR
 from swarmjax.config import ConfigError
+from swarmjax.exit_codes import USER_ERROR
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import Row
 from swarmjax.run.recorder import METRICS

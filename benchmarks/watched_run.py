@@ -11,8 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from swarmjax import command
 from swarmjax.config import ConfigError
+from swarmjax.exit_codes import INTERRUPTED
 from swarmjax.report import rows as report_rows
 from swarmjax.run.recorder import METRICS
 
@@ -84,5 +84,5 @@ class Watched:
         self._errors.seek(0)
         words = [line.strip() for line in self._errors if line.strip()]
         self._errors.close()
-        if self._process.returncode not in (0, command.INTERRUPTED):
+        if self._process.returncode not in (0, INTERRUPTED):
             raise ConfigError(words[-1] if words else f"{self.directory} was not trained.")

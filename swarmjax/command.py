@@ -7,10 +7,9 @@ from collections.abc import Callable, Sequence
 
 from swarmjax.config import ConfigError, files, reading, section
 from swarmjax.config.section import Section
+from swarmjax.exit_codes import INTERRUPTED, USER_ERROR
 from swarmjax.policy import PolicyError
 
-USER_ERROR = 2
-INTERRUPTED = 130  # 128 + SIGINT, as a shell gives it
 _HELP = {"-h", "--help"}
 _ALL = "all"  # topic of the help that is every key
 # By the command's module, what to type after `python -m` and it, and what that does.

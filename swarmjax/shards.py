@@ -4,7 +4,7 @@ A program that is spread runs once on each device of a mesh (`jax.shard_map`), w
 that device. What is learned, decided or reported is of all arenas: it is summed over the mesh, so
 that every device comes to the same numbers.
 
-Random numbers come in streams. An arena belongs to one of them whatever device it is on, so a run
+Random numbers come in streams. An arena belongs to one of them on every device count, so a run
 with four streams draws the same on one, two or four devices.
 """
 

@@ -15,11 +15,10 @@ from typing import ClassVar
 from swarmjax import command, words
 from swarmjax.config import ConfigError, Section, about, files
 from swarmjax.config.section import MAX_COUNT
+from swarmjax.exit_codes import FAILED
 from swarmjax.run import directory
 from swarmjax.run.errors import CheckpointError
 from swarmjax.run.settings import TrainConfig, from_stored, read_config, settle
-
-DIFFERS = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +122,7 @@ def main(arguments: Sequence[str]) -> int:
     found = replay(settle(trained), list(saved))
     differing = [update for update in saved if found[update] != saved[update]]
     sys.stdout.write(_verdict(settings.run, list(saved), differing) + "\n")
-    return DIFFERS if differing else 0
+    return FAILED if differing else 0
 
 
 def _verdict(run: str, updates: list[int], differing: list[int]) -> str:

@@ -4,10 +4,11 @@ import os
 
 os.environ["JAX_PLATFORMS"] = "cpu"  # before anything imports JAX
 # Most of the time is compiling, which takes two thirds as long so; proofs with `-m slow` as well.
-os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_backend_optimization_level=1"
+os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_backend_optimization_level=0"
 
 import functools
 from collections.abc import Callable
+from pathlib import Path
 
 import hypothesis
 import jax
@@ -26,6 +27,28 @@ ArenaStep = Callable[[EnvState, jax.Array], tuple[EnvState, TimeStep]]
 
 hypothesis.settings.register_profile("swarmjax", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("swarmjax")
+
+
+# Files that take longest begin first, so that both processes end at about the same time.
+LONGEST = (
+    "training/test_mesh.py",
+    "run/test_reliability.py",
+    "run/test_train.py",
+    "ppo/fast/test_fused.py",
+    "training/test_loop.py",
+    "test_api.py",
+    "test_examples.py",
+    "run/test_printed_commands.py",
+    "run/test_warm_start.py",
+    "sim/test_physics.py",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Puts the files of `LONGEST` before the others, in their order."""
+    tests = Path(__file__).parent
+    rank = {tests / name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path, len(rank)))
 
 
 def pytest_configure(config: pytest.Config) -> None:

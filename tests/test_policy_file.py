@@ -17,6 +17,7 @@ from policies import Arrays, forge, saved, several
 from swarmjax import command, policy, policy_file
 from swarmjax.evaluate import __main__ as evaluate_command
 from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.exit_codes import USER_ERROR
 from swarmjax.export import __main__ as export
 from swarmjax.export.config import ExportConfig
 from swarmjax.policy import MAX_BYTES, PolicyError
@@ -583,7 +584,7 @@ def test_commands_refuse_damaged_files_with_exit_code_2(
     monkeypatch.setattr("sys.argv", [name, f"policy={path}", *words])
     for damage in (_truncated, _overwritten, _pickled, _foreign):
         path.write_bytes(damage(content, draw, mark))
-        assert command.run(name, *commands[name]) == command.USER_ERROR
+        assert command.run(name, *commands[name]) == USER_ERROR
         said = capsys.readouterr()
         assert said.out == ""
         assert said.err.startswith(f"swarmjax.{name}: error: {path}")

@@ -21,6 +21,7 @@ from swarmjax.evaluate import witness
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import Evaluation, evaluate
 from swarmjax.evaluate.table import PLAIN_WIDTH
+from swarmjax.exit_codes import INTERRUPTED
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -36,7 +37,7 @@ def main(arguments: Sequence[str]) -> int:
             found = evaluate(settings, progress, partial(_say, said))
     except KeyboardInterrupt:
         sys.stderr.write("swarmjax.evaluate: interrupted, nothing was written.\n")
-        return command.INTERRUPTED
+        return INTERRUPTED
     if out is not None:
         _write(out, found, settings.steps * settings.task.control_step)
     console = Console()

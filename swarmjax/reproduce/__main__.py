@@ -19,6 +19,7 @@ from rich.progress import Progress
 from swarmjax import command, provenance
 from swarmjax.atomic_file import replacing
 from swarmjax.config import ConfigError, section, to_dict
+from swarmjax.exit_codes import FAILED
 from swarmjax.report import rows as report_rows
 from swarmjax.reproduce import arms, judge
 from swarmjax.reproduce import page as reproduce_page
@@ -30,7 +31,6 @@ from swarmjax.run.errors import TrainingError
 from swarmjax.run.policy_export import POLICY
 from swarmjax.run.signals import Stop, StoppedError
 
-FAILED = 1
 _PLATFORMS = {"cpu": "cpu", "gpu": "cuda,cpu"}  # as JAX calls them
 
 

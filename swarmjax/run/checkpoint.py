@@ -16,6 +16,7 @@ import logging
 import os
 import shutil
 import sys
+import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -90,6 +91,9 @@ class Checkpoints:
 
     A thread writes them while the run goes on. The newest are kept, and the one with the highest
     score.
+
+    Attributes:
+      write_seconds: That the newest one took to write.
     """
 
     def __init__(self, run: Path, keep: int, update: int | None = None) -> None:
@@ -103,6 +107,7 @@ class Checkpoints:
         self._folder = (run / FOLDER).resolve()
         self._thread = ThreadPoolExecutor(1)
         self._pending: Future[None] | None = None
+        self.write_seconds = 0.0
         if update is not None and hosts.is_first():
             for left in self._folder.glob(_UNFINISHED):
                 shutil.rmtree(left, ignore_errors=True)
@@ -166,15 +171,16 @@ class Checkpoints:
             pending.result()
 
     def _write(self, leaves: Leaves, meta: dict[str, Any], told: directory.Row) -> None:
-        update = meta["update"]
+        update, began = meta["update"], time.perf_counter()
         try:
             if _is_sound(leaves) and update not in self._manager.all_steps():
                 self._write_step(leaves, meta, told)
-        except Exception as error:  # whatever a full disk makes Orbax raise
+        except Exception as error:  # of any type that Orbax raises on a full disk
             gone = self._binding is not None and binding(self._run) is None
             why = f"{self._run} was removed" if gone else _why(error)
             raise TrainingError(f"checkpoint {update} cannot be written: {why}.") from None
         heap.release()
+        self.write_seconds = time.perf_counter() - began
 
     def _write_step(self, leaves: Leaves, meta: dict[str, Any], told: directory.Row) -> None:
         import orbax.checkpoint as ocp
@@ -239,7 +245,7 @@ def _options() -> "ocp.CheckpointManagerOptions":
 
 
 def _put_aside(step: Path) -> None:
-    """Moves a step to where nobody looks for one; what had that name is replaced."""
+    """Moves a step out of the folder of checkpoints, in place of one that was moved before."""
     aside = step.parents[1] / "passed_over" / step.name
     shutil.rmtree(aside, ignore_errors=True)
     aside.parent.mkdir(exist_ok=True)
@@ -418,7 +424,7 @@ def find(run: Path, update: int | None = None) -> Kept:
         for step in [update] if update is not None else there:
             try:
                 leaves, meta = _read(manager, step, bound)
-            except Exception as error:  # whatever a damaged one makes Orbax raise
+            except Exception as error:  # of any type that Orbax raises
                 reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
                 skipped.append(f"checkpoint {step} of {run} cannot be used ({reason})")
                 continue

@@ -7,6 +7,7 @@
 - A run has an id. Its checkpoints hold it, with a digest of what its config fixes.
 """
 
+import contextlib
 import errno
 import fcntl
 import hashlib
@@ -14,7 +15,6 @@ import json
 import os
 import secrets
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -37,7 +37,7 @@ def new_id() -> str:
     return secrets.token_hex(8)
 
 
-@contextmanager
+@contextlib.contextmanager
 def locked(run: Path) -> Iterator[None]:
     """Keeps other processes out of a run directory, which is made if it is missing.
 
@@ -48,27 +48,47 @@ def locked(run: Path) -> Iterator[None]:
       ConfigError: If another process writes it, or it cannot be written.
     """
     made = _make(run)
-    try:
-        file = (run / LOCK).open("a+")
-    except OSError as error:
-        raise unwritable(run, error) from None
-    with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            holder = file.read().strip() or "another process"
-            raise ConfigError(
-                f"run.dir is {run}, which {holder} is writing: wait for its end, or give another "
-                "directory."
-            ) from None
-        except OSError as error:  # a file system without locks
-            raise unwritable(run, error) from None
+    with contextlib.ExitStack() as held:
+        while True:
+            file = held.enter_context(_open_lock(run))
+            _lock(run, file)
+            # Another process may have removed the file between opening and locking.
+            if _is_same(file, run / LOCK):
+                break
         _sign(file)
         try:
             yield
         finally:
             _remove_empty(run, made)
+
+
+def _open_lock(run: Path) -> IO[str]:
+    try:
+        return (run / LOCK).open("a+")
+    except OSError as error:
+        raise unwritable(run, error) from None
+
+
+def _lock(run: Path, file: IO[str]) -> None:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.seek(0)
+        holder = file.read().strip() or "another process"
+        raise ConfigError(
+            f"run.dir is {run}, which {holder} is writing: wait for its end, or give another "
+            "directory."
+        ) from None
+    except OSError as error:  # a file system without locks
+        raise unwritable(run, error) from None
+
+
+def _is_same(file: IO[str], path: Path) -> bool:
+    """Tells whether an open file is the one that a path names."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except OSError:
+        return False
 
 
 def _make(run: Path) -> list[Path]:
@@ -100,6 +120,21 @@ def _remove_empty(run: Path, made: list[Path]) -> None:
                 path.rmdir()
     except OSError:  # gone, or somebody else's by now
         pass
+
+
+def check_regular(run: Path) -> None:
+    """Refuses a run directory that holds a pipe or a device, which would be waited for.
+
+    Raises:
+      ConfigError: If it does.
+    """
+    try:
+        found = [path for path in run.iterdir() if not (path.is_file() or path.is_dir())]
+    except OSError:  # missing, or to be refused where it is read
+        return
+    odd = [path for path in found if path.exists()]  # a link to nothing is no danger
+    if odd:
+        raise ConfigError(f"{odd[0]} is neither a file nor a folder: remove it.")
 
 
 def unwritable(run: Path, error: OSError | ValueError) -> ConfigError:

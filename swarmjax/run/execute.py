@@ -8,16 +8,15 @@ from pathlib import Path
 import jax
 
 from swarmjax import command, words
-from swarmjax.run import compile_cache, hosts, memory
+from swarmjax.exit_codes import FAILED, INTERRUPTED, REQUEUE
+from swarmjax.run import checkpoint, compile_cache, hosts, memory
 from swarmjax.run.display import Display, measured, spread, working
 from swarmjax.run.errors import LostPeerError, TrainingError
 from swarmjax.run.lifecycle import carry_out, dry_run, find_run
 from swarmjax.run.policy_export import POLICY, seed_path
 from swarmjax.run.settings import TrainConfig
-from swarmjax.run.signals import REQUEUE, Stop, StoppedError
+from swarmjax.run.signals import Stop, StoppedError
 from swarmjax.run.trainer import Tally, measure
-
-FAILED = 1
 
 
 def execute(settings: TrainConfig, stop: Stop, *, auto: bool) -> int:
@@ -53,24 +52,25 @@ def fill(settings: TrainConfig) -> tuple[TrainConfig, str]:
 
 def _run(settings: TrainConfig, stop: Stop) -> int:
     """Does what the config says; returns the exit code."""
-    if settings.run.dry:
-        with Display(settings.updates) as display:
-            return dry_run(settings, display)
-    found = find_run(settings) if hosts.is_first() else Path()
-    with hosts.own_directory(found) as run:
-        return _train(run, settings, stop)
+    try:
+        if settings.run.dry:
+            with Display(settings.updates) as display:
+                return dry_run(settings, stop, display)
+        found = find_run(settings) if hosts.is_first() else Path()
+        with hosts.own_directory(found) as run:
+            return _train(run, settings, stop)
+    except StoppedError:
+        _tell("stopped before the first update: nothing was trained, and nothing is lost\n")
+        return stop.code or INTERRUPTED
 
 
 def _train(run: Path, settings: TrainConfig, stop: Stop) -> int:
-    with Display(settings.updates) as display:
-        try:
+    try:
+        with Display(settings.updates) as display:
             tally = carry_out(settings, run, stop, display)
-        except TrainingError as error:
-            display.say(f"swarmjax.train: error: {error} What was saved before is in {run}.")
-            return FAILED
-        except StoppedError:
-            display.say("stopped before the first update: nothing was trained, and nothing is lost")
-            return stop.code or command.INTERRUPTED
+    except TrainingError as error:
+        sys.stderr.write(f"swarmjax.train: error: {error} What was saved before is in {run}.\n")
+        return FAILED
     _tell(f"{_success(settings, tally)}\n{_closing(run, settings, tally)}\n")
     return stop.code or 0
 
@@ -108,8 +108,10 @@ def _success(settings: TrainConfig, tally: Tally) -> str:
 def _closing(run: Path, settings: TrainConfig, tally: Tally) -> str:
     """Says what to do next."""
     if tally.update < settings.updates:
+        saved = max(checkpoint.steps(run), default=0)
+        how = "saved" if saved == tally.update else f"saved at update {saved:,}, the last sound one"
         return (
-            f"stopped after update {tally.update:,} of {settings.updates:,}, saved; go on with: "
+            f"stopped after update {tally.update:,} of {settings.updates:,}, {how}; go on with: "
             f"{command.line('train', f'resume={run}')}"
         )
     policy = seed_path(run / POLICY, settings, settings.seed)

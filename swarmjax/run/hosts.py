@@ -1,8 +1,8 @@
 """Several processes that train one run, on one host or on many.
 
 The first process shows the run and writes its directory; the others write into a folder that is
-thrown away. All of them call the program in step, so whatever the clock or a signal decides is
-decided together.
+thrown away. All of them call the program in step, so they decide together what depends on a clock
+or on a signal.
 """
 
 import contextlib
@@ -21,13 +21,14 @@ from swarmjax import provenance
 from swarmjax.config import ConfigError, show, to_dict
 from swarmjax.run import rank
 from swarmjax.run.errors import LostPeerError
-from swarmjax.run.settings import TrainConfig
+from swarmjax.run.settings import TrainConfig, leaves
 
 AUTO = "auto"
 CHECKPOINTS = "checkpoints"  # folder of a run directory
 # A sentence within a minute, where a process never comes; within half of one, where one is lost.
 _JOIN_S, _HEARTBEAT_S = 45, 20
-_OWN = ("coordinator", "processes", "process")  # keys of `run` that differ between processes
+# Keys that may differ between processes.
+_OWN = ("run.coordinator", "run.processes", "run.process", "run.id")
 
 
 def join(settings: TrainConfig) -> None:
@@ -55,7 +56,7 @@ def join(settings: TrainConfig) -> None:
             heartbeat_timeout_seconds=_HEARTBEAT_S,
             shutdown_timeout_seconds=_HEARTBEAT_S,
         )
-    except Exception as error:  # JAX raises whatever its transport does
+    except Exception as error:  # of any type that JAX's transport raises
         reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
         raise ConfigError(
             f"run.coordinator is {show(run.coordinator)}, but the processes of the run did not "
@@ -201,19 +202,7 @@ def _check_alike(settings: TrainConfig) -> None:
 
 def _comparable(settings: TrainConfig) -> dict[str, Any]:
     """Flattens what all processes must have alike to dotted keys."""
-    found: dict[str, Any] = {}
-
-    def add(where: str, value: Any) -> None:
-        if isinstance(value, dict):
-            for key, inner in value.items():
-                add(f"{where}.{key}" if where else key, inner)
-        else:
-            found[where] = value
-
-    add("", to_dict(settings))
-    for key in _OWN:
-        found.pop(f"run.{key}", None)
-    found.pop("run.id", None)
+    found = {key: value for key, value in leaves(to_dict(settings)).items() if key not in _OWN}
     return found | {f"version of {name}": value for name, value in provenance.versions().items()}
 
 

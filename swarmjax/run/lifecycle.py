@@ -172,6 +172,7 @@ def _read_kept(settings: TrainConfig) -> Kept | None:
     """Reads the newest sound checkpoint of the run that is resumed, if it has any."""
     if settings.resume is None or not checkpoint.steps(Path(settings.resume)):
         return None
+    directory.check_regular(Path(settings.resume))
     kept = checkpoint.find(Path(settings.resume))
     if kept.update > settings.updates:
         spent = kept.update * settings.arenas * settings.algo.rollout_length
@@ -283,6 +284,7 @@ def find_run(settings: TrainConfig) -> Path:
 
 def check_free(run: Path, settings: TrainConfig) -> None:
     """Refuses a directory that holds a run, unless it is the one that goes on."""
+    directory.check_regular(run)
     resumed = settings.resume is not None and Path(settings.resume).resolve() == run.resolve()
     if (run / directory.CONFIG).exists() and not resumed:
         raise ConfigError(
@@ -310,15 +312,30 @@ def _open_run(run: Path, settings: TrainConfig, kept: Kept | None) -> None:
         raise directory.unwritable(run, error) from None
 
 
-def dry_run(settings: TrainConfig, display: Display) -> int:
-    """Compiles, says what it took and what a run needs, and stops."""
+def dry_run(settings: TrainConfig, stop: Stop, display: Display) -> int:
+    """Compiles, says what it took and what a run needs, and stops.
+
+    Args:
+      settings: the config.
+      stop: notices signals.
+      display: shows what is done.
+
+    Returns:
+      The exit code.
+
+    Raises:
+      ConfigError: as `carry_out`.
+      StoppedError: if somebody asked to stop.
+    """
     with working("building the arenas"):
         warm_start.read(settings)
         program, schedule, _, template = _load(settings)
     for sentence in (_opening(program), *_short_budget(settings, schedule)):
         display.say(sentence)
     with display.working("compiling"):
+        stop.check()
         compiled = compile_chunk(program, schedule, template)
+        stop.check()
         memory.check(settings, compiled.total_bytes, memory.limit())
     state, work = compiled.state_bytes / 2**20, compiled.work_bytes / 2**20
     display.say(

@@ -15,10 +15,10 @@ import time
 from collections.abc import Iterable
 from typing import IO
 
-from swarmjax.run.signals import CODES, REQUEUE, Stop
+from swarmjax.exit_codes import REQUEUE, USER_ERROR
+from swarmjax.run.signals import CODES, Stop
 
 CHILD = "SWARMJAX_CHILD"  # holds the descriptor that a child tells its parent by
-MISUSE = 2
 _TICK_S = 0.05
 _DIE_WITH_PARENT, _KILL = 1, 9  # PR_SET_PDEATHSIG and SIGKILL of prctl(2)
 # What the C++ parts of JAX write: log lines, and the stack of an abort.
@@ -89,7 +89,7 @@ def _wait(child: subprocess.Popen[str], stop: Stop) -> int:
 
 
 def _copy(lines: IO[str]) -> None:
-    """Copies what a child says, but for what its C++ parts do."""
+    """Copies the lines that a child prints, without those of its C++ libraries."""
     sys.stderr.writelines(_sentences(lines))
     sys.stderr.flush()
 
@@ -110,4 +110,4 @@ def _died(code: int, *, joined: bool) -> int:
         "swarmjax.train: error: the processes of the run did not meet within a minute: start as "
         "many as run.processes says, and check run.coordinator, the address of the first.\n"
     )
-    return MISUSE
+    return USER_ERROR

@@ -20,7 +20,7 @@ from swarmjax.config import (
 )
 from swarmjax.config.section import MAX_COUNT, modernise
 from swarmjax.ppo.config import AlgoConfig, resolve
-from swarmjax.run.directory import MAY_CHANGE
+from swarmjax.run.directory import CONFIG, MAY_CHANGE
 from swarmjax.task import pieces, stage_files
 from swarmjax.task.config import check_realism
 from swarmjax.task.stage_config import make_room
@@ -31,9 +31,8 @@ MOST_LOGGED = 8192
 AUTO = "auto"  # what `arenas` may be instead of a number
 
 
-# What may change when a run goes on; everything else fixes what it has computed so far. The same
-# keys, as they are stored, are `directory.MAY_CHANGE`.
-_RESUME_KEYS = ("budget", "devices", "resume", "run.*", "streams")
+# What may be given when a run goes on; everything else fixes what it has computed so far.
+_RESUME_KEYS = tuple("run.*" if key == "run" else key for key in MAY_CHANGE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -269,10 +268,10 @@ def read_config(run: Path) -> dict:
     Raises:
       ConfigError: if there is none, or it is no JSON object.
     """
-    path = run / "config.json"
+    path = run / CONFIG
     section.check_text("the run directory", str(run))
     if not path.exists():
-        raise ConfigError(f"{run} is no run directory: it has no config.json.")
+        raise ConfigError(f"{run} is no run directory: it has no {CONFIG}.")
     found = reading.read_json(path)
     if not isinstance(found, dict):
         raise ConfigError(f"{path} is no run's config: it holds no JSON object.")
@@ -439,7 +438,7 @@ def _go_on_or_begin(
     auto = given.get("arenas", "").strip("'\"") == AUTO
     typed = load_train(begun, auto=auto, stages=stages)
     run = Path(typed.run.dir or "")
-    if not (run / "config.json").exists():
+    if not (run / CONFIG).exists():
         return typed, auto
     stored = from_stored(read_config(run), "stored ")
     if auto:
@@ -456,7 +455,7 @@ def _go_on_or_begin(
 def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
     """Refuse to go on with a run by other settings than its own, key by key."""
     mine, its = (
-        _leaves({k: v for k, v in each.items() if k not in MAY_CHANGE}) for each in (typed, stored)
+        leaves({k: v for k, v in each.items() if k not in MAY_CHANGE}) for each in (typed, stored)
     )
     changed = [key for key in mine if mine[key] != its.get(key)]
     if changed:
@@ -467,10 +466,15 @@ def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, A
         )
 
 
-def _leaves(found: Mapping[str, Any], where: str = "") -> dict[str, Any]:
-    """Flatten nested settings to dotted keys."""
+def leaves(found: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+    """Flatten nested settings to dotted keys.
+
+    Args:
+        found: plain data, as `to_dict` gives it.
+        where: what comes before its keys.
+    """
     flat: dict[str, Any] = {}
     for key, value in found.items():
         inner = isinstance(value, Mapping)
-        flat |= _leaves(value, f"{where}{key}.") if inner else {f"{where}{key}": value}
+        flat |= leaves(value, f"{where}{key}.") if inner else {f"{where}{key}": value}
     return flat

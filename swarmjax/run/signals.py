@@ -14,8 +14,8 @@ import threading
 import time
 from types import FrameType
 
-INTERRUPTED = 130  # 128 + SIGINT, as a shell gives it
-REQUEUE = 75  # EX_TEMPFAIL of sysexits.h: try again later
+from swarmjax.exit_codes import INTERRUPTED, REQUEUE
+
 CODES = {
     signal.SIGINT: INTERRUPTED,
     signal.SIGTERM: REQUEUE,
@@ -105,7 +105,7 @@ def _watch(read: int, patient: bool) -> None:
 
 
 def _end(code: int) -> None:
-    """Ends the process without waiting for anything; whatever it was writing is not replaced."""
+    """Ends the process without waiting for anything; files it was writing are not replaced."""
     _say("stopped at once; what was saved before is kept")
     os._exit(code)
 

@@ -240,27 +240,45 @@ def train(
             _report(program, tally, metrics, n, time.perf_counter() - began, record, display)
             if log is not None:
                 _log_episodes(program.config, log, np.arange(tally.update)[-n:], record, display)
-            if tally.is_sound and hosts.share(saves.due(tally.update))[0]:
+            due = saves.due(tally, checkpoints.write_seconds)
+            if tally.is_sound and hosts.share(due)[0]:
                 save(state, tally.update, record.sync(), score(settings, tally))
         save(state, tally.update, record.sync(), score(settings, tally))
     return state, tally
 
 
 class Saves:
-    """Says when a checkpoint is due: by time, and by share of the budget."""
+    """Says when a checkpoint is due: by time, and by share of the budget.
+
+    A run that is killed while it writes a checkpoint goes back to the one before. So a checkpoint
+    is begun early, by the time that the last one took to write and the next call takes: a kill then
+    repeats one interval at most. It is never begun before half of the interval, so an interval that
+    is shorter than that time cannot be kept.
+    """
 
     def __init__(self, settings: TrainConfig, done: int) -> None:
         """Begins to count where `done` updates are done."""
-        self._minutes = settings.run.checkpoint_minutes
-        self._every = settings.run.checkpoint_share * settings.updates
+        self._seconds = 60.0 * settings.run.checkpoint_minutes
+        self._updates = settings.run.checkpoint_share * settings.updates
         self._saved_at, self._saved = time.monotonic(), done
+        self._before = done
 
-    def due(self, update: int) -> bool:
-        """Tells whether to save after this update; if so, the next is counted from here."""
-        by_time = time.monotonic() - self._saved_at >= 60.0 * self._minutes
-        by_share = self._every > 0 and update - self._saved >= self._every
+    def due(self, tally: Tally, write_seconds: float) -> bool:
+        """Tells whether to save now; if so, the next checkpoint is counted from here.
+
+        Args:
+          tally: after a call of the program.
+          write_seconds: that the last checkpoint took to write.
+        """
+        call, self._before = tally.update - self._before, tally.update
+        pace = tally.seconds / (tally.update - tally.first)  # seconds an update
+        late = call + write_seconds / pace  # updates until a checkpoint begun later is written
+        since_s = time.monotonic() - self._saved_at
+        by_time = since_s + min(late * pace, self._seconds / 2) >= self._seconds
+        since = tally.update - self._saved
+        by_share = self._updates > 0 and since + min(late, self._updates / 2) > self._updates
         if by_time or by_share:
-            self._saved_at, self._saved = time.monotonic(), update
+            self._saved_at, self._saved = time.monotonic(), tally.update
         return by_time or by_share
 
 

@@ -135,5 +135,5 @@ def _spread(sharding: NamedSharding, x: jax.Array) -> jax.Array:
 
 
 def _without_empty(state: TrainState) -> TrainState:
-    """Makes arrays without elements anew: passed through `shard_map` they break jaxlib 0.11.2."""
+    """Replaces arrays without elements: passed through `shard_map` they break jaxlib 0.11.2."""
     return jax.tree.map(lambda x: x if x.size else jnp.zeros(x.shape, x.dtype), state)

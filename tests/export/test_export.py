@@ -14,6 +14,7 @@ from sentences import refusal
 
 from swarmjax import command, policy_file
 from swarmjax.config import ConfigError, build, to_dict
+from swarmjax.exit_codes import USER_ERROR
 from swarmjax.export import __main__ as export
 from swarmjax.export import folder as export_folder
 from swarmjax.export.config import ExportConfig
@@ -29,7 +30,7 @@ def _refusal(
     """Runs the command and returns the sentence with which it is refused."""
     monkeypatch.setattr(sys, "argv", ["export", *words])
     capsys.readouterr()
-    assert command.run("export", export.main, ExportConfig) == command.USER_ERROR
+    assert command.run("export", export.main, ExportConfig) == USER_ERROR
     said = capsys.readouterr()
     assert (said.out, said.err.count("\n")) == ("", 1)
     return said.err

@@ -9,18 +9,20 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from swarmjax.config import ConfigError
-from swarmjax.run import directory
+from swarmjax.run import directory, lifecycle
 from swarmjax.run.directory import Log
 from swarmjax.run.errors import CheckpointError
+from swarmjax.run.settings import load_train
 
 # Holds the lock of a directory until it is killed.
 _HOLDER = """
 import pathlib, sys, time
-from swarmjax.run import directory
+from swarmjax.run import directory, lifecycle
 with directory.locked(pathlib.Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)
@@ -171,3 +173,27 @@ def test_a_file_system_without_locks_is_named(
     refused = pytest.raises(ConfigError, match="cannot be written: No locks available")
     with refused, directory.locked(tmp_path):
         pass
+
+
+def test_a_lock_file_that_was_removed_meanwhile_is_opened_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock, path, removed = directory._lock, tmp_path / directory.LOCK, []
+
+    def remove_first(run: Path, file: Any) -> None:
+        if not removed:  # as the process does that held it and wrote nothing
+            removed.append(path.unlink())
+        lock(run, file)
+
+    monkeypatch.setattr(directory, "_lock", remove_first)
+    with directory.locked(tmp_path):
+        monkeypatch.undo()
+        with pytest.raises(ConfigError, match="is writing"), directory.locked(tmp_path):
+            pass
+
+
+@pytest.mark.parametrize("name", ["metrics.jsonl", "summary.json", "config.json"])
+def test_a_pipe_in_a_run_directory_is_refused(name: str, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(ConfigError, match=f"{name} is neither a file nor a folder: remove it"):
+        lifecycle.find_run(load_train(["stage=s1", f"run.dir={tmp_path}"]))

@@ -8,7 +8,8 @@ import time
 
 import pytest
 
-from swarmjax.run.signals import INTERRUPTED, REQUEUE, Stop, StoppedError
+from swarmjax.exit_codes import INTERRUPTED, REQUEUE
+from swarmjax.run.signals import Stop, StoppedError
 
 # Listens, says so, and then does what the last argument says.
 _PROCESS = """
@@ -20,9 +21,9 @@ with Stop() as stop:
         while not stop.asked:
             time.sleep(0.01)
     else:  # within one call of C, as a compiled program is, from which no signal brings Python back
-        libc = ctypes.PyDLL(None)
-        libc.usleep(30_000_000)
-        libc.usleep(30_000_000)
+        libc, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(64)
+        libc.pthread_mutex_lock(mutex)
+        libc.pthread_mutex_lock(mutex)  # waits for itself
 sys.exit(stop.code)
 """
 

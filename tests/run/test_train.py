@@ -15,6 +15,7 @@ import pytest
 
 from swarmjax import command, policy, train
 from swarmjax.config import build, to_dict
+from swarmjax.exit_codes import INTERRUPTED
 from swarmjax.export import __main__ as export
 from swarmjax.export.config import ExportConfig
 from swarmjax.run import checkpoint, lifecycle
@@ -462,7 +463,7 @@ def test_an_interrupt_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
         time.sleep(0.1)
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=120)
-    assert process.returncode == command.INTERRUPTED
+    assert process.returncode == INTERRUPTED
     assert f"resume={tmp_path}" in output
     assert checkpoint.restore(tmp_path)[1] > 0
     assert (tmp_path / "policy.npz").exists()

@@ -2,13 +2,16 @@
 
 import threading
 import time
+from dataclasses import replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from swarmjax.run import trainer
+from swarmjax.run.settings import RunConfig, load_train
 from swarmjax.run.signals import Stop
 
 
@@ -26,6 +29,29 @@ def test_groups_are_called_at_once_and_keep_their_order() -> None:
     metrics = found[1]
     assert state.tolist() == [100, 101, 102, 103, 104, 105]
     assert metrics["seed"].tolist() == [0, 10, 20, 30, 40, 50]
+
+
+def _tally(update: int) -> trainer.Tally:
+    """After so many updates of 10 ms."""
+    return trainer.Tally(update, 0, 0.0, {}, {}, seconds=0.01 * update)
+
+
+@pytest.mark.parametrize(
+    ("write_seconds", "begun"),
+    [
+        (0.0, 90),  # one call later it would be 100
+        (0.2, 70),  # a write lasts 20 updates: 70 + 20 is 90
+        (9.0, 50),  # no earlier than half of the interval
+    ],
+)
+def test_a_checkpoint_is_begun_so_early_that_a_kill_repeats_one_interval(
+    write_seconds: float, begun: int
+) -> None:
+    settings = load_train(["stage=s1", "arenas=32", f"budget={900 * 32 * 32}"])
+    settings = replace(settings, run=RunConfig(checkpoint_minutes=99.0, checkpoint_share=0.1))
+    saves = trainer.Saves(settings, 0)
+    calls = range(10, 100, 10)
+    assert next(n for n in calls if saves.due(_tally(n), write_seconds)) == begun
 
 
 def test_a_stop_has_a_time_of_its_own() -> None:

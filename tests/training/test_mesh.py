@@ -16,7 +16,7 @@ Found = dict[str, np.ndarray]
 
 
 def _start(out: Path, devices: int, *more: str, forced: int = 1) -> subprocess.Popen[str]:
-    flags = f"--xla_force_host_platform_device_count={forced}"
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={forced}"
     return subprocess.Popen(
         [sys.executable, str(SCRIPT), str(out), str(devices), *more],
         cwd=ROOT,
