@@ -5,6 +5,7 @@ Usage: python -m swarmjax.verify run=runs/NAME [updates=N]
 It exits with 0 if every state is bit for bit what the run saved, with 1 if one is not.
 """
 
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -56,14 +57,21 @@ def load_digests(settings: VerifyConfig, trained: TrainConfig) -> dict[int, str]
     log = Path(settings.run) / directory.SAVED
     rows = directory.read_rows(log, None)
     try:
-        found = {row["update"]: row["digest"] for row in rows if _is_replayable(row, trained)}
+        # From the first checkpoint without arenas on, others may have been drawn.
+        drawn = min((row["update"] for row in rows if row.get("arenas") is False), default=math.inf)
+        found = {
+            row["update"]: row["digest"]
+            for row in rows
+            if row["update"] < drawn and _is_replayable(row, trained)
+        }
     except (KeyError, TypeError):
         raise CheckpointError(f"{log} is damaged: put the file back.") from None
     if not found:
         raise ConfigError(
             f"run is {settings.run}, which has no digests in {directory.SAVED} that training from "
             "its beginning leads to: give a run that has saved a checkpoint after its first "
-            "update, with the budget and the random streams that its config.json has."
+            "update, with its arenas and with the budget and the random streams that its "
+            "config.json has."
         )
     most = min(found) if settings.updates is None else settings.updates
     chosen = {update: found[update] for update in sorted(found) if update <= most}

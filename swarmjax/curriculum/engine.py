@@ -284,6 +284,25 @@ def init(schedule: Schedule, options: CurriculumConfig, mode: Mode) -> Curriculu
     return _settle(blank, schedule, mode(blank, schedule, options, begun, zero - 1))
 
 
+def begin_cohort(curriculum: Curriculum) -> Curriculum:
+    """Begins a cohort where all arenas are drawn again, so that open episodes are not waited for.
+
+    Args:
+      curriculum: where it stands; what it has measured and decided stays.
+
+    Returns:
+      The curriculum with empty tallies.
+    """
+    empty = _no_episodes(curriculum.weights.shape[0])
+    return replace(
+        curriculum,
+        cohort=curriculum.cohort + 1,
+        age=jnp.zeros_like(curriculum.age),
+        previous=empty,
+        current=empty,
+    )
+
+
 def assign(curriculum: Curriculum, arenas: int) -> Array:
     """Says on which stage [A] the next episode of each arena begins.
 

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 Leaves = dict[str, np.ndarray]
 
 FOLDER = hosts.CHECKPOINTS
+ARENAS = "arenas/"  # of the names of leaves
 _OLD_META = {"digest", "update"}  # all that checkpoints held before they were bound to their run
 # In each step: the SHA-256 of its files. Given damaged files Orbax fails too, but it prints the
 # tracebacks of its threads as well.
@@ -75,6 +76,11 @@ class Kept(NamedTuple):
     rate_scale: float
     skipped: list[str]
     notes: list[str]
+
+    @property
+    def has_arenas(self) -> bool:
+        """Whether the state is whole; without arenas a run draws others when it goes on."""
+        return any(name.startswith(ARENAS) for name in self.leaves)
 
 
 def binding(run: Path) -> Binding | None:

@@ -106,7 +106,7 @@ def _train(
     stop.check()
     with working("building the arenas"):
         program, schedule, init, template = _load(_scaled(settings, kept))
-        state, skipped = _first_state(program, lambda: init(schedule), template, source, kept)
+        state, skipped = _first_state(program, schedule, init, template, source, kept)
     for sentence in _first_sentences(program, run, source, kept, skipped):
         display.say(sentence)
     for sentence in _short_budget(settings, schedule):
@@ -144,6 +144,11 @@ def _first_sentences(
         yield f"{sentence}: it was passed over."
     for sentence in [] if kept is None else kept.notes:
         yield f"{sentence}."
+    if kept is not None and not kept.has_arenas:
+        yield (
+            "the checkpoint holds no arenas (run.checkpoint_arenas=false): they are drawn again, "
+            "and the curriculum begins to measure its stages with them."
+        )
     if settings.resume is not None and kept is None:
         yield f"{settings.resume} has no checkpoint yet: it begins from its seed."
     if kept is not None and settings.resume is not None:
@@ -225,7 +230,7 @@ def _load(settings: TrainConfig) -> tuple[Built, Schedule, Any, TrainState]:
     program, schedule = programs.load(settings, by_robot=settings.run.episodes)
     init = jax.jit(mesh.init(program))  # traced once, for the shapes and for the state
     template = init.eval_shape(schedule)
-    memory.check_state(settings, memory.size(template), memory.limit())
+    memory.check_state(settings, mesh.bytes_each(settings, template), memory.limit())
     return program, schedule, init, template
 
 
@@ -240,13 +245,14 @@ def begin(settings: TrainConfig) -> tuple[Built, Schedule, TrainState]:
     """
     program, schedule, init, template = _load(settings)
     source = warm_start.read(settings)
-    state, _ = _first_state(program, lambda: init(schedule), template, source, None)
+    state, _ = _first_state(program, schedule, init, template, source, None)
     return program, schedule, state
 
 
 def _first_state(
     program: Built,
-    init: Callable[[], TrainState],
+    schedule: Schedule,
+    init: Callable[[Schedule], TrainState],
     template: TrainState,
     source: Source | None,
     kept: Kept | None,
@@ -257,14 +263,18 @@ def _first_state(
     """
     settings = program.config
     if kept is None:
-        state = init()
+        state = init(schedule)
         if source is None:
             return state, []
         return warm_start.carry(source, state, settings), source.skipped
     skipped = kept.skipped
     if any(name.startswith(_PRICE) for name in kept.leaves):
         skipped = [*skipped, f"a price on contacts (algo.contact_limit) in {settings.resume}"]
-    return mesh.put(program, checkpoint.from_leaves(kept.leaves, template)), skipped
+    if kept.has_arenas:
+        return mesh.put(program, checkpoint.from_leaves(kept.leaves, template)), skipped
+    without: Any = replace(template, arenas=None)
+    state = mesh.put(program, checkpoint.from_leaves(kept.leaves, without))
+    return mesh.draw_arenas(program, schedule, state), skipped
 
 
 def find_run(settings: TrainConfig) -> Path:
@@ -350,9 +360,12 @@ def _opening(program: Built) -> str:
     settings, engine = program.config, program.world.physics.engine
     names = ", ".join(stage.name for stage in settings.stage)
     steps, every = settings.arenas * settings.algo.rollout_length, seeds.numbers(settings)
-    how = {"vmap": "side by side", "map": "in turn", "cores": "spread over cores"}[
-        settings.seeds_by
-    ]
+    how = {
+        "vmap": "side by side",
+        "map": "in turn",
+        "cores": "spread over cores",
+        "devices": "spread over devices",
+    }[settings.seeds_by]
     several = f", seeds {every[0]} to {every[-1]} {how}" if len(every) > 1 else ""
     return (
         f"swarmjax: {settings.stage_name} ({names}), {words.count(settings.updates, 'update')} "

@@ -7,11 +7,9 @@ Warp's own temporary arrays are not in it: they lie outside of what JAX takes of
 """
 
 import contextlib
-import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import jax
 
@@ -44,11 +42,6 @@ def _host_memory() -> int | None:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):  # Windows has none of it
         return None
-
-
-def size(tree: Any) -> int:
-    """Returns the bytes of a tree's arrays, or of what `jax.eval_shape` gives of them."""
-    return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
 def check_state(settings: TrainConfig, needed: int, available: int | None) -> None:

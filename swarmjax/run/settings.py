@@ -59,6 +59,12 @@ class RunConfig(Section):
         default=2,
         metadata=about("newest checkpoints that are kept, besides the best", 1, MAX_COUNT),
     )
+    checkpoint_arenas: bool = field(
+        default=True,
+        metadata=about(
+            "keep arenas in checkpoints; false: small files, and a run that goes on draws others"
+        ),
+    )
     stop_after: int | None = field(
         default=None,
         metadata=about("updates after which the run saves and stops", 0, MAX_COUNT),
@@ -155,7 +161,7 @@ class TrainConfig(ProgramConfig):
         self._check_algo()
         self._check_episodes()
         check_realism(self.realism, self.robot, self.task, self.task.step_limit)
-        if self.devices > 1:
+        if self.arena_devices > 1:
             object.__setattr__(self, "streams", self.stream_count)
         names = [stage.name for stage in self.stage]
         if len(names) == 1 or not self.stage_name:
@@ -179,10 +185,11 @@ class TrainConfig(ProgramConfig):
                     )
 
     def _check_devices(self) -> None:
-        if self.streams is not None and self.streams % self.devices:
+        share = self.arena_devices
+        if self.streams is not None and self.streams % share:
             raise ConfigError(
-                f"streams is {self.streams}, but devices is {self.devices}: give a multiple of "
-                f"{self.devices}, or null."
+                f"streams is {self.streams}, but devices is {share}: give a multiple of {share}, "
+                "or null."
             )
         streams, minibatches = self.stream_count, self.algo.num_minibatches
         if self.arenas % (streams * minibatches):
@@ -194,7 +201,13 @@ class TrainConfig(ProgramConfig):
             )
         if self.devices > 1 and self.seeds_by == "cores":
             raise ConfigError(
-                f"seeds_by is cores, but devices is {self.devices}: give vmap or map, or devices=1."
+                f"seeds_by is cores, but devices is {self.devices}: give vmap, map or devices, or "
+                "devices=1."
+            )
+        if self.seeds_by == "devices" and self.seeds % self.devices:
+            raise ConfigError(
+                f"seeds is {self.seeds}, but seeds_by is devices and devices is {self.devices}: "
+                f"give a multiple of {self.devices}."
             )
 
     def _check_counts(self) -> None:
@@ -390,13 +403,14 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
     given = files.values(words)
     kept = to_dict(from_stored(stored, "stored "))
     run = kept["run"] | {"stop_after": None} | given.get("run", {})
-    spread = _spread_again(kept["streams"], given.get("devices", kept["devices"]))
+    spread = _spread_again(kept["streams"], given.get("devices", kept["devices"]), kept["seeds_by"])
     return settle(build(TrainConfig, kept | spread | given | {"run": run}))
 
 
-def _spread_again(streams: int | None, devices: Any) -> dict[str, Any]:
+def _spread_again(streams: int | None, devices: Any, seeds_by: str) -> dict[str, Any]:
     """Spreads a run that goes on over devices, with the random streams that it has if they fit."""
-    fits = isinstance(devices, int) and streams and streams % devices == 0
+    by_seeds = seeds_by == "devices"
+    fits = isinstance(devices, int) and streams and (by_seeds or streams % devices == 0)
     return {"devices": devices, "streams": streams if fits else None}
 
 
@@ -445,7 +459,7 @@ def _go_on_or_begin(
         typed = replace(typed, arenas=stored.arenas)
     _check_unchanged(run, to_dict(typed), to_dict(stored))
     kept = replace(typed.run, id=stored.run.id)
-    spread = _spread_again(stored.streams, typed.devices)
+    spread = _spread_again(stored.streams, typed.devices, stored.seeds_by)
     if typed.streams is not None and "streams" in given:
         spread["streams"] = typed.streams
     settled = replace(stored, budget=typed.budget, resume=str(run), run=kept, **spread)

@@ -225,26 +225,32 @@ def train(
         _recorder(run, program, done, kept) as record,
         Checkpoints(run, keep, resumed) as checkpoints,
     ):
-        saves = Saves(settings, done)
+        saves, keeps = Saves(settings, done), settings.run.checkpoint_arenas
         save = partial(
             checkpoints.save,
             rate_scale=1.0 if kept is None else kept.rate_scale,
-            of={"budget": settings.budget, "streams": settings.stream_count},
+            of={"budget": settings.budget, "streams": settings.stream_count, "arenas": keeps},
         )
-        save(state, done, record.sync())  # nothing is done if it is there
+        what = partial(_saved_part, arenas=keeps)
+        save(what(state), done, record.sync())  # nothing is done if it is there
         for n in _calls(program, tally, stop):
             began = time.perf_counter()
             state, metrics = compiled.call(schedule, state, np.int32(n))
-            metrics = jax.device_get(metrics)
+            metrics = jax.device_get(hosts.gather(metrics))
             log = metrics.pop(episodes.KEY, None)
             _report(program, tally, metrics, n, time.perf_counter() - began, record, display)
             if log is not None:
                 _log_episodes(program.config, log, np.arange(tally.update)[-n:], record, display)
             due = saves.due(tally, checkpoints.write_seconds)
             if tally.is_sound and hosts.share(due)[0]:
-                save(state, tally.update, record.sync(), score(settings, tally))
-        save(state, tally.update, record.sync(), score(settings, tally))
+                save(what(state), tally.update, record.sync(), score(settings, tally))
+        save(what(state), tally.update, record.sync(), score(settings, tally))
     return state, tally
+
+
+def _saved_part(state: TrainState, *, arenas: bool) -> Any:
+    """Leaves the arenas out of what is saved, where the config says so."""
+    return state if arenas else replace(state, arenas=None)
 
 
 class Saves:

@@ -38,11 +38,11 @@ class ProgramConfig(Section):
             "second run, with seed=4096",
         ),
     )
-    seeds_by: Literal["vmap", "map", "cores"] = field(
+    seeds_by: Literal["vmap", "map", "cores", "devices"] = field(
         default="vmap",
         metadata=about(
             "vmap: side by side; map: in turn, each as it would be alone, bit for bit; cores: "
-            "vmap, in a group for each core of a CPU"
+            "vmap, in a group for each core of a CPU; devices: vmap, in a group for each device"
         ),
     )
     arenas: int = field(
@@ -50,7 +50,8 @@ class ProgramConfig(Section):
         metadata=about("arenas simulated at once; auto: by run.memory_share", 1, 2**20),
     )
     devices: int = field(
-        default=1, metadata=about("that share the arenas of every seed; divides arenas", 1, 2**16)
+        default=1,
+        metadata=about("that share the arenas of every seed, or by seeds_by the seeds", 1, 2**16),
     )
     streams: int | None = field(
         default=None,
@@ -74,9 +75,14 @@ class ProgramConfig(Section):
     )
 
     @property
+    def arena_devices(self) -> int:
+        """Devices that share the arenas of a seed."""
+        return 1 if self.seeds_by == "devices" else self.devices
+
+    @property
     def stream_count(self) -> int:
-        """Streams of random numbers."""
-        return self.streams or self.devices
+        """Streams of random numbers of a seed."""
+        return self.streams or self.arena_devices
 
     @property
     def updates(self) -> int:

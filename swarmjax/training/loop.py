@@ -4,6 +4,7 @@ One program serves every chunk size, because the number of updates is an argumen
 chunk size gives the same run.
 """
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -66,14 +67,7 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
     start_key = jax.random.key(config.seed if seed is None else seed)
     run_key, learner_key, level_key = jax.random.split(start_key, 3)
     curriculum = curricula.init(schedule, config.curriculum, program.mode)
-    starts = rollout.draw_starts(
-        program.world,
-        schedule.stages,
-        _assigned(program, curriculum)[None],
-        curriculum.cohort,
-        level_key,
-        program.shards,
-    )
+    starts = _draw_first(program, schedule, curriculum, level_key)
     size = program.world.observation_size
     learners = jax.vmap(lambda key: ppo.init(key, config.algo, size, ACTION_SIZE, config.updates))(
         jax.random.split(learner_key, config.learners)
@@ -85,6 +79,23 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
         key=run_key,
         update=jnp.zeros((), jnp.int32),
     )
+
+
+def draw_arenas(program: Program, schedule: Schedule, state: TrainState) -> TrainState:
+    """Draws the arenas of a run whose checkpoint holds none.
+
+    Args:
+      program: the compiled side.
+      schedule: the curriculum's numbers.
+      state: without arenas (None).
+
+    Returns:
+      The state with arenas, and with a cohort of the curriculum that begins with them.
+    """
+    key, level_key = jax.random.split(state.key)
+    curriculum = curricula.begin_cohort(state.curriculum)
+    arenas = _draw_first(program, schedule, curriculum, level_key)
+    return replace(state, arenas=arenas, curriculum=curriculum, key=key)
 
 
 def train_chunk(
@@ -178,6 +189,12 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
 def _assigned(program: Program, curriculum: Curriculum) -> Array:
     """Says on which stage the next episode of each arena of this device begins."""
     return program.shards.local(curricula.assign(curriculum, program.config.arenas))
+
+
+def _draw_first(program: Program, schedule: Schedule, curriculum: Curriculum, key: Array) -> Arena:
+    """Draws the first episode of each arena of this device."""
+    index, cohort = _assigned(program, curriculum)[None], curriculum.cohort
+    return rollout.draw_starts(program.world, schedule.stages, index, cohort, key, program.shards)
 
 
 def _draw_waiting(

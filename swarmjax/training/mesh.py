@@ -1,12 +1,14 @@
-"""A run over several devices: one program on each, with a share of the arenas.
+"""A run over several devices: one program on each, with a share of the arenas or of the seeds.
 
-What is learned and decided is the same on every device (`Shards`), so only the arenas are spread.
+Where arenas are shared, what is learned and decided is the same on every device (`Shards`), so only
+the arenas are spread. Where seeds are shared (`seeds_by=devices`), nothing passes between devices.
 With one device there is no mesh, and the program is that of `seeds`.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,17 +19,47 @@ from swarmjax.config import ConfigError
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.shards import AXIS
 from swarmjax.training import seeds
-from swarmjax.training.loop import Metrics, TrainState
+from swarmjax.training.config import ProgramConfig
+from swarmjax.training.loop import TrainState
 from swarmjax.training.program import Program
 
 _ALL: Any = PartitionSpec()
+_SEEDS: Any = PartitionSpec("seeds")
 _ARENAS: Any = PartitionSpec(None, AXIS)  # the axis before is that of the seeds
-_STATE: Any = TrainState(learners=_ALL, arenas=_ARENAS, curriculum=_ALL, key=_ALL, update=_ALL)
-
-Chunk = Callable[[Schedule, TrainState, Any], tuple[TrainState, Metrics]]
 
 
-def make(devices: int) -> Mesh:
+class _Layout(NamedTuple):
+    """How a run is spread.
+
+    Attributes:
+      mesh: The devices.
+      lanes: What is spread of arrays with an axis of seeds.
+      state: The same, of each part of a state.
+    """
+
+    mesh: Mesh
+    lanes: Any
+    state: Any
+
+    @property
+    def shardings(self) -> Any:
+        """Of each part of a state."""
+        return jax.tree.map(
+            partial(NamedSharding, self.mesh),
+            self.state,
+            is_leaf=lambda x: isinstance(x, PartitionSpec),
+        )
+
+
+def _layout(config: ProgramConfig) -> _Layout:
+    if config.seeds_by == "devices":
+        every = TrainState(_SEEDS, _SEEDS, _SEEDS, _SEEDS, _SEEDS)
+        return _Layout(make(config.devices, "seeds"), _SEEDS, every)
+    state: Any = TrainState(_ALL, _ARENAS, _ALL, _ALL, _ALL)
+    return _Layout(make(config.devices, AXIS), _ALL, state)
+
+
+def make(devices: int, axis: str = AXIS) -> Mesh:
     """Makes the mesh of the first devices that JAX knows, those of all hosts among them.
 
     Raises:
@@ -39,7 +71,7 @@ def make(devices: int) -> Mesh:
         raise ConfigError(
             f"devices is {devices}, but JAX sees {found} ({kind}): give at most {found}."
         )
-    return jax.make_mesh((devices,), (AXIS,), (AxisType.Auto,), devices=jax.devices()[:devices])
+    return jax.make_mesh((devices,), (axis,), (AxisType.Auto,), devices=jax.devices()[:devices])
 
 
 def init(program: Program) -> Callable[[Schedule], TrainState]:
@@ -51,12 +83,43 @@ def init(program: Program) -> Callable[[Schedule], TrainState]:
     Returns:
       From the curriculum's numbers to the states [N] before the first update, spread over devices.
     """
-    local = partial(seeds.init, program)
     if program.config.devices == 1:
-        return local
-    return jax.shard_map(
-        local, mesh=make(program.config.devices), in_specs=_ALL, out_specs=_STATE, check_vma=False
+        return partial(seeds.init, program)
+    layout = _layout(program.config)
+    spread = jax.shard_map(
+        partial(seeds.init, program),
+        mesh=layout.mesh,
+        in_specs=(_ALL, layout.lanes),
+        out_specs=layout.state,
+        check_vma=False,
     )
+    lanes = np.array(seeds.numbers(program.config), np.uint32)
+    return lambda schedule: spread(schedule, lanes)
+
+
+def draw_arenas(program: Program, schedule: Schedule, state: TrainState) -> TrainState:
+    """Draws the arenas of every seed, as `seeds.draw_arenas` does.
+
+    Args:
+      program: the compiled side.
+      schedule: the curriculum's numbers.
+      state: [N] without arenas (None), spread over devices.
+
+    Returns:
+      [N] states with arenas.
+    """
+    local = partial(seeds.draw_arenas, program)
+    if program.config.devices == 1:
+        return jax.jit(local)(schedule, state)
+    layout = _layout(program.config)
+    spread = jax.shard_map(
+        local,
+        mesh=layout.mesh,
+        in_specs=(_ALL, replace(layout.state, arenas=None)),
+        out_specs=layout.state,
+        check_vma=False,
+    )
+    return jax.jit(spread)(schedule, state)
 
 
 def jit_chunk(program: Program) -> Any:
@@ -71,19 +134,19 @@ def jit_chunk(program: Program) -> Any:
     local = partial(seeds.train_chunk, program)
     if program.config.devices == 1:
         return jax.jit(local, donate_argnums=1)
-    mesh = make(program.config.devices)
+    layout = _layout(program.config)
     spread = jax.shard_map(
         lambda schedule, state, n: local(schedule, _without_empty(state), n),
-        mesh=mesh,
-        in_specs=(_ALL, _STATE, _ALL),
-        out_specs=(_STATE, _ALL),
+        mesh=layout.mesh,
+        in_specs=(_ALL, layout.state, _ALL),
+        out_specs=(layout.state, layout.lanes),
         check_vma=False,
     )
-    everywhere, state = NamedSharding(mesh, _ALL), _on(mesh)
+    everywhere = NamedSharding(layout.mesh, _ALL)
     return jax.jit(
         spread,
-        in_shardings=(everywhere, state, everywhere),
-        out_shardings=(state, everywhere),
+        in_shardings=(everywhere, layout.shardings, everywhere),
+        out_shardings=(layout.shardings, NamedSharding(layout.mesh, layout.lanes)),
         donate_argnums=1,
     )
 
@@ -93,17 +156,30 @@ def put(program: Program, state: TrainState) -> TrainState:
 
     Args:
       program: the compiled side.
-      state: [N], of all arenas.
+      state: [N], of all arenas, or without arenas (None).
 
     Returns:
       The same state.
     """
     if program.config.devices == 1:
         return state
-    shardings = _on(make(program.config.devices))
+    shardings = _layout(program.config).shardings
+    if state.arenas is None:
+        shardings = replace(shardings, arenas=None)
     return jax.tree.map(
         lambda sharding, part: jax.tree.map(partial(_spread, sharding), part), shardings, state
     )
+
+
+def bytes_each(config: ProgramConfig, state: TrainState) -> int:
+    """Returns the bytes of a state that one device holds.
+
+    Args:
+      config: of the run.
+      state: [N] of all devices, or what `jax.eval_shape` gives of one.
+    """
+    spread = seeds.size(state if config.seeds_by == "devices" else state.arenas)
+    return seeds.size(state) - spread + spread // config.devices
 
 
 def stepped_together(program: Program, state: TrainState) -> Any:
@@ -119,12 +195,6 @@ def stepped_together(program: Program, state: TrainState) -> Any:
     if program.config.devices > 1:
         state = jax.tree.map(lambda x: x.addressable_data(0), state)
     return seeds.stepped_together(program, state)
-
-
-def _on(mesh: Mesh) -> Any:
-    return jax.tree.map(
-        partial(NamedSharding, mesh), _STATE, is_leaf=lambda x: isinstance(x, PartitionSpec)
-    )
 
 
 def _spread(sharding: NamedSharding, x: jax.Array) -> jax.Array:

@@ -40,7 +40,7 @@ class Program[C: ProgramConfig]:
     @property
     def shards(self) -> Shards:
         """How the arenas are spread over devices."""
-        return Shards(self.config.devices, self.config.stream_count)
+        return Shards(self.config.arena_devices, self.config.stream_count)
 
     @property
     def rows(self) -> int:
@@ -85,7 +85,7 @@ def load_world(config: ProgramConfig) -> World:
         config.task,
         config.realism,
         config.sim,
-        arenas=config.arenas // config.devices * side_by_side(config),
+        arenas=config.arenas // config.arena_devices * side_by_side(config),
         extensions=extension.load(config.extensions),
     )
 
@@ -115,5 +115,8 @@ def groups(config: ProgramConfig, cores: int) -> int:
 
 
 def side_by_side(config: ProgramConfig) -> int:
-    """Returns how many seeds one call of the program steps at once."""
-    return 1 if config.seeds_by == "map" else config.seeds // groups(config, cores())
+    """Returns how many seeds one call of the program steps at once on a device."""
+    if config.seeds_by == "map":
+        return 1
+    parts = config.devices if config.seeds_by == "devices" else groups(config, cores())
+    return config.seeds // parts

@@ -5,6 +5,7 @@ lanes. Seed k is `config.seed + k`. The axis is there for one seed too, so that 
 of state, of checkpoint and of metrics.
 """
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -27,18 +28,35 @@ def numbers(config: ProgramConfig) -> range:
     return config.numbers
 
 
-def init(program: Program, schedule: Schedule) -> TrainState:
+def init(
+    program: Program, schedule: Schedule, lanes: Array | np.ndarray | None = None
+) -> TrainState:
     """Starts every seed of a run.
 
     Args:
       program: the compiled side.
       schedule: the curriculum's numbers.
+      lanes: [N] seeds, uint32; those of the config if there are none.
 
     Returns:
       [N] states before the first update.
     """
-    lanes = np.array(numbers(program.config), np.uint32)
+    lanes = np.array(numbers(program.config), np.uint32) if lanes is None else lanes
     return each(program.config, partial(loop.init, program, schedule), lanes)
+
+
+def draw_arenas(program: Program, schedule: Schedule, state: TrainState) -> TrainState:
+    """Draws the arenas of every seed, as `loop.draw_arenas` does.
+
+    Args:
+      program: the compiled side.
+      schedule: the curriculum's numbers.
+      state: [N] without arenas.
+
+    Returns:
+      [N] states with arenas.
+    """
+    return each(program.config, partial(loop.draw_arenas, program, schedule), state)
 
 
 def train_chunk(
@@ -64,7 +82,7 @@ def each(config: ProgramConfig, function: Callable[[Any], Any], lanes: Any) -> A
     Side by side (`vmap`) the matrix products are batched, which rounds differently from one seed
     alone, but the same in every lane; one seed is not batched at all. In turn (`map`) a seed comes
     to the same bits however many there are. With `cores` they go side by side in groups, of which
-    each call has one.
+    each call has one, and with `devices` on each device.
 
     Args:
       config: the run's config.
@@ -95,6 +113,11 @@ def split(lanes: Any, parts: int) -> list[Any]:
 def join(parts: list[Any]) -> Any:
     """Undoes `split`."""
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+
+
+def size(tree: Any) -> int:
+    """Returns the bytes of a tree's arrays, or of what `jax.eval_shape` gives of them."""
+    return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
 def stepped_together(program: Program, state: TrainState) -> PhysicsState:

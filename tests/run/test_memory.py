@@ -16,6 +16,7 @@ from swarmjax.run import execute, lifecycle, memory, trainer
 from swarmjax.run.settings import RunConfig, TrainConfig, load_run, load_train
 from swarmjax.task.observation import SIZE
 from swarmjax.task.stage_config import StageConfig
+from swarmjax.training import seeds
 
 GIB = 2**30
 SETTINGS = TrainConfig(stage=(StageConfig(name="pair", robots=2, side=0.5),), budget=10**9)
@@ -38,9 +39,9 @@ def test_two_small_programs_tell_what_a_larger_one_takes(tiny_config: TrainConfi
 
 def test_the_bytes_of_a_tree_are_those_of_its_arrays() -> None:
     tree = {"a": jnp.zeros((3, 5)), "b": jnp.zeros(7, jnp.int8)}
-    assert memory.size(tree) == 3 * 5 * 4 + 7
-    assert memory.size(jax.eval_shape(lambda: tree)) == 3 * 5 * 4 + 7
-    assert memory.size(jax.random.split(jax.random.key(0), 4)) == 4 * 8  # two words each
+    assert seeds.size(tree) == 3 * 5 * 4 + 7
+    assert seeds.size(jax.eval_shape(lambda: tree)) == 3 * 5 * 4 + 7
+    assert seeds.size(jax.random.split(jax.random.key(0), 4)) == 4 * 8  # two words each
 
 
 @pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="Linux alone has it")

@@ -161,6 +161,18 @@ def test_episodes_stay_where_a_run_writes_none_for_a_while(tmp_path: Path) -> No
     assert (run / "episodes.jsonl").read_bytes().startswith(written)
 
 
+def test_a_run_without_arenas_in_its_checkpoints_goes_on_with_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, words = tmp_path / "run", [*TINY, "run.checkpoint_arenas=false"]
+    assert train.main([*words, f"run.dir={run}", "run.stop_after=5"]) == 0
+    assert not checkpoint.find(run).has_arenas
+    capsys.readouterr()
+    assert train.main([f"resume={run}"]) == 0
+    assert "holds no arenas" in " ".join(capsys.readouterr().out.split())
+    assert _updates(run) == list(range(9))
+
+
 def test_checkpoints_without_their_config_are_not_added_to(tmp_path: Path) -> None:
     run = _stopped(tmp_path / "run", after=5)
     (run / "config.json").unlink()
@@ -360,6 +372,10 @@ def test_a_run_that_was_trained_otherwise_does_not_verify(
         ('{"update": 0, "digest": "a"}\n', "has no digests in checkpoints.jsonl"),
         (
             '{"update": 2, "digest": "a", "rate_scale": 0.1}\n',
+            "has no digests in checkpoints.jsonl",
+        ),
+        (
+            '{"update": 0, "digest": "a", "arenas": false}\n{"update": 2, "digest": "a"}\n',
             "has no digests in checkpoints.jsonl",
         ),
         ('{"update": 7, "digest": "a"}\n', "the first checkpoint of .* give at least 7"),

@@ -1,0 +1,72 @@
+"""Arenas that are drawn again when a run goes on: what was learned and measured stays."""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from swarmjax.run.checkpoint import to_leaves
+from swarmjax.run.settings import TrainConfig
+from swarmjax.task.env import World
+from swarmjax.training import loop
+from swarmjax.training import program as programs
+from swarmjax.training.loop import TrainState
+from swarmjax.training.program import Program
+
+
+@pytest.fixture(scope="module")
+def states(tiny_config: TrainConfig, tiny_world: World) -> tuple[TrainState, TrainState]:
+    """A state on the second stage with episodes counted, and the same with arenas drawn again."""
+    program = Program(tiny_config, tiny_world)
+    schedule = programs.schedule(tiny_config)
+    begun = jax.jit(partial(loop.init, program))(schedule)
+    weights = np.float32([0.0, 1.0])
+    tally = jax.tree.map(lambda x: x + 3, begun.curriculum.current)
+    there = replace(
+        begun.curriculum, stage=np.int32(1), weights=weights, age=np.int32(1), current=tally
+    )
+    before = replace(begun, curriculum=there)
+    without: Any = replace(before, arenas=None)
+    return before, jax.jit(partial(loop.draw_arenas, program))(schedule, without)
+
+
+def test_learners_and_updates_stay(states: tuple[TrainState, TrainState]) -> None:
+    before, after = map(to_leaves, states)
+    for name in before:
+        if name.startswith("learners/") or name == "update":
+            np.testing.assert_array_equal(after[name], before[name], err_msg=name)
+
+
+@pytest.mark.parametrize("name", ["stage", "weights", "since", "record", "met"])
+def test_what_the_curriculum_has_decided_stays(
+    name: str, states: tuple[TrainState, TrainState]
+) -> None:
+    before, after = (getattr(state.curriculum, name) for state in states)
+    jax.tree.map(np.testing.assert_array_equal, after, before)
+
+
+def test_arenas_begin_on_the_stages_of_now(states: tuple[TrainState, TrainState]) -> None:
+    before, after = states
+    assert set(before.arenas.stage.tolist()) == {0}
+    assert set(after.arenas.stage.tolist()) == {1}
+
+
+def test_a_cohort_begins_that_holds_all_new_episodes(states: tuple[TrainState, TrainState]) -> None:
+    before, after = states
+    assert int(after.curriculum.cohort) == int(before.curriculum.cohort) + 1
+    assert int(after.curriculum.age) == 0
+    assert set(after.arenas.cohort.tolist()) == {int(after.curriculum.cohort)}
+
+
+def test_episodes_that_were_lost_are_not_counted(states: tuple[TrainState, TrainState]) -> None:
+    curriculum = states[1].curriculum
+    for tally in (curriculum.current, curriculum.previous):
+        assert [int(np.sum(x)) for x in tally] == [0] * len(tally)
+
+
+def test_other_levels_are_drawn(states: tuple[TrainState, TrainState]) -> None:
+    before, after = states
+    assert not np.array_equal(before.arenas.observation, after.arenas.observation)
