@@ -1,0 +1,26 @@
+#!/usr/bin/env bash
+# Runs a command for a Slurm job, hands SIGUSR1 on to it, and asks for the job again if it ends with
+# 75: saved, to be started again.
+#   bash launch/requeue.sh COMMAND [ARGUMENT ...]
+set -euo pipefail
+
+"$@" &
+command=$!
+# `scancel --signal` reaches all tasks of a job step; a command without steps gets the signal itself.
+if [ "${STEPS:-0}" -eq 1 ]; then
+  trap 'scancel --signal=USR1 "$SLURM_JOB_ID"' USR1
+else
+  trap 'kill -USR1 "$command"' USR1
+fi
+code=0
+wait "$command" || code=$?
+# A trapped signal ends `wait` before the command has ended.
+while kill -0 "$command" 2>/dev/null; do
+  code=0
+  wait "$command" || code=$?
+done
+if [ "$code" -eq 75 ]; then
+  scontrol requeue "${SLURM_ARRAY_JOB_ID:-$SLURM_JOB_ID}${SLURM_ARRAY_TASK_ID:+_$SLURM_ARRAY_TASK_ID}"
+  exit 0
+fi
+exit "$code"
