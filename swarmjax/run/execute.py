@@ -8,10 +8,11 @@ from pathlib import Path
 import jax
 
 from swarmjax import command, words
-from swarmjax.exit_codes import FAILED, INTERRUPTED, REQUEUE
+from swarmjax.config import ConfigError
+from swarmjax.exit_codes import FAILED, INTERRUPTED, REQUEUE, USER_ERROR
 from swarmjax.run import checkpoint, compile_cache, hosts, memory
 from swarmjax.run.display import Display, measured, spread, working
-from swarmjax.run.errors import LostPeerError, TrainingError
+from swarmjax.run.errors import CheckpointError, LostPeerError, TrainingError
 from swarmjax.run.lifecycle import carry_out, dry_run, find_run
 from swarmjax.run.policy_export import POLICY, seed_path
 from swarmjax.run.settings import TrainConfig
@@ -41,6 +42,11 @@ def execute(settings: TrainConfig, stop: Stop, *, auto: bool) -> int:
         except LostPeerError as error:
             sys.stderr.write(f"swarmjax.train: {error} Go on with resume=auto.\n")
             return hosts.leave(REQUEUE)
+        except (ConfigError, CheckpointError) as error:
+            if hosts.count() == 1:
+                raise
+            sys.stderr.write(f"swarmjax.train: error: {error}\n")
+            return hosts.leave(USER_ERROR)
 
 
 def fill(settings: TrainConfig) -> tuple[TrainConfig, str]:

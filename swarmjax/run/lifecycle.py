@@ -62,7 +62,8 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
       StoppedError: if somebody asked to stop before there was anything to save.
     """
     with directory.locked(run):
-        check_free(run, settings)
+        if hosts.is_first():  # the folder of the others links to checkpoints of the first
+            check_free(run, settings)
         name = settings.run.id or hosts.share_text(directory.new_id())
         settings = replace(settings, run=replace(settings.run, id=name))
         try:

@@ -85,6 +85,17 @@ def test_a_death_is_a_sentence(joined: bool, code: int, capsys: pytest.CaptureFi
 
 
 @pytest.mark.slow
+def test_processes_go_on_together(tmp_path: Path, coordinator: str) -> None:
+    run = tmp_path / "run"
+    for stop in (3, 5):
+        words = ["devices=2", "budget=1e6", "resume=auto", f"run.stop_after={stop}"]
+        both = [_start(run, coordinator, i, *words) for i in range(2)]
+        assert [_said(process)[0] for process in both] == [0, 0]
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert [row["update"] for row in rows] == list(range(5))
+
+
+@pytest.mark.slow
 def test_a_lost_process_ends_the_others_and_the_run_goes_on_alone(
     tmp_path: Path, coordinator: str
 ) -> None:
