@@ -244,6 +244,8 @@ def train(
             due = saves.due(tally, checkpoints.write_seconds)
             if tally.is_sound and hosts.share(due)[0]:
                 save(what(state), tally.update, record.sync(), score(settings, tally))
+            if saves.must_wait(tally):
+                checkpoints.wait()
         save(what(state), tally.update, record.sync(), score(settings, tally))
     return state, tally
 
@@ -254,20 +256,21 @@ def _saved_part(state: TrainState, *, arenas: bool) -> Any:
 
 
 class Saves:
-    """Says when a checkpoint is due: by time, and by share of the budget.
+    """Says when a checkpoint is due, by time and by share of the budget, and when to wait for one.
 
-    A run that is killed while it writes a checkpoint goes back to the one before. So a checkpoint
-    is begun early, by the time that the last one took to write and the next call takes: a kill then
-    repeats one interval at most. It is never begun before half of the interval, so an interval that
-    is shorter than that time cannot be kept.
+    A run that is killed while it writes a checkpoint goes back to the one before. So that a kill
+    repeats one interval at most, a checkpoint is begun early: by the time that the last one took
+    to write and the next call takes, at most by half of the interval. If it takes longer than
+    that, the run waits for it.
     """
 
     def __init__(self, settings: TrainConfig, done: int) -> None:
         """Begins to count where `done` updates are done."""
         self._seconds = 60.0 * settings.run.checkpoint_minutes
         self._updates = settings.run.checkpoint_share * settings.updates
-        self._saved_at, self._saved = time.monotonic(), done
-        self._before = done
+        self._last = self._before = (time.monotonic(), done)  # checkpoints, the newest and before
+        self._update = done
+        self._call = 0
 
     def due(self, tally: Tally, write_seconds: float) -> bool:
         """Tells whether to save now; if so, the next checkpoint is counted from here.
@@ -276,16 +279,30 @@ class Saves:
           tally: after a call of the program.
           write_seconds: that the last checkpoint took to write.
         """
-        call, self._before = tally.update - self._before, tally.update
-        pace = tally.seconds / (tally.update - tally.first)  # seconds an update
-        late = call + write_seconds / pace  # updates until a checkpoint begun later is written
-        since_s = time.monotonic() - self._saved_at
-        by_time = since_s + min(late * pace, self._seconds / 2) >= self._seconds
-        since = tally.update - self._saved
-        by_share = self._updates > 0 and since + min(late, self._updates / 2) > self._updates
-        if by_time or by_share:
-            self._saved_at, self._saved = time.monotonic(), tally.update
-        return by_time or by_share
+        self._call, self._update = tally.update - self._update, tally.update
+        late = self._call + write_seconds / _pace(tally)  # updates until it is written
+        due = self._is_over(self._last, tally, late, most=0.5)
+        if due:
+            self._last, self._before = (time.monotonic(), tally.update), self._last
+        return due
+
+    def must_wait(self, tally: Tally) -> bool:
+        """Tells whether the next call ends later than an interval after the checkpoint before."""
+        return self._is_over(self._before, tally, self._call, most=1.0)
+
+    def _is_over(
+        self, since: tuple[float, int], tally: Tally, ahead: float, *, most: float
+    ) -> bool:
+        """Tells whether an interval is over in `ahead` updates, or in `most` of it."""
+        seconds, updates = time.monotonic() - since[0], tally.update - since[1]
+        by_time = seconds + min(ahead * _pace(tally), most * self._seconds) > self._seconds
+        by_share = updates + min(ahead, most * self._updates) > self._updates
+        return by_time or (self._updates > 0 and by_share)
+
+
+def _pace(tally: Tally) -> float:
+    """Returns the seconds that an update takes."""
+    return tally.seconds / (tally.update - tally.first)
 
 
 def score(settings: TrainConfig, tally: Tally) -> float | None:

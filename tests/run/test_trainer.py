@@ -36,6 +36,13 @@ def _tally(update: int) -> trainer.Tally:
     return trainer.Tally(update, 0, 0.0, {}, {}, seconds=0.01 * update)
 
 
+def _saves_each_90() -> trainer.Saves:
+    """Of a run of 900 updates, each tenth of which is saved."""
+    settings = load_train(["stage=s1", "arenas=32", f"budget={900 * 32 * 32}"])
+    run = RunConfig(checkpoint_minutes=99.0, checkpoint_share=0.1)
+    return trainer.Saves(replace(settings, run=run), 0)
+
+
 @pytest.mark.parametrize(
     ("write_seconds", "begun"),
     [
@@ -47,11 +54,21 @@ def _tally(update: int) -> trainer.Tally:
 def test_a_checkpoint_is_begun_so_early_that_a_kill_repeats_one_interval(
     write_seconds: float, begun: int
 ) -> None:
-    settings = load_train(["stage=s1", "arenas=32", f"budget={900 * 32 * 32}"])
-    settings = replace(settings, run=RunConfig(checkpoint_minutes=99.0, checkpoint_share=0.1))
-    saves = trainer.Saves(settings, 0)
+    saves = _saves_each_90()
     calls = range(10, 100, 10)
     assert next(n for n in calls if saves.due(_tally(n), write_seconds)) == begun
+
+
+def test_a_run_waits_for_a_checkpoint_that_is_not_written_within_the_interval() -> None:
+    saves = _saves_each_90()
+    begun = [n for n in range(10, 60, 10) if saves.due(_tally(n), write_seconds=9.0)]
+    assert begun == [50]  # the checkpoint before is that of update 0
+    waits = [
+        n
+        for n in range(60, 100, 10)
+        if not saves.due(_tally(n), 0.0) and saves.must_wait(_tally(n))
+    ]
+    assert waits == [90]  # another call would end at 100
 
 
 def test_a_stop_has_a_time_of_its_own() -> None:
