@@ -1,16 +1,16 @@
 """Who brings the same swarm to its targets sooner, our trainer or Brax's PPO?
 
-`python -m benchmarks.race trainer=swarmjax|brax [points=30] [levels=256] [key=value ...]` takes the
-keys of `swarmjax.train` and prints one JSON line. Both train on the same compiled environment, with
-the same networks, initial weights but for the critic's last layer, batch, minibatches, epochs,
-discount, clip, costs and clipped gradients; both are judged by the same policy's mean on the same
-levels, at `points` evenly spaced over the budget. What differs is what is Brax's own: one learning
-rate for actor and critic, which does not fall (`learning_rate`, that of our actor unless given),
-Adam's epsilon, a critic whose last layer begins as large as the others (Brax takes one
-initialisation for all), minibatches of robots instead of arenas or tiles of samples, no bound on
-normalised observations, no options of XLA's (`loop.compiler_options`), and no mask, so that robots
-that have arrived stay in its batch (benchmarks/brax_env.py). All of its robot steps are counted as
-transitions, of ours those that were learned from.
+`python -m benchmarks.race trainer=swarmjax|brax [seed=0,1,2] [points=30] [key=value ...]`
+takes the keys of `swarmjax.train` and prints a JSON line for each seed. Both train on the same
+compiled environment, with the same networks, initial weights but for the critic's last layer,
+batch, minibatches, epochs, discount, clip, costs and clipped gradients; both are judged by the same
+policy's mean on the same levels, at `points` evenly spaced over the budget. What differs is what is
+Brax's own: one learning rate for actor and critic, which does not fall (`learning_rate`, that of
+our actor unless given), Adam's epsilon, a critic whose last layer begins as large as the others
+(Brax takes one initialisation for all), minibatches of robots instead of arenas or tiles of
+samples, no bound on normalised observations, no options of XLA's (`loop.compiler_options`), and no
+mask, so that robots that have arrived stay in its batch (benchmarks/brax_env.py). All of its robot
+steps are counted as transitions, of ours those that were learned from.
 
 `settings=playground` gives Brax what MuJoCo Playground sets for its walking robots (`PLAYGROUND`)
 instead of our numbers; the networks stay.
@@ -72,6 +72,9 @@ class RaceConfig(Section):
 
     trainer: Literal["swarmjax", "brax"] = field(
         default="swarmjax", metadata=about("whose PPO trains")
+    )
+    seed: tuple[int, ...] = field(
+        default=(0,), metadata=about("random seeds, one after the other", 0, MAX_COUNT)
     )
     points: int = field(default=30, metadata=about("points at which it is judged", 4, 1000))
     levels: int = field(default=256, metadata=about("that it is judged on", 1, 2**20))
@@ -310,6 +313,7 @@ def line(race: RaceConfig, trained: TrainConfig, course: Course) -> dict[str, An
     return {
         "benchmark": "race",
         "trainer": "swarmjax" if ours else BRAX[race.settings],
+        "seed": trained.seed,
         **steps_per_second.about(trained),
         "arena_steps_per_s": float(np.median(np.diff(course.arena_steps) / calls_s)),
         "transitions_per_s": float(speed),
@@ -375,7 +379,8 @@ def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     race, trained = parse(arguments)
     run = {"swarmjax": run_ours, "brax": run_brax}[race.trainer]
-    peers.write([line(race, trained, run(race, trained))])
+    seeded = (replace(trained, seed=seed) for seed in race.seed)
+    peers.write(line(race, each, run(race, each)) for each in seeded)
     return 0
 
 

@@ -89,8 +89,17 @@ def _race(lines: Sequence[Line]) -> Figure | None:
     if not mine:
         return None
     plot, axes = _figure()
+    trainers = list(dict.fromkeys(line["trainer"] for line in mine))
     for line in mine:
-        axes.plot(*zip(*line["curve"], strict=True), "o-", ms=3, label=line["trainer"])
+        name = line["trainer"]
+        first = next(other for other in mine if other["trainer"] == name) is line
+        axes.plot(
+            *zip(*line["curve"], strict=True),
+            "o-",
+            ms=2,
+            color=f"C{trainers.index(name)}",
+            label=name if first else None,
+        )
     for share in (0.90, 0.95):
         axes.axhline(share, color="0.5", lw=0.8, ls="--")
     axes.set(xscale="log", xlabel="seconds of training, compilation apart")

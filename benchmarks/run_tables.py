@@ -7,6 +7,7 @@ from typing import Any
 Line = dict[str, Any]
 # What tells the lines of one entry from each other.
 _KEYS = ("arenas", "robots", "seed", "trainer", "cache", "reset", "share")
+_SHARES = ("seconds_to_0.90", "seconds_to_0.95")
 _COUNTED = ("step", "substeps", "resets", "precision", "matmul_precision")
 
 
@@ -188,28 +189,39 @@ def _bytes(value: float) -> str:
 
 
 def _trainers(lines: Sequence[Line]) -> list[str]:
+    """A row for each trainer: medians of all seeds, and the seconds of each."""
+    rows: dict[tuple[str, int], list[Line]] = {}
+    for line in lines:
+        if "trainer" in line:
+            rows.setdefault((line["trainer"], line["arenas"]), []).append(line)
     heads = (
         "trainer",
         "arenas",
+        "seeds",
         "transitions/s",
         "arena steps/s",
         "compile, s",
         "to 0.90, s",
         "to 0.95, s",
     )
-    mine = [line for line in lines if "trainer" in line]
-    body = (
-        [
-            line["trainer"],
-            f"{line['arenas']:,}",
-            speed(line["transitions_per_s"]),
-            speed(line["arena_steps_per_s"]),
-            seconds(line["compile_s"]),
-            *(seconds(line.get(key), 2) for key in ("seconds_to_0.90", "seconds_to_0.95")),
-        ]
-        for line in mine
+    return _rows(
+        heads,
+        (
+            [
+                name,
+                f"{arenas:,}",
+                str(len(mine)),
+                *(speed(_middle(mine, key)) for key in ("transitions_per_s", "arena_steps_per_s")),
+                seconds(mine[0]["compile_s"]),
+                *(_median([x[key] for x in mine], 2) for key in _SHARES),
+            ]
+            for (name, arenas), mine in rows.items()
+        ),
     )
-    return _rows(heads, body)
+
+
+def _middle(lines: Sequence[Line], key: str) -> float:
+    return statistics.median(line[key] for line in lines)
 
 
 def _success(lines: Sequence[Line]) -> list[str]:
@@ -218,7 +230,7 @@ def _success(lines: Sequence[Line]) -> list[str]:
     for line in choose(lines, "command_to_success"):
         rows.setdefault((line["entry"], label(line)), []).append(line)
     heads = ("swarm", "seeds", "to 0.90, s", "to 0.95, s", "saved, s", "judged in MuJoCo C")
-    keys = ("seconds_to_0.90", "seconds_to_0.95", "saved_s")
+    keys = (*_SHARES, "saved_s")
     return _rows(
         heads,
         (
@@ -233,12 +245,12 @@ def _success(lines: Sequence[Line]) -> list[str]:
     )
 
 
-def _median(values: Sequence[float | None]) -> str:
+def _median(values: Sequence[float | None], digits: int = 1) -> str:
     """The median and all values; a seed that never came so far counts as slower than all."""
     known = sorted(value if value is not None else float("inf") for value in values)
     middle = statistics.median_high(known)
-    shown = ", ".join(seconds(value) for value in values)
-    return f"{seconds(None if middle == float('inf') else middle)} ({shown})"
+    shown = ", ".join(seconds(value, digits) for value in values)
+    return f"{seconds(None if middle == float('inf') else middle, digits)} ({shown})"
 
 
 def _start_up(lines: Sequence[Line]) -> list[str]:

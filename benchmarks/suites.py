@@ -82,7 +82,7 @@ def _peer(name: str, values: tuple[str, ...], *words: str) -> SuiteEntry:
 _WARP = "sim.impl=warp"
 _SLOW = ("16384", "4096", "1024", "256")
 _LARGE = ("65536", "16384", "262144", "4096")
-_TRAINED = ("stage=s6", _WARP, "arenas=8192", "budget=160e6")
+_RACED = ("stage=s6", _WARP, "arenas=8192")
 
 HEADLINE = (
     _speed("planar-warp", _WARP),
@@ -98,18 +98,24 @@ TRAINERS = (
     SuiteEntry(
         name="race-swarmjax",
         module="race",
-        words=("trainer=swarmjax", "points=200", *_TRAINED),
+        words=("trainer=swarmjax", "points=100", *_RACED, "budget=80e6"),
+        over="seed",
+        values=SEEDS,
     ),
     SuiteEntry(
         name="race-brax",
         module="race",
-        words=("trainer=brax", "points=200", *_TRAINED),
+        words=("trainer=brax", "points=100", *_RACED, "budget=80e6"),
+        over="seed",
+        values=SEEDS,
         seconds=400.0,
     ),
     SuiteEntry(
         name="race-brax-playground",
         module="race",
-        words=("trainer=brax", "settings=playground", "points=100", *_TRAINED),
+        words=("trainer=brax", "settings=playground", "points=10", *_RACED, "budget=16e6"),
+        over="seed",
+        values=SEEDS,
         seconds=400.0,
     ),
     SuiteEntry(

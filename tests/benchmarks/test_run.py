@@ -292,8 +292,10 @@ def test_trainers_and_seeds() -> None:
         "device": "d",
         "commit": "c",
     }
-    text = run_tables.markdown([trainer])
-    assert "| T | 8 | 2.5 k | 500 | - | 1.25 | - |" in text
+    seeded = [trainer | {"seed": seed, "seconds_to_0.90": 1.25 + seed} for seed in range(3)]
+    text = run_tables.markdown(seeded)
+    row = "| T | 8 | 3 | 2.5 k | 500 | - | 2.25 (1.25, 2.25, 3.25) | - (-, -, -) |"
+    assert row in text
     seeds = [
         _speed(8, 0.0)
         | {"benchmark": "command_to_success", "seed": seed, "judged": 0.96, "saved_s": 9.0}
