@@ -141,7 +141,7 @@ class AlgoConfig(Section):
     )
     entropy_cost: float = field(default=0.0, metadata=about("weight of the entropy", 0.0))
     bound_cost: float = field(
-        default=1.0,
+        default=1500.0,
         metadata=about("weight of the squared distance of the mean action from -1..1", 0.0),
     )
     update_backend: Literal["auto", "autodiff", "fused"] = field(
