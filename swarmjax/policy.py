@@ -54,7 +54,7 @@ def load(path: str | Path | IO[bytes]) -> Policy:
             raise ValueError(f"meta has more than {MAX_ENTRIES} entries")
         meta = json.loads(text)
         if meta["format"] != FORMAT:
-            raise ValueError(f"meta.format is {meta['format']}, and {FORMAT} is what is read")
+            raise ValueError(f"meta.format is {json.dumps(meta['format'])[:80]}, not {FORMAT}")
         if found != digest(arrays):
             raise ValueError("digest is not that of the arrays")
         names = [*(f"hidden_{i}" for i in range((len(arrays) - 6) // 2)), "mean"]

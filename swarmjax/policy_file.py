@@ -255,8 +255,10 @@ def _unpack(content: bytes) -> dict[str, bytes]:
     except PolicyError:
         raise
     except _UNREADABLE as error:
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
-        raise PolicyError(f"it is no npz archive that can be read: {_plain(reason)}.") from None
+        # zipfile quotes a damaged header whole, which says nothing to a reader.
+        said = str(error).strip().partition(" and header ")[0] or type(error).__name__
+        reason = _plain(said.splitlines()[0].rstrip("."))
+        raise PolicyError(f"it is no npz archive that can be read: {reason[:200]}.") from None
 
 
 def _check_total(total: int, most: int) -> None:
