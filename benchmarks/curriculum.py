@@ -37,8 +37,8 @@ from swarmjax.sim import dispatch
 from swarmjax.task import env
 from swarmjax.task.level import Level
 from swarmjax.task.stage_config import StageConfig
+from swarmjax.training import mesh, seeds
 from swarmjax.training import program as programs
-from swarmjax.training import seeds
 from swarmjax.training.loop import TrainState
 from swarmjax.training.program import Program
 
@@ -120,16 +120,16 @@ def measure(trained: TrainConfig, at: np.ndarray, judge: Judge) -> Curves:
       The curves.
     """
     program, schedule = programs.load(trained)
-    state = jax.jit(partial(seeds.init, program))(schedule)
+    state = jax.jit(mesh.init(program))(schedule)
     compiled = trainer.compile_chunk(program, schedule, state)
     call = partial(compiled.call, schedule)
     # Warp builds its kernels at its first step, which is no part of training either.
-    judge_compile_s, _ = _timed(partial(judge, state.learners))
+    judge_compile_s, _ = _timed(partial(judge, jax.device_get(state.learners)))
     rows, train_s, judge_s = [], [], 0.0
     for n in np.diff(at, prepend=0):
         seconds, (state, row) = _timed(partial(_train, program, call, state, int(n)))
         train_s.append(seconds + (train_s[-1] if train_s else 0.0))
-        seconds, found = _timed(partial(judge, state.learners))
+        seconds, found = _timed(partial(judge, jax.device_get(state.learners)))
         judge_s += seconds
         rows.append(row | {"judged": found})
     judged = {

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 from benchmarks import (
     faults_disk,
+    faults_hosts,
     faults_inputs,
     faults_nan,
     faults_policies,
@@ -54,6 +55,7 @@ CAMPAIGNS: dict[str, Campaign] = {
     "nan": Campaign(faults_nan.trial, 240),
     "policies": Campaign(faults_policies.trial, 1000),
     "inputs": Campaign(faults_inputs.trial, 5000),
+    "hosts": Campaign(faults_hosts.trial, 10),
 }
 
 

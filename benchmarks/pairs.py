@@ -10,8 +10,8 @@ import numpy as np
 
 from swarmjax.run import trainer
 from swarmjax.run.settings import TrainConfig
+from swarmjax.training import mesh
 from swarmjax.training import program as programs
-from swarmjax.training import seeds
 
 
 class Arm:
@@ -26,7 +26,7 @@ class Arm:
     def __init__(self, settings: TrainConfig) -> None:
         program, schedule = programs.load(settings)
         self.settings = settings
-        self._state = jax.jit(partial(seeds.init, program))(schedule)
+        self._state = jax.jit(mesh.init(program))(schedule)
         compiled = trainer.compile_chunk(program, schedule, self._state)
         self._train = partial(compiled.call, schedule)
         self.compile_s = compiled.seconds

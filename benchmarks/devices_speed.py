@@ -1,0 +1,136 @@
+"""How much faster do several devices train than one?
+
+`python -m benchmarks.devices_speed devices=N [scaling=weak|strong] [key=value ...]` takes the keys
+of `swarmjax.train` and trains on one device and on N, in turn. `scaling=weak` gives each device
+`arenas` arenas; `scaling=strong` spreads `arenas` over all. It prints a JSON line: arena steps a
+second of both, their ratio, and `efficiency`, the ratio over N, each the median over `PAIRS` pairs
+with a 95 % interval by order statistics. Compile time is apart.
+
+With `run.coordinator`, `run.processes` and `run.process` it is started once for each process. The
+first process then trains on its own device in turn with all of them, and prints the line.
+"""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from jax.experimental import multihost_utils
+
+from benchmarks import key_value
+from benchmarks.pairs import Arm, in_turn, median
+from benchmarks.steps_per_second import about as about_run
+from benchmarks.steps_per_second import made_with
+from swarmjax import command
+from swarmjax.config import ConfigError, Section, about
+from swarmjax.run import hosts
+from swarmjax.run.settings import TrainConfig, load_train
+
+PAIRS = 10
+CALL_SECONDS = 0.8  # of a call of one device, about
+
+
+@dataclass(frozen=True, kw_only=True)
+class DevicesConfig(Section):
+    """What is held fixed when devices are added."""
+
+    scaling: Literal["weak", "strong"] = field(
+        default="weak", metadata=about("weak: arenas of each device; strong: arenas of all devices")
+    )
+
+
+def parse(words: Sequence[str]) -> tuple[DevicesConfig, TrainConfig, TrainConfig]:
+    """Makes the settings of the comparison, of one device and of all.
+
+    Args:
+      words: of the command line.
+
+    Raises:
+      ConfigError: if a word is unsound, or there is one device alone.
+    """
+    given, rest = key_value.parse(DevicesConfig, words)
+    every = load_train(["stage=s6", "budget=1e11", *rest])
+    if every.devices == 1:
+        raise ConfigError("devices is 1: give at least 2 to compare one device with.")
+    one = replace(every, devices=1, streams=1)
+    if given.scaling == "weak":
+        every = replace(every, arenas=every.arenas * every.devices)
+    return given, one, every
+
+
+def result(given: DevicesConfig, one: TrainConfig, every: TrainConfig) -> dict[str, Any] | None:
+    """Compiles both programs and times them in turn.
+
+    Args:
+      given: what is held fixed.
+      one: settings of one device.
+      every: settings of all devices.
+
+    Returns:
+      The line; None in all processes but the first.
+    """
+    alone, spread = (Arm(one) if hosts.is_first() else None), Arm(every)
+    updates = _updates(alone)
+    pairs = in_turn(lambda: _speed(alone, updates), lambda: _speed(spread, updates), 1 + PAIRS)[
+        1:
+    ]  # the first pair is not counted
+    if alone is None:
+        return None
+    ratio, low, high = median([many / single for single, many in pairs])
+    devices = every.devices
+    return {
+        "benchmark": "devices_speed",
+        "scaling": given.scaling,
+        "devices": devices,
+        "processes": hosts.count(),
+        **about_run(one),
+        "arenas": one.arenas,
+        "arenas_in_all": every.arenas,
+        "updates": updates,
+        "pairs": PAIRS,
+        "ratio": [ratio, low, high],
+        "efficiency": [ratio / devices, low / devices, high / devices],
+        "arena_steps_per_s_of_one": median([single for single, _ in pairs])[0],
+        "arena_steps_per_s": median([many for _, many in pairs])[0],
+        "calls_per_s": [[round(value) for value in pair] for pair in pairs],
+        "compile_s_of_one": alone.compile_s,
+        "compile_s": spread.compile_s,
+        **made_with(),
+    }
+
+
+def _updates(alone: Arm | None) -> int:
+    """Chooses the updates of a call, the same in all processes."""
+    updates = 1
+    if alone is not None:
+        alone.time(1)
+        updates = max(1, round(CALL_SECONDS / alone.time(1)))
+    return int(hosts.share(updates)[0])
+
+
+def _speed(arm: Arm | None, updates: int) -> float:
+    """Arena steps a second of one call; other processes wait for the first one's own arm."""
+    if hosts.count() > 1:
+        multihost_utils.sync_global_devices("before a call")
+    if arm is None:
+        return np.nan
+    seconds = arm.time(updates)
+    settings = arm.settings
+    steps = updates * settings.seeds * settings.arenas * settings.algo.rollout_length
+    return steps / seconds
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    given, one, every = parse(arguments)
+    hosts.join(every)
+    line = result(given, one, every)
+    if line is not None:
+        sys.stdout.write(json.dumps(line) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("devices_speed", main, TrainConfig))
