@@ -42,6 +42,7 @@ EXAMPLES: dict[str, dict[str, str]] = {
     "swarmjax.report": {
         "run=runs/first": "into runs/first/report",
         "run=runs/first out=reports/first": "into a folder of your choice",
+        "runs=runs/first,runs/array,'runs/cell*'": "a table of several runs, arrays and sweeps",
     },
     "swarmjax.replay": {
         "policy=runs/first/policy.npz": "level 0 of its last stage, into replay.html",
