@@ -111,12 +111,15 @@ def find(text: str) -> list[Path]:
 def _within(path: Path, part: str, deep: int = _DEEP) -> Iterator[Path]:
     """Finds the run at a path, or those in the folder there that have begun to train."""
     if (path / CONFIG).exists():
-        trained = (path / METRICS).exists() and (path / METRICS).stat().st_size
-        if trained or str(path) == part:
+        if _has_trained(path) or str(path) == part:
             yield path
     elif path.is_dir() and deep:
         for inner in sorted(path.iterdir()):
             yield from _within(inner, part, deep - 1)
+
+
+def _has_trained(run: Path) -> bool:
+    return (run / METRICS).exists() and (run / METRICS).stat().st_size > 0
 
 
 def read(runs: Sequence[Path]) -> list[Line]:
@@ -137,6 +140,19 @@ def read(runs: Sequence[Path]) -> list[Line]:
         join(group, _differences(each, flat))
         for each, group in zip(flat, groups.values(), strict=True)
     ]
+
+
+def read_each(labels: Mapping[Path, str]) -> list[Line]:
+    """Reads runs that have trained, a line each.
+
+    Args:
+      labels: by directory, what sets a run apart.
+
+    Raises:
+      ConfigError: if one cannot be read.
+    """
+    trained = {run: label for run, label in labels.items() if _has_trained(run)}
+    return [join([(run, rows.read(run))], label) for run, label in trained.items()]
 
 
 def join(group: Sequence[tuple[Path, History]], settings: str) -> Line:
