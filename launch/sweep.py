@@ -27,7 +27,7 @@ from swarmjax.policy import PolicyError
 from swarmjax.report import table
 from swarmjax.run import directory, heap
 from swarmjax.run.errors import CheckpointError
-from swarmjax.run.grid import MOST_CELLS, Cell, multiply
+from swarmjax.run.grid import MOST_CELLS, GridCell, multiply
 
 _TICK_S = 1.0
 _SAVE_S = 180  # from the signal that a job under Slurm gets to its end
@@ -58,7 +58,7 @@ class SweepConfig(Section):
     )
 
 
-def parse(arguments: Sequence[str]) -> tuple[SweepConfig, list[Cell]]:
+def parse(arguments: Sequence[str]) -> tuple[SweepConfig, list[GridCell]]:
     """Makes the settings and the cells of a sweep of its `key=value` words.
 
     Raises:
@@ -107,7 +107,7 @@ def train(arguments: Sequence[str], visible: str | None) -> int:
         return FAILED
 
 
-def work(cells: Sequence[Cell], settings: SweepConfig) -> dict[str, int]:
+def work(cells: Sequence[GridCell], settings: SweepConfig) -> dict[str, int]:
     """Trains cells in jobs, again where they save and want to go on.
 
     Returns:
@@ -134,7 +134,7 @@ def work(cells: Sequence[Cell], settings: SweepConfig) -> dict[str, int]:
     return codes
 
 
-def submit(cell: Cell, settings: SweepConfig) -> Any:
+def submit(cell: GridCell, settings: SweepConfig) -> Any:
     """Submits the job of a cell; returns submitit's handle of it."""
     import submitit
 

@@ -49,7 +49,7 @@ def write(run: Path, out: Path, made_by: str) -> list[Path]:
     )
 
 
-def write_table(lines: Sequence[table.Line], out: Path, made_by: str) -> list[Path]:
+def write_table(lines: Sequence[table.TableLine], out: Path, made_by: str) -> list[Path]:
     """Writes the table of several runs.
 
     Args:

@@ -12,7 +12,7 @@ from swarmjax.config import to_dict
 from swarmjax.report import rows as report_rows
 from swarmjax.report import table as report_table
 from swarmjax.report.rows import History, Row
-from swarmjax.report.table import Line
+from swarmjax.report.table import TableLine
 
 GOOD = 0.9  # success from which on a stage is counted as learned
 _TOP = 5  # stages named of a reweighing
@@ -73,7 +73,7 @@ def page(title: str, command: str, history: History, figures: Mapping[str, bytes
     )
 
 
-def table_page(title: str, command: str, lines: Sequence[Line]) -> str:
+def table_page(title: str, command: str, lines: Sequence[TableLine]) -> str:
     """Lays the table of several runs out.
 
     Args:

@@ -39,7 +39,7 @@ HEADS = (
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Line:
+class TableLine:
     """All seeds of the same settings.
 
     Attributes:
@@ -122,7 +122,7 @@ def _has_trained(run: Path) -> bool:
     return (run / METRICS).exists() and (run / METRICS).stat().st_size > 0
 
 
-def read(runs: Sequence[Path]) -> list[Line]:
+def read(runs: Sequence[Path]) -> list[TableLine]:
     """Reads runs, those of the same settings into one line.
 
     Args:
@@ -142,7 +142,7 @@ def read(runs: Sequence[Path]) -> list[Line]:
     ]
 
 
-def read_each(labels: Mapping[Path, str]) -> list[Line]:
+def read_each(labels: Mapping[Path, str]) -> list[TableLine]:
     """Reads runs that have trained, a line each.
 
     Args:
@@ -155,7 +155,7 @@ def read_each(labels: Mapping[Path, str]) -> list[Line]:
     return [join([(run, rows.read(run))], label) for run, label in trained.items()]
 
 
-def join(group: Sequence[tuple[Path, History]], settings: str) -> Line:
+def join(group: Sequence[tuple[Path, History]], settings: str) -> TableLine:
     """Puts runs of the same settings into one line.
 
     Args:
@@ -179,7 +179,7 @@ def join(group: Sequence[tuple[Path, History]], settings: str) -> Line:
     success = np.concatenate([history.success[:, -1, -1] for history in histories])
     seconds = [history.seconds for history in histories]
     config = histories[0].config
-    return Line(
+    return TableLine(
         runs=tuple(run for run, _ in group),
         settings=settings,
         stage=config.stage[-1].name,
@@ -208,7 +208,7 @@ def _differences(mine: Mapping[str, Any], every: Sequence[Mapping[str, Any]]) ->
     return " ".join(words)
 
 
-def cells(lines: Sequence[Line]) -> list[tuple[str, ...]]:
+def cells(lines: Sequence[TableLine]) -> list[tuple[str, ...]]:
     """Writes lines as text, in the columns of `HEADS`."""
     return [
         (
@@ -225,7 +225,7 @@ def cells(lines: Sequence[Line]) -> list[tuple[str, ...]]:
     ]
 
 
-def note(lines: Sequence[Line]) -> str:
+def note(lines: Sequence[TableLine]) -> str:
     """Says what the success of lines is, and the interval."""
     measures = " or ".join(sorted({line.measure for line in lines}))
     return (
@@ -234,7 +234,7 @@ def note(lines: Sequence[Line]) -> str:
     )
 
 
-def text(lines: Sequence[Line]) -> str:
+def text(lines: Sequence[TableLine]) -> str:
     """Writes lines as a table for a terminal, with a note."""
     table = [HEADS, *cells(lines)]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
@@ -245,7 +245,7 @@ def text(lines: Sequence[Line]) -> str:
     return "\n".join([*written, note(lines)])
 
 
-def plain(lines: Sequence[Line]) -> list[dict[str, Any]]:
+def plain(lines: Sequence[TableLine]) -> list[dict[str, Any]]:
     """Writes lines as plain data for JSON; what was not measured is null."""
     return [
         {
@@ -272,7 +272,7 @@ def _place(runs: Sequence[Path]) -> str:
     return f"{len(runs)} in {os.path.commonpath(runs)}"
 
 
-def _seeds(line: Line) -> str:
+def _seeds(line: TableLine) -> str:
     """Counts seeds, and those that have a success where not all do."""
     of, measured = len(line.seeds), len(line.measured)
     return str(of) if measured == of else f"{of}, {measured} measured"

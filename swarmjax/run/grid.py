@@ -19,7 +19,7 @@ _OWN = ("resume", "run.dir", "run.coordinator", "run.processes", "run.process", 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cell:
+class GridCell:
     """One combination of a grid's values.
 
     Attributes:
@@ -44,7 +44,7 @@ class Cell:
         return found.get("budget_spent") is True and found.get("updates") == self.settings.updates
 
 
-def multiply(folder: Path, typed: Sequence[str]) -> list[Cell]:
+def multiply(folder: Path, typed: Sequence[str]) -> list[GridCell]:
     """Multiplies a grid out.
 
     Args:
@@ -96,9 +96,9 @@ def _values(key: str, text: str) -> list[str]:
         ) from None
 
 
-def _cells(folder: Path, grid: dict[str, list[str]], shared: Sequence[str]) -> list[Cell]:
+def _cells(folder: Path, grid: dict[str, list[str]], shared: Sequence[str]) -> list[GridCell]:
     """Loads the settings of each combination."""
-    cells: dict[Path, Cell] = {}
+    cells: dict[Path, GridCell] = {}
     for values in itertools.product(*grid.values()):
         mine = [f"{key}={value}" for key, value in zip(grid, values, strict=True)]
         run = folder / re.sub(r"[^\w.=+-]+", "-", re.sub(r"[][{}'\"]", "", "_".join(mine)))
@@ -106,5 +106,5 @@ def _cells(folder: Path, grid: dict[str, list[str]], shared: Sequence[str]) -> l
             raise ConfigError(f"two cells of the grid would be {run}: give values that differ.")
         words = (*shared, *mine, "resume=auto", f"run.dir={run}")
         settings, _ = load_run(words)
-        cells[run] = Cell(label=" ".join(mine), run=run, words=words, settings=settings)
+        cells[run] = GridCell(label=" ".join(mine), run=run, words=words, settings=settings)
     return list(cells.values())
