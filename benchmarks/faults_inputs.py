@@ -32,7 +32,7 @@ from swarmjax.export.config import ExportConfig
 from swarmjax.policy import PolicyError
 from swarmjax.policy_file import read_meta
 from swarmjax.replay.config import ReplayConfig
-from swarmjax.report import rows
+from swarmjax.report import rows, table
 from swarmjax.report.config import ReportConfig
 from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
 from swarmjax.run.settings import TrainConfig, load_run, load_train
@@ -79,7 +79,11 @@ def _export(words: Words) -> None:
 
 
 def _report(words: Words) -> None:
-    rows.read(Path(files.load(ReportConfig, words).run))
+    settings = files.load(ReportConfig, words)
+    if settings.runs is not None:
+        table.read(table.find(settings.runs))
+    else:
+        rows.read(Path(settings.run or ""))
 
 
 def _suite(words: Words) -> None:
@@ -109,7 +113,7 @@ _SOUND: dict[str, list[str]] = {
     ],
     "replay": ["policy=policy.npz", "policy=policy.npz suite=suite.yaml cell=one", "policy=b.npz"],
     "export": ["policy=policy.npz out=b.npz", "policy=policy.npz format=c", "run=run"],
-    "report": ["run=run", "run=run out=there"],
+    "report": ["run=run", "runs=run", "run=run out=there"],
     "suite": ["suite=suite.yaml", "suite=dev", "suite=suite.yaml write=true"],
     "reproduce": ["seeds=3 budget=6000 fine_tune=6000", "arms=[baseline] minutes=1", "resume=run"],
 }

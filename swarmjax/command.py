@@ -1,6 +1,7 @@
 """What all commands share: `--help`, and errors of the user's in one sentence with exit code 2."""
 
 import inspect
+import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
@@ -42,6 +43,7 @@ EXAMPLES: dict[str, dict[str, str]] = {
     "swarmjax.report": {
         "run=runs/first": "into runs/first/report",
         "run=runs/first out=reports/first": "into a folder of your choice",
+        "runs=runs/first,runs/array,'runs/cell*'": "a table of several runs, arrays and sweeps",
     },
     "swarmjax.replay": {
         "policy=runs/first/policy.npz": "level 0 of its last stage, into replay.html",
@@ -120,8 +122,12 @@ def line(name: str, *arguments: str) -> str:
 
 
 def _module(name: str) -> str:
-    """The command as `python -m` names it: benchmarks are not part of the package."""
-    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    """The command as `python -m` names it, or the path of a script: not all are in the package."""
+    main = sys.modules["__main__"]
+    script = getattr(main, "__file__", None) or ""
+    spec = getattr(main, "__spec__", None)
+    if spec is None and os.path.basename(script) == f"{name}.py":
+        return os.path.relpath(script)
     found = "" if spec is None else spec.name.removesuffix(".__main__")
     return found if found.rpartition(".")[2] == name else f"swarmjax.{name}"
 
@@ -131,7 +137,7 @@ def help_text(cls: type[Section], module: str, topics: Sequence[str] = ()) -> st
 
     Args:
         cls: the command's dataclass.
-        module: the command as `python -m` names it, such as `swarmjax.train`.
+        module: the command as `python -m` names it, such as `swarmjax.train`, or a script's path.
         topics: sections or keys to list, or `all`; none for usage, examples, groups and the keys
             that are in no section.
 
@@ -160,7 +166,7 @@ def _listed(cls: type[Section], topics: Sequence[str]) -> list[str]:
 
 def _overview(cls: type[Section], module: str) -> list[str]:
     """Say how a command is used, without the keys of its sections."""
-    command = f"python -m {module}"
+    command = f"python {module}" if module.endswith(".py") else f"python -m {module}"
     lines = [f"usage: {command} key=value ..."]
     examples = EXAMPLES.get(module, {})
     if examples:

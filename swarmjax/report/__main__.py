@@ -1,22 +1,26 @@
-"""`python -m swarmjax.report run=DIR [out=DIR]`: what a run came to, as figures and one page.
+"""`python -m swarmjax.report run=DIR|runs=DIR,... [out=DIR]`: what runs came to.
 
-Writes `mix.png`, `success.png`, `curves.png`, `grid.png` if the stages make a grid, and
-`report.html`, which holds them all. The run may be under way or have been killed: what it has not
-finished writing is left out. No JAX.
+Of one run it writes `mix.png`, `success.png`, `curves.png`, `grid.png` if the stages make a grid,
+and `report.html`, which holds them all. The run may be under way or have been killed: what it has
+not finished writing is left out. No JAX.
+
+Of several it prints a table: see `table`. With `out` it writes it there too, as `report.html` and
+`report.json`.
 """
 
+import json
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from swarmjax import command, words
 from swarmjax.config import ConfigError, files
 from swarmjax.report import page as report_page
-from swarmjax.report import rows
+from swarmjax.report import rows, table
 from swarmjax.report.config import ReportConfig
 
-PAGE = "report.html"
+PAGE, TABLE = "report.html", "report.json"
 
 
 def write(run: Path, out: Path, made_by: str) -> list[Path]:
@@ -40,22 +44,53 @@ def write(run: Path, out: Path, made_by: str) -> list[Path]:
 
     figures = report_figures.draw(history)
     page = report_page.page(f"Report of {run}", made_by, history, figures)
-    files = {f"{name}.png": png for name, png in figures.items()} | {PAGE: page.encode()}
+    return _write(
+        out, {f"{name}.png": png for name, png in figures.items()} | {PAGE: page.encode()}
+    )
+
+
+def write_table(lines: Sequence[table.TableLine], out: Path, made_by: str) -> list[Path]:
+    """Writes the table of several runs.
+
+    Args:
+      lines: of the table.
+      out: directory of the report, which is made.
+      made_by: the command that makes it, for the page.
+
+    Returns:
+      The files.
+
+    Raises:
+      ConfigError: if `out` cannot be written.
+    """
+    page = report_page.table_page("Runs", made_by, lines)
+    found = json.dumps(table.plain(lines), indent=2) + "\n"
+    return _write(out, {TABLE: found.encode(), PAGE: page.encode()})
+
+
+def _write(out: Path, contents: Mapping[str, bytes]) -> list[Path]:
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for name, content in files.items():
+        for name, content in contents.items():
             (out / name).write_bytes(content)
     except OSError as error:
         raise ConfigError(f"out is {out}, which cannot be written: {error.strerror}.") from None
-    return [out / name for name in files]
+    return [out / name for name in contents]
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings = files.load(ReportConfig, arguments)
-    run = Path(settings.run)
-    out = Path(settings.out) if settings.out else run / "report"
     made_by = shlex.join(["python", "-m", "swarmjax.report", *arguments])
+    if settings.runs is not None:
+        lines = table.read(table.find(settings.runs))
+        sys.stdout.write(f"{table.text(lines)}\n")
+        if settings.out:
+            written = write_table(lines, Path(settings.out), made_by)
+            sys.stdout.write(f"{written[-1]}: the same as a page.\n")
+        return 0
+    run = Path(settings.run or "")
+    out = Path(settings.out) if settings.out else run / "report"
     written = write(run, out, made_by)
     figures = words.count(len(written) - 1, "figure")
     sys.stdout.write(f"{written[-1]}: the report of {run}, with {figures}.\n")

@@ -3,14 +3,29 @@
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from swarmjax.config import Section, about
+from swarmjax.config import ConfigError, Section, about
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportConfig(Section):
-    """Which run is drawn, and where to."""
+    """Which run is drawn or which are compared, and where to."""
 
     command: ClassVar[str] = "report"
 
-    run: str = field(metadata=about("run directory"))
-    out: str | None = field(default=None, metadata=about("directory; null: <run>/report"))
+    run: str | None = field(default=None, metadata=about("run directory"))
+    runs: str | None = field(
+        default=None,
+        metadata=about(
+            "instead of run: run directories, folders of them (an array, a sweep) and patterns, "
+            "with commas between them; a table of all, seeds of the same settings together"
+        ),
+    )
+    out: str | None = field(
+        default=None,
+        metadata=about("directory; null: <run>/report, or with runs what is printed alone"),
+    )
+
+    def _check(self) -> None:
+        if (self.run is None) == (self.runs is None):
+            both = "is missing" if self.run is None else "and runs are given"
+            raise ConfigError(f"run {both}: give run=DIR, or runs=DIR,DIR,... for a table.")

@@ -10,7 +10,9 @@ import numpy as np
 from swarmjax import words
 from swarmjax.config import to_dict
 from swarmjax.report import rows as report_rows
+from swarmjax.report import table as report_table
 from swarmjax.report.rows import History, Row
+from swarmjax.report.table import TableLine
 
 GOOD = 0.9  # success from which on a stage is counted as learned
 _TOP = 5  # stages named of a reweighing
@@ -68,6 +70,26 @@ def page(title: str, command: str, history: History, figures: Mapping[str, bytes
         f'<div class="{layout}">\n{"".join(_figure(*each) for each in figures.items())}</div>\n'
         f"<h2>Decisions of the curriculum</h2>\n{_decisions(history)}"
         f"<h2>Stages</h2>\n{_stages(history)}</body>\n</html>\n"
+    )
+
+
+def table_page(title: str, command: str, lines: Sequence[TableLine]) -> str:
+    """Lays the table of several runs out.
+
+    Args:
+      title: of the page.
+      command: that makes the report.
+      lines: of the table.
+
+    Returns:
+      HTML in which every name of a run is escaped.
+    """
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f"<title>{escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
+        f"<h1>{escape(title)}</h1>\n{_table(report_table.HEADS, report_table.cells(lines))}"
+        f"<p>{escape(report_table.note(lines))} Made by <code>{escape(command)}</code>.</p>\n"
+        "</body>\n</html>\n"
     )
 
 

@@ -61,8 +61,19 @@ def test_a_report_of_a_run_that_was_killed_leaves_its_unfinished_line_out(
         (["run=text"], "text/metrics.jsonl in line 1 has no number as train_s: it is damaged."),
         (["run=empty"], "empty/metrics.jsonl has no update of every seed: train it first."),
         (["run=good", "out=file"], "out is file, which cannot be written: File exists."),
-        ([], "run is missing and has no default: give it."),
-        (["run=good", "step=1"], "step is not a key: give one of run, out."),
+        ([], "run is missing: give run=DIR, or runs=DIR,DIR,... for a table."),
+        (
+            ["run=good", "runs=good"],
+            "run and runs are given: give run=DIR, or runs=DIR,DIR,... for",
+        ),
+        (["run=good", "step=1"], "step is not a key: give one of run, runs, out."),
+        (["runs=good,gone"], "runs is 'good,gone', and 'gone' is and holds no run."),
+        (["runs=g*,none*"], "runs is 'g*,none*', and 'none*' is and holds no run."),
+        (["runs=good,good"], "runs is 'good,good', which names good twice: give it once."),
+        (["runs=good,,cut"], "runs is 'good,,cut', and '' is and holds no run."),
+        (["runs=good,same"], "seed 0 is in good and in same, of the same settings: give one of"),
+        (["runs=good,empty"], "empty/metrics.jsonl has no update of every seed: train it first."),
+        (["runs=good", "out=file"], "out is file, which cannot be written: File exists."),
     ],
 )
 def test_errors_are_one_sentence(
@@ -73,7 +84,8 @@ def test_errors_are_one_sentence(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for name, rows in (("good", [row(0)]), ("empty", []), ("text", [row(0, train_s="1")])):
+    text = [row(0, train_s="1")]
+    for name, rows in {"good": [row(0)], "same": [row(0)], "empty": [], "text": text}.items():
         write(Path(name), rows)
     good = (write(Path("cut"), [row(0)]) / "metrics.jsonl").read_text()
     Path("cut/metrics.jsonl").write_text(good[:-20] + "\n" + good)

@@ -1,0 +1,190 @@
+"""Trains a grid of settings, a job for each cell, and prints one table at the end.
+
+    python launch/sweep.py dir=runs/grid grid.algo.epochs=1,2 grid.arenas=64,128 seeds=5 stage=s3
+
+trains four cells with five seeds each into `runs/grid/algo.epochs=1_arenas=64` and so on. Words
+that are no keys of this command are those of `python -m swarmjax.train`. A job that saves and ends
+with 75 is submitted again. Started again with the same words, the command goes on with what is
+done. `sweep.json` has the table too. Needs the extra `sweep`: uv sync --extra gpu --extra sweep.
+"""
+
+import importlib.util
+import os
+import shutil
+import sys
+import time
+import traceback
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from swarmjax import command, words
+from swarmjax.config import ConfigError, Section, about, build, section
+from swarmjax.exit_codes import FAILED, INTERRUPTED, REQUEUE, USER_ERROR
+from swarmjax.policy import PolicyError
+from swarmjax.report import table
+from swarmjax.run import directory, heap
+from swarmjax.run.errors import CheckpointError
+from swarmjax.run.grid import MOST_CELLS, GridCell, multiply
+
+_TICK_S = 1.0
+_SAVE_S = 180  # from the signal that a job under Slurm gets to its end
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepConfig(Section):
+    """Where the cells of a grid are trained."""
+
+    command: ClassVar[str] = ""
+
+    dir: str = field(metadata=about("folder of the sweep, which all jobs must see"))
+    cluster: Literal["slurm", "local", "debug"] = field(
+        default="slurm", metadata=about("local: processes of this machine; debug: this process")
+    )
+    minutes: int = field(
+        default=240,
+        metadata=about("of a job, after which it saves and is submitted again", 5, 100_000),
+    )
+    cpus: int = field(default=8, metadata=about("of a job [slurm]", 1, 1024))
+    gpus: int | None = field(
+        default=None, metadata=about("of a job; null: as many as its devices [slurm]", 0, 64)
+    )
+    tries: int = field(default=10, metadata=about("times that a job is submitted", 1, 1000))
+    at_once: int | None = field(
+        default=None,
+        metadata=about("jobs at once; null: all [slurm], one [local, debug]", 1, MOST_CELLS),
+    )
+
+
+def parse(arguments: Sequence[str]) -> tuple[SweepConfig, list[GridCell]]:
+    """Makes the settings and the cells of a sweep of its `key=value` words.
+
+    Raises:
+      ConfigError: if a word is unsound, or jobs cannot be submitted here.
+    """
+    known = section.names(SweepConfig)
+    mine = {key: value for key, _, value in (word.partition("=") for word in arguments)}
+    settings: SweepConfig = build(SweepConfig, {k: v for k, v in mine.items() if k in known})
+    section.check_text("dir", settings.dir)
+    cells = multiply(
+        Path(settings.dir), [word for word in arguments if word.partition("=")[0] not in known]
+    )
+    if importlib.util.find_spec("submitit") is None:
+        raise ConfigError("submitit is missing: install it with uv sync --extra sweep.")
+    for name in ("sbatch", "srun") if settings.cluster == "slurm" else ():
+        if shutil.which(name) is None:
+            raise ConfigError(
+                f"cluster is slurm, but there is no {name} on the PATH: start the sweep where jobs "
+                "are submitted, or give cluster=local."
+            )
+    return settings, cells
+
+
+def train(arguments: Sequence[str], visible: str | None) -> int:
+    """Trains one cell: what a job does.
+
+    Args:
+      arguments: of `python -m swarmjax.train`.
+      visible: CUDA_VISIBLE_DEVICES, where submitit has put something else there.
+
+    Returns:
+      The exit code of that command.
+    """
+    if visible is not None:
+        os.environ["CUDA_VISIBLE_DEVICES"] = visible
+    heap.share()
+    from swarmjax import train as training
+
+    try:
+        return training.main(arguments)
+    except (ConfigError, PolicyError, CheckpointError) as error:
+        sys.stderr.write(f"swarmjax.train: error: {error}\n")
+        return USER_ERROR
+    except Exception:  # submitit's debug executor would open a debugger
+        traceback.print_exc()
+        return FAILED
+
+
+def work(cells: Sequence[GridCell], settings: SweepConfig) -> dict[str, int]:
+    """Trains cells in jobs, again where they save and want to go on.
+
+    Returns:
+      The last exit code of each cell, by its label.
+    """
+    waiting, running, codes = deque((cell, 1) for cell in cells), {}, {}
+    most = settings.at_once or (MOST_CELLS if settings.cluster == "slurm" else 1)
+    try:
+        while waiting or running:
+            while waiting and len(running) < most:
+                cell, attempt = waiting.popleft()
+                job = submit(cell, settings)
+                running[job] = cell, attempt
+                _say(f"{cell.label}: job {job.job_id}, try {attempt} of {settings.tries}")
+            for job in [job for job in running if job.done()]:
+                cell, attempt = running.pop(job)
+                codes[cell.label] = _code(job, cell.label)
+                if codes[cell.label] == REQUEUE and attempt < settings.tries:
+                    waiting.append((cell, attempt + 1))
+            time.sleep(_TICK_S if running else 0)
+    finally:
+        for job in running:
+            job.cancel(check=False)
+    return codes
+
+
+def submit(cell: GridCell, settings: SweepConfig) -> Any:
+    """Submits the job of a cell; returns submitit's handle of it."""
+    import submitit
+
+    executor = submitit.AutoExecutor(Path(settings.dir) / "jobs", cluster=settings.cluster)
+    executor.update_parameters(
+        name="swarmjax",
+        timeout_min=settings.minutes,
+        gpus_per_node=cell.settings.devices if settings.gpus is None else settings.gpus,
+        cpus_per_task=settings.cpus,
+        slurm_signal_delay_s=_SAVE_S,
+    )
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES") if settings.cluster == "local" else None
+    return executor.submit(train, cell.words, visible)
+
+
+def _code(job: Any, label: str) -> int:
+    """Takes the exit code of a job that has ended, and says how it ended."""
+    try:
+        code = job.result()
+    except Exception as error:  # of a job that was killed
+        code, why = FAILED, f"died ({type(error).__name__})"
+    else:
+        why = {0: "done", REQUEUE: "saved"}.get(code, f"failed with code {code}")
+    _say(f"{label}: {why}" + ("" if code in (0, REQUEUE) else f", see {job.paths.stderr}"))
+    if code == INTERRUPTED:
+        raise KeyboardInterrupt
+    return code
+
+
+def _say(sentence: str) -> None:
+    sys.stdout.write(f"{sentence}\n")
+    sys.stdout.flush()
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code, 75 if cells have saved and are not done."""
+    settings, cells = parse(arguments)
+    folder = Path(settings.dir)
+    folder.mkdir(parents=True, exist_ok=True)
+    left = [cell for cell in cells if not cell.is_done]
+    _say(f"{words.count(len(cells), 'cell')}, {len(cells) - len(left)} of them done before")
+    codes = dict.fromkeys((cell.label for cell in cells), 0) | work(left, settings)
+    lines = table.read_each({cell.run: cell.label for cell in cells})
+    found = {"words": list(arguments), "codes": codes, "cells": table.plain(lines)}
+    directory.write_json(folder / "sweep.json", found)
+    if lines:
+        _say(table.text(lines))
+    failed = [label for label, code in codes.items() if code not in (0, REQUEUE)]
+    return FAILED if failed else max(codes.values())
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("sweep", main, SweepConfig))

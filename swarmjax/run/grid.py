@@ -1,0 +1,110 @@
+"""The runs of a grid of settings: words such as `grid.algo.epochs=1,2`, multiplied out."""
+
+import itertools
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from swarmjax.config import ConfigError, files, reading, show
+from swarmjax.run.directory import SUMMARY
+from swarmjax.run.settings import TrainConfig, load_run
+
+GRID = "grid."
+MOST_CELLS = 256
+_MOST_LETTERS = 5000  # of a word of the grid
+# What each cell is given here.
+_OWN = ("resume", "run.dir", "run.coordinator", "run.processes", "run.process", "run.dry")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridCell:
+    """One combination of a grid's values.
+
+    Attributes:
+      label: the values, as words.
+      run: its run directory.
+      words: of `swarmjax.train`, which train it or go on with it.
+      settings: what they come to.
+    """
+
+    label: str
+    run: Path
+    words: tuple[str, ...]
+    settings: TrainConfig
+
+    @property
+    def is_done(self) -> bool:
+        """Whether its run has spent its budget."""
+        path = self.run / SUMMARY
+        found = reading.read_json(path) if path.exists() else None
+        if not isinstance(found, dict):
+            return False
+        return found.get("budget_spent") is True and found.get("updates") == self.settings.updates
+
+
+def multiply(folder: Path, typed: Sequence[str]) -> list[GridCell]:
+    """Multiplies a grid out.
+
+    Args:
+      folder: of the run directories.
+      typed: words `grid.KEY=VALUE,VALUE`, and those `KEY=VALUE` that all cells share.
+
+    Returns:
+      Cells, the values of the last key varying fastest.
+
+    Raises:
+      ConfigError: if a word is unsound or one cell is, or there are none or too many.
+    """
+    grid: dict[str, list[str]] = {}
+    shared = []
+    for word in typed:
+        key, equals, value = word.partition("=")
+        if not equals:
+            raise ConfigError(f"{show(word)} is not a setting: give key=value.")
+        if key.removeprefix(GRID) in _OWN:
+            raise ConfigError(f"{key} cannot be given: each cell of the grid has its own.")
+        if key.startswith(GRID):
+            grid[key.removeprefix(GRID)] = _values(key.removeprefix(GRID), value)
+        else:
+            shared.append(word)
+    if not grid:
+        raise ConfigError(f"the grid is empty: give values, as in {GRID}algo.epochs=1,2.")
+    if math.prod(map(len, grid.values())) > MOST_CELLS:
+        raise ConfigError(f"the grid has more than {MOST_CELLS} cells: give fewer values.")
+    return _cells(folder, grid, shared)
+
+
+def _values(key: str, text: str) -> list[str]:
+    """Splits the values of a key by Hydra's grammar: `1,2`, `[1,2],[3]` or `range(3)`."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    files.split_words(TrainConfig, [f"{key}={text}"])
+    if len(text) > _MOST_LETTERS:
+        raise ConfigError(f"{GRID}{key} has {len(text)} letters: give at most {_MOST_LETTERS}.")
+    try:
+        parsed = OverridesParser.create().parse_override(f"{key}={text}")
+        if not parsed.is_sweep_override():
+            return [text]
+        return list(itertools.islice(parsed.sweep_string_iterator(), MOST_CELLS + 1))
+    except (HydraException, ValueError, OverflowError):
+        raise ConfigError(
+            f"{GRID}{key} is {show(text)}, which cannot be read: give values with commas between "
+            "them, and quote those with special characters."
+        ) from None
+
+
+def _cells(folder: Path, grid: dict[str, list[str]], shared: Sequence[str]) -> list[GridCell]:
+    """Loads the settings of each combination."""
+    cells: dict[Path, GridCell] = {}
+    for values in itertools.product(*grid.values()):
+        mine = [f"{key}={value}" for key, value in zip(grid, values, strict=True)]
+        run = folder / re.sub(r"[^\w.=+-]+", "-", re.sub(r"[][{}'\"]", "", "_".join(mine)))
+        if run in cells:
+            raise ConfigError(f"two cells of the grid would be {run}: give values that differ.")
+        words = (*shared, *mine, "resume=auto", f"run.dir={run}")
+        settings, _ = load_run(words)
+        cells[run] = GridCell(label=" ".join(mine), run=run, words=words, settings=settings)
+    return list(cells.values())

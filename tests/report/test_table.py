@@ -1,0 +1,142 @@
+"""Several runs in one table."""
+
+import dataclasses
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from runs import CONFIG, row, write
+
+from swarmjax import command
+from swarmjax.report import __main__ as report
+from swarmjax.report import table
+from swarmjax.report.config import ReportConfig
+from swarmjax.run.settings import RunConfig, TrainConfig
+
+MORE = dataclasses.replace(CONFIG, algo=dataclasses.replace(CONFIG.algo, epochs=3))
+
+
+def _rows(*success: float | None, first: int = 0) -> list[dict]:
+    """Two updates of a seed for each success of the last stage."""
+    return [
+        row(update, first + seed, success_by_stage=[0.9, each if update else None])
+        for update in (0, 1)
+        for seed, each in enumerate(success)
+    ]
+
+
+def _array(folder: Path, jobs: list[list[float]], trained: TrainConfig = CONFIG) -> Path:
+    """Writes what an array of jobs does: some seeds each, a folder each."""
+    for job, success in enumerate(jobs):
+        first = job * len(success)
+        config = dataclasses.replace(
+            trained, seed=first, seeds=len(success), run=RunConfig(dir=str(folder / str(job)))
+        )
+        write(folder / str(job), _rows(*success, first=first), trained=config)
+    return folder
+
+
+def test_seeds_of_an_array_are_one_line(tmp_path: Path) -> None:
+    folder = _array(tmp_path / "mine", [[0.5, 0.6], [0.7, 0.8], [0.9, 1.0]])
+    (line,) = table.read(table.find(str(folder)))
+    assert line.seeds.tolist() == [0, 1, 2, 3, 4, 5]
+    np.testing.assert_allclose(line.success, [0.5, 0.6, 0.7, 0.8, 0.9, 1.0], rtol=1e-6)
+    assert line.mean == pytest.approx(0.75)
+    assert line.interval is not None
+    low, high = line.interval
+    assert 0.5 < low < 0.75 < high < 1.0
+    assert line.train_s == 180.0
+    assert line.updates == (2, 20)
+    assert line.stage == "trio"
+    assert line.settings == ""
+
+
+def test_seeds_on_devices_are_counted_with_seeds_of_one_device(tmp_path: Path) -> None:
+    _array(tmp_path / "one", [[0.5, 0.6]])
+    spread = dataclasses.replace(CONFIG, seed=2, seeds=2, devices=2, seeds_by="devices")
+    write(tmp_path / "two", _rows(0.7, 0.8, first=2), trained=spread)
+    (line,) = table.read(table.find(f"{tmp_path}/one,{tmp_path}/two"))
+    assert line.seeds.tolist() == [0, 1, 2, 3]
+
+
+def test_cells_of_a_sweep_are_a_line_each(tmp_path: Path) -> None:
+    for cell, trained in {"a": CONFIG, "b": MORE}.items():
+        write(tmp_path / cell, _rows(0.5, 0.6), trained=dataclasses.replace(trained, seeds=2))
+    lines = table.read(table.find(str(tmp_path)))
+    assert [line.settings for line in lines] == ["algo.epochs=1", "algo.epochs=3"]
+    assert [line.interval for line in lines] == [None, None]
+
+
+def test_stages_are_told_apart_by_their_name(tmp_path: Path) -> None:
+    pair = dataclasses.replace(CONFIG, stage=CONFIG.stage[:1], stage_name="")
+    write(tmp_path / "a", [row(0)])
+    short = ("mix", "weights", *(key for key in row(0) if key.endswith("_by_stage")))
+    write(tmp_path / "b", [row(0) | {key: row(0)[key][:1] for key in short}], trained=pair)
+    lines = table.read(table.find(str(tmp_path)))
+    assert [line.settings for line in lines] == ["stage=pair-trio", "stage=pair"]
+
+
+def test_runs_of_other_budgets_are_not_one_line(tmp_path: Path) -> None:
+    write(tmp_path / "a", _rows(0.5))
+    longer = dataclasses.replace(CONFIG, budget=2 * CONFIG.budget, seed=1)
+    write(tmp_path / "b", _rows(0.6, first=1), trained=longer)
+    lines = table.read(table.find(str(tmp_path)))
+    assert [line.settings for line in lines] == ["budget=1280", "budget=2560"]
+
+
+def test_a_pattern_finds_runs_and_folders_of_them(tmp_path: Path) -> None:
+    _array(tmp_path / "mine", [[0.5], [0.6]])
+    write(tmp_path / "mean", _rows(0.7, first=7))
+    (tmp_path / "notes").mkdir()
+    found = table.find(f"{tmp_path}/*")
+    assert [str(run.relative_to(tmp_path)) for run in found] == ["mean", "mine/0", "mine/1"]
+
+
+def test_a_run_that_has_not_begun_is_left_out_of_its_folder(tmp_path: Path) -> None:
+    folder = _array(tmp_path / "mine", [[0.5], [0.6]])
+    write(folder / "2", [])
+    assert len(table.find(str(folder))) == 2
+    assert len(table.find(str(folder / "2"))) == 1
+
+
+def test_a_seed_that_was_not_measured_has_no_part_in_the_mean(tmp_path: Path) -> None:
+    (line,) = table.read([write(tmp_path, _rows(0.5, None, 0.7))])
+    assert line.mean == pytest.approx(0.6)
+    assert line.interval is None
+    assert table.cells([line])[0][4] == "3, 2 measured"
+    (none,) = table.read([write(tmp_path, _rows(None))])
+    assert math.isnan(none.mean)
+    assert table.plain([none])[0]["mean"] is None
+
+
+def test_a_run_that_decides_by_whole_episodes_is_measured_by_them(tmp_path: Path) -> None:
+    curriculum = dataclasses.replace(CONFIG.curriculum, success="all")
+    given = row(0, success_by_stage=[0.9, 0.8], complete_by_stage=[0.3, 0.2])
+    trained = dataclasses.replace(CONFIG, curriculum=curriculum)
+    (line,) = table.read([write(tmp_path, [given], trained=trained)])
+    assert line.mean == pytest.approx(0.2)
+    assert "Success: episodes in which all arrived on the last stage" in table.text([line])
+
+
+def test_the_command_prints_the_table_and_writes_it_where_it_is_wanted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = _array(tmp_path / "<mine>", [[0.5, 0.6], [0.7, 0.8]])
+    out = tmp_path / "out"
+    monkeypatch.setattr(sys, "argv", ["report", f"runs={folder}", f"out={out}"])
+    assert command.run("report", report.main, ReportConfig) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0].split()[:3] == ["runs", "settings", "last"]
+    assert printed[1].startswith(f"2 in {folder}")
+    assert "65.0 %" in printed[1]
+    page = (out / "report.html").read_text()
+    assert "&lt;mine&gt;" in page
+    assert "<mine>" not in page
+    (found,) = json.loads((out / "report.json").read_text())
+    assert found["seeds"] == [0, 1, 2, 3]
+    assert found["interval"][0] < 0.65 < found["interval"][1]
+    assert found["budget_spent"] is False
+    assert not (folder / "report").exists()

@@ -1,0 +1,111 @@
+"""A grid of settings multiplied out."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from swarmjax.config import ConfigError
+from swarmjax.run import grid
+
+
+def test_a_cell_is_a_combination_of_values(tmp_path: Path) -> None:
+    cells = grid.multiply(tmp_path, ["grid.algo.epochs=1,2", "seeds=5", "grid.arenas=64,128"])
+    assert [cell.label for cell in cells] == [
+        "algo.epochs=1 arenas=64",
+        "algo.epochs=1 arenas=128",
+        "algo.epochs=2 arenas=64",
+        "algo.epochs=2 arenas=128",
+    ]
+    assert cells[0].run.name == "algo.epochs=1_arenas=64"
+    assert cells[3].words == (
+        *("seeds=5", "algo.epochs=2", "arenas=128"),
+        *("resume=auto", f"run.dir={cells[3].run}"),
+    )
+    last = cells[3].settings
+    assert (last.algo.epochs, last.arenas, last.seeds) == (2, 128, 5)
+    assert last.run.dir == str(cells[3].run)
+
+
+@pytest.mark.parametrize(
+    ("word", "labels", "folders"),
+    [
+        ("grid.algo.epochs=3", ["algo.epochs=3"], ["algo.epochs=3"]),
+        (
+            "grid.algo.hidden_sizes=[8],[8,4]",
+            ["algo.hidden_sizes=[8]", "algo.hidden_sizes=[8,4]"],
+            ["algo.hidden_sizes=8", "algo.hidden_sizes=8-4"],
+        ),
+        ("grid.seed=range(0,4,2)", ["seed=0", "seed=2"], ["seed=0", "seed=2"]),
+        ("grid.stage=s1,s6", ["stage=s1", "stage=s6"], ["stage=s1", "stage=s6"]),
+        (
+            "grid.algo.actor_learning_rate=1e-4,0.001",
+            ["algo.actor_learning_rate=0.0001", "algo.actor_learning_rate=0.001"],
+            ["algo.actor_learning_rate=0.0001", "algo.actor_learning_rate=0.001"],
+        ),
+    ],
+)
+def test_values_are_read_as_hydra_does(
+    word: str, labels: list[str], folders: list[str], tmp_path: Path
+) -> None:
+    cells = grid.multiply(tmp_path, [word])
+    assert [cell.label for cell in cells] == labels
+    assert [cell.run.name for cell in cells] == folders
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ([], "the grid is empty: give values, as in grid.algo.epochs=1,2."),
+        (["arenas=64"], "the grid is empty: give values, as in grid.algo.epochs=1,2."),
+        (["grid.arenas="], "arenas is '': give a whole number."),
+        (["grid.algo.epocs=1,2"], "algo.epocs is not a key: did you mean algo.epochs?"),
+        (["grid.nothing=1,2"], "nothing is not a key: "),
+        (["grid.=1,2"], "'=1,2' is not a setting: give key=value."),
+        (["grid.seed"], "'grid.seed' is not a setting: give key=value."),
+        (["grid.seed=1,2", "seds=2"], "seds is not a key: did you mean seeds?"),
+        (["grid.seed=range(300)"], "the grid has more than 256 cells: give fewer values."),
+        (["grid.seed=range(1,2000000000)"], "the grid has more than 256 cells: give fewer values."),
+        (
+            ["grid.seed=range(20)", "grid.budget=range(20)"],
+            "the grid has more than 256 cells: give fewer values.",
+        ),
+        (["grid.seed=1,1"], "two cells of the grid would be DIR/seed=1: give values that differ."),
+        (["grid.seed=[1,2"], "grid.seed is '[1,2', which cannot be read: give values with commas"),
+        (["grid.seed=" + "1," * 3000], "seed is '1,1,1,"),
+        (["grid.run.dir=a,b"], "grid.run.dir cannot be given: each cell of the grid has its own."),
+        (
+            ["grid.seed=1,2", "resume=a"],
+            "resume cannot be given: each cell of the grid has its own.",
+        ),
+        (
+            ["grid.arenas=64,65"],
+            "arenas is 65, but algo.num_minibatches is 8: give a multiple of 8.",
+        ),
+    ],
+)
+def test_what_is_no_grid_is_refused(words: list[str], sentence: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as caught:
+        grid.multiply(tmp_path, words)
+    assert str(caught.value).replace(str(tmp_path), "DIR").startswith(sentence)
+
+
+@pytest.mark.parametrize(
+    ("summary", "done"),
+    [
+        (None, False),
+        ({"budget_spent": True, "updates": 488}, True),
+        ({"budget_spent": True, "updates": 487}, False),
+        ({"budget_spent": False, "updates": 488}, False),
+        ([1], False),
+    ],
+)
+def test_a_cell_is_done_when_its_budget_is_spent(
+    summary: object, done: bool, tmp_path: Path
+) -> None:
+    (cell,) = grid.multiply(tmp_path, ["grid.arenas=64", "stage=s1", "budget=999424"])
+    assert cell.settings.updates == 488
+    cell.run.mkdir()
+    if summary is not None:
+        (cell.run / "summary.json").write_text(json.dumps(summary))
+    assert cell.is_done is done
