@@ -23,7 +23,7 @@ import numpy as np
 from swarmjax.exit_codes import REQUEUE
 from swarmjax.run import directory
 
-UPDATES = 1000
+UPDATES = 400
 WORDS = (
     "stage=s1",
     "arenas=64",
@@ -60,6 +60,7 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
         "outcome": "ok" if sound else "WRONG",
         "victim": victim,
         "goes_on_with": devices,
+        "updates": UPDATES,
         "updates_at_the_kill": lost.updates,
         "code": lost.code,
         "seconds_until_the_other_ended": round(lost.seconds, 2),
