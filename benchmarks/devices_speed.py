@@ -83,10 +83,9 @@ def result(given: DevicesConfig, one: TrainConfig, every: TrainConfig) -> dict[s
     return {
         "benchmark": "devices_speed",
         "scaling": given.scaling,
-        "devices": devices,
         "processes": hosts.count(),
         **about_run(one),
-        "arenas": one.arenas,
+        "devices": devices,
         "arenas_in_all": every.arenas,
         "updates": updates,
         "pairs": PAIRS,

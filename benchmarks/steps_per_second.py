@@ -197,6 +197,7 @@ def about(settings: TrainConfig, impl: str | None = None) -> dict[str, Any]:
         "solver": settings.sim.solver,
         "impl": dispatch.resolve_impl(settings.sim.impl) if impl is None else impl,
         "arenas": settings.arenas,
+        "devices": settings.devices,
         "seeds": settings.seeds,
         "robots": settings.stage[-1].robots,
         "obstacles": settings.stage[-1].obstacles,

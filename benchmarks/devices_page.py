@@ -1,0 +1,188 @@
+"""Writes docs/scaling.md: what several devices gain, and what a model of it predicts for more.
+
+`python -m benchmarks.devices_page [lines=benchmarks/results/devices.jsonl] [docs=docs]` writes the
+tables between the page's markers, and the plot `figures/devices.png`. It takes the newest line of
+each comparison that `benchmarks.devices_speed` printed, and those of `benchmarks.all_reduce`.
+
+The model of an update on N devices of equal share: the time of one device, and for each sum over
+devices its latency. Within a host that is measured; between hosts it grows with the logarithm of
+their number. Devices wait for the slowest one; with times that vary normally around their mean the
+expected slowest of N is `EXPECTED_MAX[N]` deviations above it (Harter 1961, "Expected values of
+normal order statistics", table 1, for 2 and 8; simulated for 64 and 512).
+"""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import ceil, log2
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+from benchmarks import key_value, pages
+from swarmjax import command
+from swarmjax.config import ConfigError, Section, about
+
+mpl.use("Agg")
+Line = dict[str, Any]
+PAGE, FIGURE = "scaling.md", "figures/devices.png"
+EXPECTED_MAX = {1: 0.0, 2: 0.564, 8: 1.424, 64: 2.34, 512: 3.05}
+# Sums of an update: one for each of 8 minibatches, and 5 for advantages, observations and tallies,
+# as the compiled program has them. The lines stored have 8 more, since merged.
+REDUCES, REDUCES_MEASURED = 13, 21
+_HOST = 8  # devices of a host
+_HOP_US = 15.0  # that a doubling of hosts adds to a sum; assumed, not measured
+_ROLLOUT = 32  # control steps of an update, the default
+_MESSAGE = 65_536  # bytes: networks of 40 kB, rounded up to a size that was timed
+
+
+@dataclass(frozen=True, kw_only=True)
+class PageConfig(Section):
+    """Where the figures come from, and where they go."""
+
+    lines: str = field(
+        default="benchmarks/results/devices.jsonl", metadata=about("file of JSON lines")
+    )
+    docs: str = field(default="docs", metadata=about(f"folder of {PAGE}"))
+
+
+def update_ms(line: Line, devices: int) -> float:
+    """Milliseconds of an update, of one device or of all that a line compares."""
+    one = devices == 1
+    steps = line["arenas"] if one else line["arenas_in_all"]
+    speed = line["arena_steps_per_s_of_one"] if one else line["arena_steps_per_s"]
+    return 1e3 * steps * _ROLLOUT / speed
+
+
+def sum_us(devices: int, measured_us: float) -> float:
+    """Microseconds of a sum over devices.
+
+    Args:
+      devices: N, in hosts of 8.
+      measured_us: of two devices of one host.
+    """
+    return measured_us + _HOP_US * log2(ceil(devices / _HOST))
+
+
+def predict(one_ms: float, devices: int, measured_us: float, deviation_ms: float) -> float:
+    """Predicts the weak efficiency of N devices, 0..1.
+
+    Args:
+      one_ms: of an update of one device.
+      devices: N, a key of `EXPECTED_MAX`.
+      measured_us: of a sum over two devices of one host.
+      deviation_ms: by which updates of devices differ.
+    """
+    if devices == 1:
+        return 1.0
+    waiting = EXPECTED_MAX[devices] * deviation_ms
+    return one_ms / (one_ms + REDUCES * sum_us(devices, measured_us) * 1e-3 + waiting)
+
+
+def deviation_ms(line: Line, measured_us: float) -> float:
+    """Takes what two devices lose beyond their sums for waiting; 0 if they lose less.
+
+    Args:
+      line: of a weak comparison of two devices.
+      measured_us: of a sum.
+    """
+    lost = update_ms(line, 2) - update_ms(line, 1) - REDUCES_MEASURED * measured_us * 1e-3
+    return max(0.0, lost) / EXPECTED_MAX[2]
+
+
+def measured_table(lines: Sequence[Line]) -> str:
+    """Makes the table of what was measured."""
+    rows = [
+        "| robots | scaling | processes | arenas, one and two devices | update, ms, one and two "
+        "| million arena steps/s, one and two | efficiency |",
+        "|---|---|--:|--:|--:|--:|---|",
+    ]
+    for line in lines:
+        middle, low, high = (f"{100 * value:.1f}" for value in line["efficiency"])
+        speeds = (line["arena_steps_per_s_of_one"], line["arena_steps_per_s"])
+        one, two = (f"{speed / 1e6:.2f}" for speed in speeds)
+        times = f"{update_ms(line, 1):.1f}, {update_ms(line, 2):.1f}"
+        arenas = f"{line['arenas']:,}, {line['arenas_in_all']:,}"
+        rows.append(
+            f"| {line['robot']} | {line['scaling']} | {line['processes']} | {arenas} | {times} "
+            f"| {one}, {two} | {middle} % [{low}, {high}] |"
+        )
+    return "\n".join(rows) + "\n"
+
+
+def model_table(lines: Sequence[Line], measured_us: float) -> str:
+    """Makes the table of what the model predicts."""
+    rows = ["| robots | arenas a device | 2, measured | 2 | 8 | 64 | 512 |", "|---" * 7 + "|"]
+    for line in (line for line in lines if line["scaling"] == "weak"):
+        found = _predictions(line, measured_us)
+        cells = " | ".join(f"{100 * found[n]:.0f} %" for n in (2, 8, 64, 512))
+        label = line["robot"] + (", two processes" if line["processes"] == 2 else "")
+        measured = f"{100 * line['efficiency'][0]:.0f} %"
+        rows.append(f"| {label} | {line['arenas']:,} | {measured} | {cells} |")
+    return "\n".join(rows) + "\n"
+
+
+def _predictions(line: Line, measured_us: float) -> dict[int, float]:
+    spread, one = deviation_ms(line, measured_us), update_ms(line, 1)
+    return {n: predict(one, n, measured_us, spread) for n in EXPECTED_MAX}
+
+
+def draw(lines: Sequence[Line], measured_us: float) -> Figure:
+    """Draws the efficiency that was measured, and the model's curves."""
+    plot = Figure(figsize=(7.0, 4.0), layout="constrained")
+    axes = plot.subplots()
+    axes.grid(visible=True, alpha=0.3)
+    for number, line in enumerate(line for line in lines if line["scaling"] == "weak"):
+        found, colour = _predictions(line, measured_us), f"C{number}"
+        several = ", two processes" if line["processes"] == 2 else ""
+        label = f"{line['robot']}, {line['arenas']:,} arenas a device{several}"
+        axes.plot([*found], [100 * y for y in found.values()], "--", color=colour, label=label)
+        middle, low, high = (100 * value for value in line["efficiency"])
+        bars = [[middle - low], [high - middle]]
+        axes.errorbar([2], [middle], bars, fmt="o", color=colour, capsize=3)
+    axes.set_xscale("log", base=2)
+    axes.set_xlabel("devices (dots: measured; dashes: model)")
+    axes.set_ylabel("weak efficiency, %")
+    axes.set_ylim(70, 108)
+    axes.legend(fontsize=8)
+    return plot
+
+
+def write(lines: Sequence[Line], docs: Path) -> None:
+    """Writes the tables and the plot.
+
+    Raises:
+      ConfigError: if the page or a line that it needs is missing.
+    """
+    found = [line for line in lines if line["benchmark"] == "devices_speed"]
+    sums = {line["bytes"]: line["microseconds"] for line in lines if "microseconds" in line}
+    page = docs / PAGE
+    if not found or _MESSAGE not in sums or not page.exists():
+        raise ConfigError(
+            f"lines need some of devices_speed and all_reduce's of {_MESSAGE} bytes, and docs a "
+            f"{PAGE}: give other lines or docs."
+        )
+    text = pages.insert(page.read_text(), PAGE, "measured", measured_table(found))
+    text = pages.insert(text, PAGE, "model", model_table(found, sums[_MESSAGE]))
+    page.write_text(text)
+    plot = draw(found, sums[_MESSAGE])
+    # Without the version of Matplotlib, so that the same plot is the same file.
+    plot.savefig(docs / FIGURE, dpi=90, metadata={"Software": None})
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    given = key_value.load(PageConfig, arguments)
+    try:
+        lines = [json.loads(line) for line in Path(given.lines).read_text().splitlines()]
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"lines is {given.lines}, which cannot be read: {error}.") from None
+    write(lines, Path(given.docs))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("devices_page", main, PageConfig))
