@@ -75,7 +75,8 @@ def _train(run: Path, settings: TrainConfig, stop: Stop) -> int:
         with Display(settings.updates) as display:
             tally = carry_out(settings, run, stop, display)
     except TrainingError as error:
-        sys.stderr.write(f"swarmjax.train: error: {error} What was saved before is in {run}.\n")
+        kept = f" What was saved before is in {run}." if checkpoint.steps(run) else ""
+        sys.stderr.write(f"swarmjax.train: error: {error}{kept}\n")
         return FAILED
     _tell(f"{_success(settings, tally)}\n{_closing(run, settings, tally)}\n")
     return stop.code or 0
