@@ -278,6 +278,15 @@ def test_two_processes_do_not_write_one_run(tmp_path: Path) -> None:
         first.communicate()
 
 
+def test_two_new_runs_do_not_begin_in_one_directory(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    with directory.locked(run):  # as by a run that still compiles, and has written nothing else
+        assert os.listdir(run) == [LOCK]
+        with pytest.raises(ConfigError, match=f"process {os.getpid()} is writing"):
+            train.main([*TINY, f"run.dir={run}"])
+    assert train.main([*TINY, f"run.dir={run}", "run.stop_after=1"]) == 0
+
+
 def _full(monkeypatch: pytest.MonkeyPatch, after: int) -> None:
     """Lets a disk be full after some rows."""
     write, left = directory.Log.write, [after]
