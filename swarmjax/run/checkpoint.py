@@ -43,6 +43,7 @@ _OLD_META = {"digest", "update"}  # all that checkpoints held before they were b
 # In each step: the SHA-256 of its files. Given damaged files Orbax fails too, but it prints the
 # tracebacks of its threads as well.
 _MANIFEST = "files.json"
+_REMOVAL = 0.5  # s, which removing a directory may take from its checkpoints to its config
 _UNFINISHED = "*.orbax-checkpoint-tmp*"  # what Orbax renames when it is whole
 
 
@@ -111,6 +112,7 @@ class Checkpoints:
         """
         self._run, self._keep = run, keep
         self._folder = (run / FOLDER).resolve()
+        self._binding = binding(run)
         self._thread = ThreadPoolExecutor(1)
         self._pending: Future[None] | None = None
         self.write_seconds = 0.0
@@ -129,10 +131,6 @@ class Checkpoints:
         _quieten()
         self._folder.mkdir(parents=True, exist_ok=True)
         return ocp.CheckpointManager(self._folder, options=_options())
-
-    @functools.cached_property
-    def _binding(self) -> Binding | None:
-        return binding(self._run)
 
     def save(
         self,
@@ -179,14 +177,26 @@ class Checkpoints:
     def _write(self, leaves: Leaves, meta: dict[str, Any], told: directory.Row) -> None:
         update, began = meta["update"], time.perf_counter()
         try:
+            if self._is_gone():  # Orbax would make another directory, without a config
+                raise FileNotFoundError
             if _is_sound(leaves) and update not in self._manager.all_steps():
                 self._write_step(leaves, meta, told)
         except Exception as error:  # of any type that Orbax raises on a full disk
-            gone = self._binding is not None and binding(self._run) is None
-            why = f"{self._run} was removed" if gone else _why(error)
+            why = self._why(error)
             raise TrainingError(f"checkpoint {update} cannot be written: {why}.") from None
         heap.release()
         self.write_seconds = time.perf_counter() - began
+
+    def _is_gone(self) -> bool:
+        """Tells whether somebody removed the directory of the run."""
+        return self._binding is not None and not (self._run / directory.CONFIG).exists()
+
+    def _why(self, error: Exception) -> str:
+        """Says why a checkpoint could not be written."""
+        why = _why(error)
+        if not self._is_gone() and why != os.strerror(errno.ENOSPC):
+            time.sleep(_REMOVAL)
+        return f"{self._run} was removed" if self._is_gone() else why
 
     def _write_step(self, leaves: Leaves, meta: dict[str, Any], told: directory.Row) -> None:
         import orbax.checkpoint as ocp

@@ -10,7 +10,7 @@ import jax
 from swarmjax import command, words
 from swarmjax.config import ConfigError
 from swarmjax.exit_codes import FAILED, INTERRUPTED, REQUEUE, USER_ERROR
-from swarmjax.run import checkpoint, compile_cache, hosts, memory
+from swarmjax.run import checkpoint, compile_cache, directory, hosts, memory
 from swarmjax.run.display import Display, measured, spread, working
 from swarmjax.run.errors import CheckpointError, LostPeerError, TrainingError
 from swarmjax.run.lifecycle import carry_out, dry_run, find_run
@@ -75,7 +75,9 @@ def _train(run: Path, settings: TrainConfig, stop: Stop) -> int:
         with Display(settings.updates) as display:
             tally = carry_out(settings, run, stop, display)
     except TrainingError as error:
-        sys.stderr.write(f"swarmjax.train: error: {error} What was saved before is in {run}.\n")
+        can_go_on = (run / directory.CONFIG).exists() and checkpoint.steps(run)
+        kept = f" What was saved before is in {run}." if can_go_on else ""
+        sys.stderr.write(f"swarmjax.train: error: {error}{kept}\n")
         return FAILED
     _tell(f"{_success(settings, tally)}\n{_closing(run, settings, tally)}\n")
     return stop.code or 0

@@ -264,6 +264,36 @@ def test_a_disk_that_is_full_is_one_sentence(tmp_path: Path) -> None:
     assert done.stderr == ""
 
 
+# Looks for the newest sound checkpoint.
+_FIND = """
+import sys
+from pathlib import Path
+from swarmjax.run import checkpoint
+try:
+    print(checkpoint.restore(Path(sys.argv[1]))[2])
+except checkpoint.CheckpointError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("damaged", [[2], [1, 2]])
+def test_orbax_says_nothing_beside_our_sentence(tmp_path: Path, damaged: list[int]) -> None:
+    _save(tmp_path, 1, 2)
+    for update in damaged:
+        (_steps(tmp_path) / f"{update}" / "files.json").unlink(missing_ok=True)  # as before them
+        for file in (_steps(tmp_path) / f"{update}" / "state" / "d").iterdir():
+            file.write_bytes(b"")
+    done = subprocess.run(
+        [sys.executable, "-c", _FIND, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert "checkpoint 2" in done.stdout
+    assert done.stdout.count("\n") == 1
+    assert done.stderr == ""
+
+
 def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise ValueError(f"RESOURCE_EXHAUSTED: {'x' * 300} [OS error 28: No space left on device]")

@@ -3,6 +3,7 @@
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -77,3 +78,13 @@ def test_a_stop_has_a_time_of_its_own() -> None:
     over = Stop(until=time.monotonic())
     assert over.asked
     assert not over.signalled
+
+
+def test_a_call_of_all_updates_lasts_ten_seconds_so_that_a_signal_is_heard() -> None:
+    settings = load_train(["stage=s1", "arenas=32", f"budget={900 * 32 * 32}", "run.chunk=all"])
+    program: Any = SimpleNamespace(config=settings, rows=settings.updates)
+    tally = trainer.Tally(0, 0, 0.0, {}, {}, seconds=0.0)
+    calls = trainer._calls(program, tally, Stop())
+    tally.update = next(calls)
+    tally.seconds = 1.0 * tally.update
+    assert next(calls) == 10
