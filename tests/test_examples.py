@@ -1,5 +1,6 @@
 """The examples run as they are written, in a folder of their own."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -29,3 +30,24 @@ def test_own_pieces_are_trained_with_and_judged(tmp_path: Path) -> None:
     said = _run(tmp_path, "train_own_pieces.py", "4096")
     assert said.splitlines()[-1].endswith(" % of the targets on ring")
     assert len(list(tmp_path.glob("runs/*/policy.npz"))) == 1
+
+
+def test_an_arena_drawn_as_text_is_trained_and_judged(tmp_path: Path) -> None:
+    words = ["arenas=8", "algo.num_minibatches=2", "budget=2048", "run.tensorboard=false"]
+    stage = extensions.EXAMPLES / "two_rooms.yaml"
+    _command(tmp_path, "train", f"stage={stage}", *words, "run.dir=run")
+    said = _command(tmp_path, "evaluate", "policy=run/policy.npz", "episodes=1", "workers=1")
+    assert "stage two_rooms" in said
+
+
+def _command(tmp_path: Path, name: str, *words: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", f"swarmjax.{name}", *words],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": str(extensions.EXAMPLES.parent)},
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout + done.stderr

@@ -21,7 +21,7 @@ from swarmjax.sim import gaps as sim_gaps
 from swarmjax.sim.config import RobotConfig, SimConfig, physics_substeps
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import electronics as task_electronics
-from swarmjax.task import extended, observation, pieces, reward
+from swarmjax.task import extended, observation, pieces, reward, room
 from swarmjax.task import factors as task_factors
 from swarmjax.task import stage as task_stage
 from swarmjax.task.config import TaskConfig
@@ -149,6 +149,7 @@ def load(
     extended.check(chosen, robots=sim.robots, obstacles=sim.obstacles)
     size = model.ArenaSize(sim.robots, sim.obstacles, task_stage.largest_half(stages))
     spacing = Spacing(*size[:2], robot.hull_radius, task.target_radius)
+    room.check(stages, spacing, chosen.drawings)
     if chosen.drawings:
         drawn = task_stage.stack(stages, chosen.drawings)
         names = [stage.name for stage in stages]

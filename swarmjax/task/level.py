@@ -4,6 +4,7 @@ Code takes the array module, so that NumPy and JAX draw the same level from the 
 """
 
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,12 +12,15 @@ import numpy as np
 from swarmjax.sim import noise
 from swarmjax.sim.noise import Stream
 from swarmjax.task import fixed_level
+from swarmjax.task.maps import MapArrays
 from swarmjax.task.placement import (
     UNITS,
     Gap,
     lattice,
     metres,
     place,
+    score_open,
+    score_rectangles,
     score_things,
     score_walls,
     units,
@@ -117,8 +121,12 @@ def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     drawn = _split(uniforms, spacing)
     random = _random(drawn, stage, spacing, xp)
     fixed = _fixed(drawn, stage, spacing, xp)
-    level = [xp.where(stage.fixed, f, r) for f, r in zip(fixed, random, strict=True)]
-    return park(Level(*level), xp)
+    level = Level(*(xp.where(stage.fixed, f, r) for f, r in zip(fixed, random, strict=True)))
+    if stage.map is not None:
+        mapped = _mapped(drawn, stage, stage.map, spacing, xp)
+        choose = partial(xp.where, stage.map.mapped)
+        level = Level(*(choose(m, other) for m, other in zip(mapped, level, strict=True)))
+    return park(level, xp)
 
 
 def _split(uniforms: Array, spacing: Spacing) -> _Uniforms:
@@ -193,9 +201,7 @@ def _place_targets(
         # A robot parked on this side of its target, and another one passing behind it.
         around.radius + _units(reach + 3.0 * hull),
     )
-    # Two robots parked on the near sides of their targets let a third one through.
-    through = max(TARGET_SPACING, 2.0 * reach + 4.0 * hull)
-    apart = Gap(_units(2.0 * hull + 2.0 * MARGIN), _units(through))
+    apart = _gaps(hull, reach).target
     points = lattice(drawn.target_shift, side, xp)
     score = score_walls(points, side, _units(hull + MARGIN), xp)
     score = xp.minimum(score, score_things(points, around.centre, around.there, beside, xp))
@@ -214,15 +220,33 @@ def _place_starts(
     """Places starts clear of everything that is or may come to be there; returns [R, 2] units."""
     hull, reach = spacing.hull_radius, spacing.target_radius
     beside = _units(hull + MARGIN) + around.radius
-    # No robot starts where it has arrived already; better, none starts where another may park.
-    from_target = Gap(_units(reach + MARGIN), _units(reach + 2.0 * hull + MARGIN))
-    apart = Gap(_units(2.0 * hull + MARGIN), _units(2.0 * hull + 2.0 * MARGIN))
+    _, from_target, apart = _gaps(hull, reach)
     points = lattice(drawn.start_shift, side, xp)
     score = score_walls(points, side, _units(hull + MARGIN), xp)
     walled = score_things(points, around.centre, around.there, Gap(beside, beside), xp)
     clear = score_things(points, target, present, from_target, xp)
     score = xp.minimum(score, xp.minimum(walled, clear))
     return place(points, score, drawn.start, present, apart, xp)[0]
+
+
+class _Gaps(NamedTuple):
+    """Distances between targets, from starts to targets, and between starts."""
+
+    target: Gap
+    from_target: Gap
+    start: Gap
+
+
+def _gaps(hull: float, reach: float) -> _Gaps:
+    """Works the distances out, of a hull's radius and of that of the arrival zone, m."""
+    # Two robots parked on the near sides of their targets let a third one through.
+    through = max(TARGET_SPACING, 2.0 * reach + 4.0 * hull)
+    return _Gaps(
+        target=Gap(_units(2.0 * hull + 2.0 * MARGIN), _units(through)),
+        # No robot starts where it has arrived already; better, none starts where another may park.
+        from_target=Gap(_units(reach + MARGIN), _units(reach + 2.0 * hull + MARGIN)),
+        start=Gap(_units(2.0 * hull + MARGIN), _units(2.0 * hull + 2.0 * MARGIN)),
+    )
 
 
 def _fixed(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
@@ -237,6 +261,70 @@ def _fixed(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
         obstacle=fixed_level.obstacles(spacing.obstacles, stage.side, stage.fence, xp),
         seed=_seed(drawn, xp),
     )
+
+
+def _mapped(drawn: _Uniforms, stage: Stage, arena: MapArrays, spacing: Spacing, xp: Any) -> Level:
+    """Draws targets and starts in the areas of a map; robots with letters come first."""
+    present = xp.arange(spacing.robots) < stage.robots
+    paired = present & (xp.arange(spacing.robots) < arena.pairs)
+    pair = _rows(arena.pair, spacing.robots, xp)
+    hull, reach = spacing.hull_radius, spacing.target_radius
+    score = partial(_score_on_map, stage, arena, spacing, xp)
+    target_apart, from_target, start_apart = _gaps(hull, reach)
+    among = partial(_place_among, present=present, paired=paired, xp=xp)
+    free = score(arena.target, arena.target_open)
+    target = among(arena.target, free, pair[:, 1], target_apart, drawn.target)
+    clear = score_things(arena.start, target, present, from_target, xp)
+    free = xp.minimum(score(arena.start, arena.start_open), clear)
+    start = among(arena.start, free, pair[:, 0], start_apart, drawn.start)
+    yaw = (drawn.heading * 2.0 - 1.0) * np.float32(math.pi)
+    wall = _rows(arena.wall, spacing.obstacles, xp)
+    there = xp.arange(spacing.obstacles) < stage.obstacles
+    return Level(
+        side=stage.side,
+        present=present,
+        start=xp.concatenate([metres(start, xp), yaw[:, None]], axis=-1),
+        target=metres(target, xp),
+        obstacle_present=there,
+        obstacle=xp.where(there[:, None], wall, np.float32(0.5) * stage.obstacle_size),
+        seed=_seed(drawn, xp),
+    )
+
+
+def _score_on_map(
+    stage: Stage, arena: MapArrays, spacing: Spacing, xp: Any, points: Array, is_open: Array
+) -> Array:
+    """Scores the points of an area by whether a robot has room there, [P]."""
+    gap = _units(spacing.hull_radius + MARGIN)
+    there = xp.arange(arena.wall.shape[0]) < stage.obstacles
+    rectangle = units(arena.wall[:, np.array([0, 1, 3, 4])], xp)
+    beside = score_rectangles(points, rectangle, there, gap, xp)
+    within = score_walls(points, units(stage.side, xp), gap, xp)
+    return xp.minimum(score_open(points, is_open, xp), xp.minimum(beside, within))
+
+
+def _place_among(
+    points: Array,
+    score: Array,
+    fixed: Array,
+    gap: Gap,
+    picks: Array,
+    *,
+    present: Array,
+    paired: Array,
+    xp: Any,
+) -> Array:
+    """Places what has no place of its own [R, 2] (units) yet, clear of what has."""
+    score = xp.minimum(score, score_things(points, fixed, paired, gap, xp))
+    placed, _ = place(points, score, picks, present & ~paired, gap, xp)
+    return xp.where(paired[:, None], fixed, placed)
+
+
+def _rows(array: Array, count: int, xp: Any) -> Array:
+    """Cuts an array to so many rows, or adds rows of zeros."""
+    lacking = max(0, count - array.shape[0])
+    zeros = xp.zeros((lacking, *array.shape[1:]), array.dtype)
+    return xp.concatenate([array[:count], zeros])
 
 
 def park(level: Level, xp: Any) -> Level:

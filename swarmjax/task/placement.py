@@ -92,6 +92,40 @@ def score_things(points: Array, centres: Array, there: Array, gap: Gap, xp: Any)
     return xp.min(xp.where(there, worst, 0), axis=-1, initial=0)
 
 
+def score_open(points: Array, is_open: Array, xp: Any) -> Array:
+    """Scores points by whether they may be used.
+
+    Args:
+      points: [P, 2] units.
+      is_open: [P] bool.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [P] 0 where a point is open, far below where it is not.
+    """
+    return xp.where(is_open, 0, _FORBIDDEN + 0 * points[:, 0])
+
+
+def score_rectangles(points: Array, rectangle: Array, there: Array, gap: int, xp: Any) -> Array:
+    """Scores points by their distances to rectangles that are not turned, a hard one.
+
+    Args:
+      points: [P, 2] units.
+      rectangle: [W, 4] x, y, half edges, units.
+      there: [W] whether the rectangle counts.
+      gap: least distance, units.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [P] 0 where all distances are kept, far below where one is not.
+    """
+    apart = xp.abs(points[:, None, :] - rectangle[None, :, :2]) - rectangle[None, :, 2:]
+    apart = xp.maximum(apart, 0)
+    square = xp.sum(apart * apart, axis=-1)
+    score = xp.where(square < gap * gap, _FORBIDDEN + square, 0)
+    return xp.min(xp.where(there, score, 0), axis=-1)
+
+
 def place(
     points: Array, score: Array, picks: Array, there: Array, gap: Gap, xp: Any
 ) -> tuple[Array, Array]:

@@ -7,7 +7,8 @@ import numpy as np
 
 from swarmjax.config import ConfigError, show
 from swarmjax.extension import LevelDrawing
-from swarmjax.task import fixed_level
+from swarmjax.task import fixed_level, maps
+from swarmjax.task.maps import MapArrays
 from swarmjax.task.stage_config import BUILT_IN, StageConfig
 
 Array = Any
@@ -25,6 +26,7 @@ class Stage(NamedTuple):
       fixed: the paper's fixed level instead of a random one, bool.
       fence: the obstacle of a fixed level is the fence instead of boxes, bool.
       drawing: 1 + index of the extension's way of drawing its levels, 0 for none, int32.
+      map: the maps; None if no stage has one.
     """
 
     robots: Array
@@ -35,6 +37,7 @@ class Stage(NamedTuple):
     fixed: Array
     fence: Array
     drawing: Array
+    map: MapArrays | None = None
 
 
 def stack(stages: Sequence[StageConfig], drawings: Sequence[LevelDrawing] = ()) -> Stage:
@@ -59,6 +62,7 @@ def stack(stages: Sequence[StageConfig], drawings: Sequence[LevelDrawing] = ()) 
         fixed=np.array([s.level == "fixed" for s in stages]),
         fence=np.array([s.layout == "fence" for s in stages]),
         drawing=np.array([_drawing(s, names) for s in stages], np.int32),
+        map=maps.stack([stage.drawn_map for stage in stages]),
     )
 
 
@@ -69,7 +73,9 @@ def single(stage: StageConfig, drawings: Sequence[LevelDrawing] = ()) -> Stage:
 
 def select(stages: Stage, index: Array) -> Stage:
     """Picks stages [...] by index [...] out of [S]."""
-    return Stage(*(field[index] for field in stages))
+    *fields, drawn = stages
+    drawn = None if drawn is None else MapArrays(*(field[index] for field in drawn))
+    return Stage(*(field[index] for field in fields), map=drawn)
 
 
 def largest_half(stages: Sequence[StageConfig]) -> float:
@@ -104,6 +110,8 @@ def _drawing(stage: StageConfig, drawings: Sequence[str]) -> int:
 
 def _half(stage: StageConfig) -> float:
     """Half the longest edge of the obstacles of a stage, m."""
+    if (drawn := stage.drawn_map) is not None:
+        return float(drawn.wall[:, 3:].max(initial=0.5 * stage.obstacle_size))
     if stage.layout == "fence":
         return fixed_level.FENCE_HALF_LENGTH * stage.sides[1]
     return fixed_level.BOX_HALF if stage.level == "fixed" else 0.5 * stage.obstacle_size

@@ -3,12 +3,14 @@
 import itertools
 import math
 import re
+import typing
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
-from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.config import ConfigError, Section, about, section, show
 from swarmjax.sim.config import SimConfig
+from swarmjax.task import maps
 
 # The room that a random level asks for. A start and a target each take a square of 0.15 m (two
 # hulls of 0.074 m side by side); an obstacle takes the square about its circumscribed circle,
@@ -23,8 +25,45 @@ PASSAGE = 0.10  # m; between obstacles, and between an obstacle and a wall
 FILLING = 0.4  # boxes per square of a grid that random placing surely reaches
 
 
-BUILT_IN = ("random", "fixed")  # ways of drawing levels
+BUILT_IN = ("random", "fixed", "map")  # ways of drawing levels
 _OR = "or the name of a drawing of extensions"
+
+
+_MOST_OBSTACLES = 32
+_SMALLEST_CELL = 0.08  # m; a robot of 0.074 m and 3 mm on either side
+
+
+def complete(stage: dict[str, Any]) -> dict[str, Any]:
+    """Adds to a stage with a map what the map says.
+
+    Args:
+        stage: plain data; `map` is a text, or its rows.
+
+    Returns:
+        The data, with `side`, `obstacles` and `level` if there is a map.
+
+    Raises:
+        ConfigError: the map is unsound.
+    """
+    text = stage.get("map")
+    if not text:
+        return stage
+    rows = text.strip().split() if isinstance(text, str) else text
+    rows = section.convert(tuple[str, ...], rows, "stage.map")
+    cell = section.convert(float, stage.get("cell", StageConfig.cell), "stage.cell")
+    found = _read_map(typing.cast(tuple[str, ...], rows), typing.cast(float, cell))
+    said = {"side": found.side, "obstacles": len(found.wall), "level": "map"}
+    return {**stage, "map": list(typing.cast(tuple[str, ...], rows)), **said}
+
+
+def _read_map(rows: Sequence[str], cell: float) -> maps.Map:
+    found = maps.read(rows, cell)
+    if len(found.wall) > _MOST_OBSTACLES:
+        raise ConfigError(
+            f"map has walls of {len(found.wall)} rectangles: give at most {_MOST_OBSTACLES}; "
+            "straight walls take the fewest."
+        )
+    return found
 
 
 _Cell = tuple[int, int, float | tuple[float, float]]  # robots, obstacles, side
@@ -39,18 +78,29 @@ class StageConfig(Section):
     side: float | tuple[float, float] = field(
         metadata=about("side of the square arena, m; a range: drawn anew for each level", 0.4, 4.0)
     )
-    obstacles: int = field(default=0, metadata=about("obstacles", 0, 32))
+    obstacles: int = field(default=0, metadata=about("obstacles", 0, _MOST_OBSTACLES))
     obstacle_size: float = field(
         default=0.10, metadata=about("edge of the square boxes of a random level, m", 0.02, 0.3)
     )
     level: str = field(
         default="random",
         metadata=about(
-            "random: a new one every episode; fixed: always the same; or a drawing of extensions"
+            "random: a new one every episode; fixed: always the same; map: the walls of map, with "
+            "new starts and targets; or a drawing of extensions"
         ),
     )
     layout: Literal["boxes", "fence"] = field(
         default="boxes", metadata=about("obstacles of a fixed level")
+    )
+    map: tuple[str, ...] = field(
+        default=(),
+        metadata=about(
+            "rows of the arena as text: # wall, . floor, S start area, T target area, a letter and "
+            "its capital for one robot; it says side, obstacles and level"
+        ),
+    )
+    cell: float = field(
+        default=0.12, metadata=about("edge of a letter of map, m", _SMALLEST_CELL, 1.0)
     )
 
     def _check(self) -> None:
@@ -64,13 +114,46 @@ class StageConfig(Section):
             raise ConfigError("obstacles is 0, but layout is fence: give 1 or more.")
         if self.level == "fixed" and isinstance(self.side, tuple):
             raise ConfigError(f"side is {show(self.side)}, but level is fixed: give one number.")
-        least = smallest_side(self)
+        self._check_map()
+        least = 0.0 if self.map else smallest_side(self)
         if self.sides[0] < least:
             raise ConfigError(
                 f"side is {show(self.side)}, too small for robots={self.robots}, "
                 f"obstacles={self.obstacles}, obstacle_size={show(self.obstacle_size)}: "
                 f"give at least {math.ceil(100 * least) / 100}."
             )
+
+    def _check_map(self) -> None:
+        if bool(self.map) != (self.level == "map"):
+            raise ConfigError(
+                f"level is {self.level}, but map is {'given' if self.map else 'missing'}: give "
+                "both level=map and a map, or neither."
+            )
+        if not self.map:
+            return
+        drawn = self.drawn_map
+        assert drawn is not None
+        said = {"side": drawn.side, "obstacles": len(drawn.wall)}
+        for key, value in said.items():
+            if getattr(self, key) != value:
+                raise ConfigError(
+                    f"{key} is {show(getattr(self, key))}, but map says {value}: leave {key} out."
+                )
+        self._check_robots(drawn)
+
+    def _check_robots(self, drawn: maps.Map) -> None:
+        pairs = len(drawn.pair)
+        if self.robots < pairs or (self.robots > pairs and not len(drawn.start)):
+            raise ConfigError(
+                f"robots is {self.robots}, but map has letters for {pairs}"
+                f"{'' if len(drawn.start) else ' and no S and T'}: give {pairs}"
+                f"{' or more' if len(drawn.start) else ', or areas S and T'}."
+            )
+
+    @property
+    def drawn_map(self) -> maps.Map | None:
+        """The map; None without one."""
+        return _read_map(self.map, self.cell) if self.map else None
 
     @property
     def sides(self) -> tuple[float, float]:

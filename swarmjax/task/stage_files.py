@@ -7,7 +7,7 @@ from typing import Any
 
 from swarmjax.config import ConfigError, Section, build, files, section, show, to_dict
 from swarmjax.config.reading import called
-from swarmjax.task.stage_config import GridConfig
+from swarmjax.task.stage_config import GridConfig, complete
 
 
 def expand(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
@@ -72,15 +72,16 @@ def load_levels[C: Section](
         ConfigError: a word is unsound, or a suite is given beside what it says itself.
     """
 
-    def complete(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:
+    def fill_in(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:
         _check_suite_alone(cls, mapping.get("suite"), overrides)
         words = files.split_words(cls, overrides)
         if stage is None or "stage" in words:
             return mapping | {"stage": pick_one(mapping.get("stage", {}), chosen["stage"])}
         mine = {key: word for key, word in words.items() if key.startswith("stage.")}
-        return mapping | {"stage": {**stage, **files.values(mine).get("stage", {})}}
+        given = files.values(mine).get("stage", {})
+        return mapping | {"stage": complete({**stage, **given})}
 
-    return files.load(cls, overrides, complete)
+    return files.load(cls, overrides, fill_in)
 
 
 def _check_suite_alone(cls: type[Section], suite: object, overrides: Sequence[str]) -> None:
@@ -153,4 +154,4 @@ def _named(stage: dict[str, Any], choice: str) -> dict[str, Any]:
     found = stage.get("name", name)
     if found != name:
         raise ConfigError(f"stage.name is {show(found)} in {name}.yaml: give the file's name.")
-    return {"name": name, **stage}
+    return complete({"name": name, **stage})

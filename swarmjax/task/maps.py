@@ -1,0 +1,296 @@
+"""Arenas drawn as text: where walls are, where robots start and where their targets may be.
+
+    ########
+    #S..#..#
+    #S.....#
+    #...#.T#
+    ########
+
+`#` is wall, `.` floor, `S` and `T` the areas where robots start and have their targets. Any other
+letter is the start of one robot, and its capital the target of that robot. The text is the view
+from above: x to the right, y up.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from swarmjax.config import ConfigError, show
+from swarmjax.task.placement import UNITS
+
+Array = Any
+Cell = tuple[int, int]  # row and column of the text, from 0
+
+WALL, FLOOR, START, TARGET = "#.ST"
+MOST_CELLS = 48  # of a row, and rows
+# Points of an area that things may be placed on: at least so far apart (m), at most so many, unless
+# the area has more cells.
+_APART, _MOST_POINTS = 0.03, 1024
+
+
+class Map(NamedTuple):
+    """What a text says, in metres around the middle of the arena.
+
+    Attributes:
+      side: of the square arena that holds the map, m.
+      wall: [W, 5] x (m), y (m), yaw (0 rad), half edges (m) of rectangles.
+      start: [C, 2] points on which robots may start, m.
+      target: [D, 2] points on which targets may be, m.
+      pair: [P, 2, 2] start and target of each robot that has a letter, m.
+    """
+
+    side: float
+    wall: np.ndarray
+    start: np.ndarray
+    target: np.ndarray
+    pair: np.ndarray
+
+
+class MapArrays(NamedTuple):
+    """The maps of stages as arrays, [S, ...] or [...]; what a stage lacks is not open.
+
+    Attributes:
+      mapped: whether the stage has a map, bool.
+      wall: [W, 5] as in `Map`, float32.
+      start: [C, 2] in units, int32.
+      start_open: [C] whether it is a point of this stage, bool.
+      target: [D, 2] likewise.
+      target_open: [D] likewise.
+      pair: [P, 2, 2] in units, int32.
+      pairs: how many of these there are, int32.
+    """
+
+    mapped: Array
+    wall: Array
+    start: Array
+    start_open: Array
+    target: Array
+    target_open: Array
+    pair: Array
+    pairs: Array
+
+
+def read(rows: Sequence[str], cell: float) -> Map:
+    """Reads a map.
+
+    Args:
+      rows: of the text, from the top.
+      cell: edge of a cell, m.
+
+    Returns:
+      The map; where it is no square, wall is added on both sides.
+
+    Raises:
+      ConfigError: naming what is wrong with the text.
+    """
+    _check_text(rows)
+    areas = _areas(rows)
+    pairs = _pairs(areas)
+    _check_reach(rows, areas[START], areas[TARGET], pairs)
+    longest = max(len(rows), len(rows[0]))
+    middle = np.array([len(rows[0]) - 1, len(rows) - 1]) / 2
+    points = [_points(areas[kind], middle, cell) for kind in (START, TARGET)]
+    ends = [[_centre(each, middle, cell) for each in pair] for pair in pairs]
+    return Map(
+        side=round(longest * cell, 6),
+        wall=_walls(rows, cell),
+        start=points[0],
+        target=points[1],
+        pair=np.array(ends, np.float64).reshape(-1, 2, 2),
+    )
+
+
+def _check_text(rows: Sequence[str]) -> None:
+    if not rows or not rows[0]:
+        raise ConfigError("map is empty: give rows of #, ., S and T.")
+    for number, row in enumerate(rows, 1):
+        if len(row) != len(rows[0]):
+            raise ConfigError(
+                f"map has {len(rows[0])} letters in row 1 and {len(row)} in row {number}: give "
+                "rows of the same length."
+            )
+        for column, letter in enumerate(row, 1):
+            if letter not in (WALL, FLOOR) and not (letter.isascii() and letter.isalpha()):
+                raise ConfigError(
+                    f"map has {show(letter)} in row {number}, column {column}: give # (wall), . "
+                    "(floor), S (start area), T (target area), or a letter for one robot."
+                )
+            if letter in "st":
+                raise ConfigError(
+                    f"map has {show(letter)} in row {number}, column {column}: give S or T for an "
+                    "area, or another letter for one robot."
+                )
+    if max(len(rows), len(rows[0])) > MOST_CELLS:
+        raise ConfigError(
+            f"map has {len(rows)} rows of {len(rows[0])} letters: give at most {MOST_CELLS} of "
+            "each, and larger cells."
+        )
+
+
+def _areas(rows: Sequence[str]) -> dict[str, list[Cell]]:
+    """Lists the cells of each letter that is neither wall nor floor."""
+    found: dict[str, list[Cell]] = {START: [], TARGET: []}
+    for r, row in enumerate(rows):
+        for c, letter in enumerate(row):
+            if letter not in (WALL, FLOOR):
+                found.setdefault(letter, []).append((r, c))
+    return found
+
+
+def _pairs(areas: dict[str, list[Cell]]) -> list[tuple[Cell, Cell]]:
+    """Puts the starts and targets of letters together, in the order of the alphabet."""
+    letters = sorted({letter.lower() for letter in areas} - {"s", "t"})
+    for letter in letters:
+        for each in (letter, letter.upper()):
+            count = len(areas.get(each, []))
+            if count != 1:
+                raise ConfigError(
+                    f"map has {show(each)} {count} times: give the start ({letter}) and the target "
+                    f"({letter.upper()}) of a robot once each."
+                )
+    return [(areas[letter][0], areas[letter.upper()][0]) for letter in letters]
+
+
+def _check_reach(
+    rows: Sequence[str],
+    starts: Sequence[Cell],
+    targets: Sequence[Cell],
+    pairs: Sequence[tuple[Cell, Cell]],
+) -> None:
+    """Refuses a target that cannot be reached, by steps from cell to cell."""
+    if bool(starts) != bool(targets) or not (starts or pairs):
+        raise ConfigError(
+            f"map has {len(starts)} cells of S and {len(targets)} of T: give both, or a letter for "
+            "each robot."
+        )
+    wanted = [(start, target) for start in starts[:1] for target in targets]
+    wanted += [(start, targets[0]) for start in starts[1:]]
+    for start, target in [*wanted, *pairs]:
+        if target not in _reached(rows, start):
+            raise ConfigError(
+                f"map has a target in row {target[0] + 1}, column {target[1] + 1} that cannot be "
+                f"reached from the start in row {start[0] + 1}, column {start[1] + 1}: leave a way "
+                "of whole cells."
+            )
+
+
+def _reached(rows: Sequence[str], start: Cell) -> set[Cell]:
+    """Fills the floor from a cell on, over the edges of cells."""
+    found, edge = {start}, [start]
+    while edge:
+        r, c = edge.pop()
+        for near in ((r + 1, c), (r - 1, c), (r, c + 1), (r, c - 1)):
+            if near not in found and _is_floor(rows, near):
+                found.add(near)
+                edge.append(near)
+    return found
+
+
+def _is_floor(rows: Sequence[str], cell: Cell) -> bool:
+    r, c = cell
+    return 0 <= r < len(rows) and 0 <= c < len(rows[0]) and rows[r][c] != WALL
+
+
+def _centre(cell: Cell, middle: np.ndarray, edge: float) -> np.ndarray:
+    """Returns the centre of a cell, [2] m."""
+    return np.array([cell[1] - middle[0], middle[1] - cell[0]]) * edge
+
+
+def _points(cells: Sequence[Cell], middle: np.ndarray, edge: float) -> np.ndarray:
+    """Spreads points evenly over cells, [C, 2] m."""
+    most = math.isqrt(_MOST_POINTS // max(1, len(cells)))
+    count = max(1, min(math.floor(edge / _APART), most))
+    aside = ((np.arange(count) + 0.5) / count - 0.5) * edge
+    offsets = np.stack(np.meshgrid(aside, aside), axis=-1).reshape(-1, 2)
+    centres = [_centre(cell, middle, edge) for cell in cells]
+    return np.array([centre + offsets for centre in centres]).reshape(-1, 2)
+
+
+def _walls(rows: Sequence[str], edge: float) -> np.ndarray:
+    """Covers the wall by rectangles that do not overlap, [W, 5]."""
+    height, width = len(rows), len(rows[0])
+    margin = abs(height - width) / 2  # cells on either side of a map that is no square
+    found: list[tuple[float, float, float, float]] = [*_rectangles(rows)]
+    if width > height:
+        found += [(0, -margin, width, 0), (0, height, width, height + margin)]
+    if height > width:
+        found += [(-margin, 0, 0, height), (width, 0, width + margin, height)]
+    walls = [
+        (
+            ((left + right) / 2 - width / 2) * edge,
+            (height / 2 - (top + bottom) / 2) * edge,
+            0.0,
+            (right - left) / 2 * edge,
+            (bottom - top) / 2 * edge,
+        )
+        for left, top, right, bottom in found
+    ]
+    return np.array(walls, np.float64).reshape(-1, 5)
+
+
+def _rectangles(rows: Sequence[str]) -> Iterator[tuple[int, int, int, int]]:
+    """Yields left, top, right and bottom of rectangles that cover the wall, largest first."""
+    left = np.array([[letter == WALL for letter in row] for row in rows])
+    while left.any():
+        yield (best := _largest(left))
+        left[best[1] : best[3], best[0] : best[2]] = False
+
+
+def _largest(wall: np.ndarray) -> tuple[int, int, int, int]:
+    """Finds the largest rectangle of wall: left, top, right, bottom."""
+    best, most = (0, 0, 0, 0), 0
+    runs = np.zeros(wall.shape[1], int)  # of wall above the bottom row, by column
+    for bottom, row in enumerate(wall, 1):
+        runs = np.where(row, runs + 1, 0)
+        for left in range(len(runs)):
+            high = len(wall)
+            for right in range(left, len(runs)):
+                high = min(high, int(runs[right]))
+                if high * (right + 1 - left) > most:
+                    most = high * (right + 1 - left)
+                    best = (left, bottom - high, right + 1, bottom)
+    return best
+
+
+def stack(maps: Sequence[Map | None]) -> MapArrays | None:
+    """Stacks the maps of stages into NumPy arrays.
+
+    Args:
+      maps: of the stages; None where one has no map.
+
+    Returns:
+      The arrays [S, ...]; None if no stage has a map.
+    """
+    if not any(maps):
+        return None
+    none = Map(0.0, *(np.zeros((0, *shape)) for shape in ((5,), (2,), (2,), (2, 2))))
+    each = [none if one is None else one for one in maps]
+    start, start_open = _pad([one.start for one in each])
+    target, target_open = _pad([one.target for one in each])
+    pair, pair_there = _pad([one.pair for one in each])
+    return MapArrays(
+        mapped=np.array([one is not None for one in maps]),
+        wall=_pad([one.wall for one in each])[0].astype(np.float32),
+        start=_in_units(start),
+        start_open=start_open,
+        target=_in_units(target),
+        target_open=target_open,
+        pair=_in_units(pair),
+        pairs=pair_there.sum(axis=1).astype(np.int32),
+    )
+
+
+def _pad(arrays: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Stacks arrays of different lengths, one row at least; returns them and where there is any."""
+    longest = max(1, *map(len, arrays))
+    shape = (len(arrays), longest, *arrays[0].shape[1:])
+    padded, there = np.zeros(shape), np.zeros(shape[:2], bool)
+    for row, mask, array in zip(padded, there, arrays, strict=True):
+        row[: len(array)], mask[: len(array)] = array, True
+    return padded, there
+
+
+def _in_units(metres: np.ndarray) -> np.ndarray:
+    return np.round(metres * UNITS).astype(np.int32)
