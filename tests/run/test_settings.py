@@ -160,7 +160,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage.sequence=[curriculum]"], "stage.sequence names curriculum, a curriculum itself: "
          "give single stages."),
         (["stage=s3", "stage.sequence=[s1]"], "stage.sequence is not a key: give one of name, "
-         "robots, side, obstacles, obstacle_size, level, layout."),
+         "robots, side, obstacles, obstacle_size, level, layout, map, cell."),
         (["stage=s3", "stage.name=s4"], "stage.name is 's4' in s3.yaml: give the file's name."),
         (["stage=s3", "stage.layout=fence"], "stage.layout is fence, but level is random: give "
          "level=fixed."),
