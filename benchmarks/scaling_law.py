@@ -185,12 +185,14 @@ def table(config: ScalingConfig) -> Iterator[dict[str, Any]]:
         for point in points(config):
             if head.startswith(f"{point}-"):
                 cell = head.removeprefix(f"{point}-")
-                yield from (_line(config, point, cell, action) for action in ACTIONS)
+                files = {each: judged_file(config, point, cell, each) for each in ACTIONS}
+                there = [action for action, file in files.items() if file.exists()]
+                yield from (_line(config, point, cell, action) for action in there)
 
 
 def _line(config: ScalingConfig, point: Point, cell: str, action: str) -> dict[str, Any]:
     found = _load(config, point, cell, action)
-    assert found is not None  # the file of its drawn actions is there
+    assert found is not None  # its file is there
     line: dict[str, Any] = {
         "benchmark": "scaling_law",
         **point._asdict(),
