@@ -19,20 +19,18 @@ from math import ceil, log2
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from benchmarks import key_value, pages
 from swarmjax import command
 from swarmjax.config import ConfigError, Section, about
 
-mpl.use("Agg")
 Line = dict[str, Any]
 PAGE, FIGURE = "scaling.md", "figures/devices.png"
 EXPECTED_MAX = {1: 0.0, 2: 0.564, 8: 1.424, 64: 2.34, 512: 3.05}
 # Sums of an update: one for each of 8 minibatches, and 5 for advantages, observations and tallies,
-# as the compiled program has them. The lines stored have 8 more, since merged.
-REDUCES, REDUCES_MEASURED = 13, 21
+# as the compiled program has them (tests/training/test_mesh.py). A line tells its own number.
+REDUCES = 13
 _HOST = 8  # devices of a host
 _HOP_US = 15.0  # that a doubling of hosts adds to a sum; assumed, not measured
 _ROLLOUT = 32  # control steps of an update, the default
@@ -89,8 +87,22 @@ def deviation_ms(line: Line, measured_us: float) -> float:
       line: of a weak comparison of two devices.
       measured_us: of a sum.
     """
-    lost = update_ms(line, 2) - update_ms(line, 1) - REDUCES_MEASURED * measured_us * 1e-3
+    lost = update_ms(line, 2) - update_ms(line, 1) - line["sums"] * measured_us * 1e-3
     return max(0.0, lost) / EXPECTED_MAX[2]
+
+
+def newest(lines: Sequence[Line]) -> list[Line]:
+    """Takes the newest line of each comparison.
+
+    Args:
+      lines: of any benchmarks, the newest last.
+
+    Returns:
+      Those of `devices_speed`, in the order in which their comparisons first come.
+    """
+    keys = ("robot", "scaling", "processes", "arenas", "arenas_in_all")
+    mine = [line for line in lines if line["benchmark"] == "devices_speed"]
+    return list({tuple(line[key] for key in keys): line for line in mine}.values())
 
 
 def measured_table(lines: Sequence[Line]) -> str:
@@ -157,7 +169,7 @@ def write(lines: Sequence[Line], docs: Path) -> None:
     Raises:
       ConfigError: if the page or a line that it needs is missing.
     """
-    found = [line for line in lines if line["benchmark"] == "devices_speed"]
+    found = newest(lines)
     sums = {line["bytes"]: line["microseconds"] for line in lines if "microseconds" in line}
     page = docs / PAGE
     if not found or _MESSAGE not in sums or not page.exists():

@@ -14,6 +14,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -29,6 +30,7 @@ from swarmjax.run import hosts
 from swarmjax.run.settings import TrainConfig, load_train
 
 PAIRS = 10
+OTHER_SUMS = 5  # over devices, of an update beside its minibatches
 CALL_SECONDS = 0.8  # of a call of one device, about
 
 
@@ -46,6 +48,9 @@ def parse(words: Sequence[str]) -> tuple[DevicesConfig, TrainConfig, TrainConfig
 
     Args:
       words: of the command line.
+
+    Returns:
+      What is held fixed, the settings of one device, and those of all.
 
     Raises:
       ConfigError: if a word is unsound, or there is one device alone.
@@ -73,27 +78,34 @@ def result(given: DevicesConfig, one: TrainConfig, every: TrainConfig) -> dict[s
     """
     alone, spread = (Arm(one) if hosts.is_first() else None), Arm(every)
     updates = _updates(alone)
-    pairs = in_turn(lambda: _speed(alone, updates), lambda: _speed(spread, updates), 1 + PAIRS)[
-        1:
-    ]  # the first pair is not counted
+    one_call, other_call = partial(_speed, alone, updates), partial(_speed, spread, updates)
+    _, *pairs = in_turn(one_call, other_call, 1 + PAIRS)  # the first pair is not counted
     if alone is None:
         return None
+    return _line(given, alone, spread, updates, pairs)
+
+
+def _line(
+    given: DevicesConfig, alone: Arm, spread: Arm, updates: int, pairs: list[tuple[float, float]]
+) -> dict[str, Any]:
+    """Sums the pairs up."""
+    one, every = alone.settings, spread.settings
     ratio, low, high = median([many / single for single, many in pairs])
-    devices = every.devices
     return {
         "benchmark": "devices_speed",
         "scaling": given.scaling,
         "processes": hosts.count(),
         **about_run(one),
-        "devices": devices,
+        "devices": every.devices,
         "arenas_in_all": every.arenas,
         "updates": updates,
+        "sums": every.algo.num_minibatches * every.algo.epochs + OTHER_SUMS,
         "pairs": PAIRS,
         "ratio": [ratio, low, high],
-        "efficiency": [ratio / devices, low / devices, high / devices],
+        "efficiency": [value / every.devices for value in (ratio, low, high)],
         "arena_steps_per_s_of_one": median([single for single, _ in pairs])[0],
         "arena_steps_per_s": median([many for _, many in pairs])[0],
-        "calls_per_s": [[round(value) for value in pair] for pair in pairs],
+        "arena_steps_per_s_by_pair": [[round(value) for value in pair] for pair in pairs],
         "compile_s_of_one": alone.compile_s,
         "compile_s": spread.compile_s,
         **made_with(),

@@ -11,6 +11,7 @@ done. `sweep.json` has the table too. Needs the extra `sweep`: uv sync --extra g
 import importlib.util
 import os
 import shutil
+import signal
 import sys
 import time
 import traceback
@@ -118,8 +119,11 @@ def work(cells: Sequence[GridCell], settings: SweepConfig) -> dict[str, int]:
     try:
         while waiting or running:
             while waiting and len(running) < most:
-                cell, attempt = waiting.popleft()
-                job = submit(cell, settings)
+                cell, attempt = waiting[0]
+                job = submit(cell, settings, is_first=not running)
+                if job is None:
+                    break
+                waiting.popleft()
                 running[job] = cell, attempt
                 _say(f"{cell.label}: job {job.job_id}, try {attempt} of {settings.tries}")
             for job in [job for job in running if job.done()]:
@@ -134,9 +138,22 @@ def work(cells: Sequence[GridCell], settings: SweepConfig) -> dict[str, int]:
     return codes
 
 
-def submit(cell: GridCell, settings: SweepConfig) -> Any:
-    """Submits the job of a cell; returns submitit's handle of it."""
+def submit(cell: GridCell, settings: SweepConfig, *, is_first: bool = True) -> Any:
+    """Submits the job of a cell.
+
+    Args:
+      cell: to train.
+      settings: of the sweep.
+      is_first: whether no other job runs whose end may make room for this one.
+
+    Returns:
+      submitit's handle of it; None if Slurm takes no more jobs now.
+
+    Raises:
+      ConfigError: if Slurm takes none at all.
+    """
     import submitit
+    from submitit.core.utils import FailedJobError
 
     executor = submitit.AutoExecutor(Path(settings.dir) / "jobs", cluster=settings.cluster)
     executor.update_parameters(
@@ -147,7 +164,13 @@ def submit(cell: GridCell, settings: SweepConfig) -> Any:
         slurm_signal_delay_s=_SAVE_S,
     )
     visible = os.environ.get("CUDA_VISIBLE_DEVICES") if settings.cluster == "local" else None
-    return executor.submit(train, cell.words, visible)
+    try:
+        return executor.submit(train, cell.words, visible)
+    except FailedJobError as error:
+        if not is_first:
+            return None
+        reason = str(error).strip().splitlines()[-1][:200]
+        raise ConfigError(f"cluster is slurm, but it takes no job: {reason}.") from None
 
 
 def _code(job: Any, label: str) -> int:
@@ -187,4 +210,6 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
+    for number in (signal.SIGTERM, signal.SIGHUP):  # as Ctrl-C: jobs are cancelled
+        signal.signal(number, signal.default_int_handler)
     sys.exit(command.run("sweep", main, SweepConfig))

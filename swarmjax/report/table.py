@@ -98,8 +98,8 @@ def find(text: str) -> list[Path]:
     found: list[Path] = []
     for part in [text] if os.path.isdir(text) else text.split(","):
         named = sorted(glob(part)) if set(part) & set("*?[") else [part]
-        within = [run for path in named if part for run in _within(Path(path), part)]
-        if not within:
+        within = [run for path in named for run in _within(Path(path), part)]
+        if not part or not within:
             raise ConfigError(f"runs is {show(text)}, and {show(part)} is and holds no run.")
         found += within
     twice = [str(run) for run in found if found.count(run) > 1]
@@ -111,7 +111,7 @@ def find(text: str) -> list[Path]:
 def _within(path: Path, part: str, deep: int = _DEEP) -> Iterator[Path]:
     """Finds the run at a path, or those in the folder there that have begun to train."""
     if (path / CONFIG).exists():
-        if _has_trained(path) or str(path) == part:
+        if _has_trained(path) or path == Path(part):
             yield path
     elif path.is_dir() and deep:
         for inner in sorted(path.iterdir()):

@@ -65,6 +65,7 @@ def multiply(folder: Path, typed: Sequence[str]) -> list[GridCell]:
             raise ConfigError(f"{show(word)} is not a setting: give key=value.")
         if key.removeprefix(GRID) in _OWN:
             raise ConfigError(f"{key} cannot be given: each cell of the grid has its own.")
+        _check_once(key, {*grid, *(each.partition("=")[0] for each in shared)})
         if key.startswith(GRID):
             grid[key.removeprefix(GRID)] = _values(key.removeprefix(GRID), value)
         else:
@@ -74,6 +75,12 @@ def multiply(folder: Path, typed: Sequence[str]) -> list[GridCell]:
     if math.prod(map(len, grid.values())) > MOST_CELLS:
         raise ConfigError(f"the grid has more than {MOST_CELLS} cells: give fewer values.")
     return _cells(folder, grid, shared)
+
+
+def _check_once(key: str, given: set[str]) -> None:
+    """Refuses a key that a word before has given."""
+    if key.removeprefix(GRID) in given:
+        raise ConfigError(f"{key.removeprefix(GRID)} is given twice: give each key once.")
 
 
 def _values(key: str, text: str) -> list[str]:

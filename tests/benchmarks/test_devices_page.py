@@ -15,6 +15,7 @@ LINE = {
     "processes": 1,
     "arenas": 1000,
     "arenas_in_all": 2000,
+    "sums": 21,
     "arena_steps_per_s_of_one": 3.2e6,  # 10 ms for 1000 arenas of 32 control steps
     "arena_steps_per_s": 5.0e6,  # 12.8 ms
     "efficiency": [0.78, 0.7, 0.8],
@@ -48,6 +49,12 @@ def test_the_page_gets_tables_and_a_plot(tmp_path: Path) -> None:
     assert devices_page.main([f"lines={lines}", f"docs={tmp_path}"]) == 0
     assert "| planar | weak | 1 | 1,000, 2,000 | 10.0, 12.8 | 3.20, 5.00 |" in page.read_text()
     assert (tmp_path / devices_page.FIGURE).exists()
+
+
+def test_the_newest_line_of_a_comparison_counts() -> None:
+    other = LINE | {"processes": 2}
+    found = devices_page.newest([LINE, other, LINE | {"sums": 13}, SUM])
+    assert [line["sums"] for line in found] == [13, 21]
 
 
 def test_lines_without_sums_are_refused(tmp_path: Path) -> None:

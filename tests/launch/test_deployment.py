@@ -125,7 +125,7 @@ def test_bad_settings_end_a_jobset_and_all_else_starts_it_again() -> None:
     job, policy = _job(), _read("jobset")["spec"]["failurePolicy"]
     (rule,) = job["podFailurePolicy"]["rules"]
     assert rule["action"] == "FailJob"
-    assert rule["onExitCodes"] == {"containerName": "train", "operator": "In", "values": [2]}
+    assert rule["onExitCodes"] == {"containerName": "train", "operator": "In", "values": [1, 2]}
     assert [each["action"] for each in policy["rules"]] == ["FailJobSet"]
     assert policy["rules"][0]["onJobFailureReasons"] == ["PodFailurePolicy"]
     assert job["backoffLimit"] == 0

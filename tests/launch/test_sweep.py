@@ -135,7 +135,7 @@ class _Job:
 def test_a_job_that_is_killed_has_failed(
     quick: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(quick, "submit", lambda *_: _Job(dead=True))
+    monkeypatch.setattr(quick, "submit", lambda *_, **__: _Job(dead=True))
     assert quick.main([f"dir={tmp_path}", "cluster=debug", *GRID]) == 1
 
 
@@ -144,7 +144,7 @@ def test_what_runs_is_cancelled_when_the_sweep_is_interrupted(
 ) -> None:
     jobs = []
 
-    def submit(*_: object) -> _Job:
+    def submit(*_: object, **__: object) -> _Job:
         if len(jobs) == 2:
             raise KeyboardInterrupt
         jobs.append(_Job(dead=False))
@@ -178,6 +178,36 @@ def test_training_that_is_refused_or_breaks_is_an_exit_code(
     assert sweep.train([], "5") == 1
     assert os.environ["CUDA_VISIBLE_DEVICES"] == "5"
     assert "ZeroDivisionError" in capsys.readouterr().err
+
+
+def test_a_cell_waits_while_slurm_takes_no_more_jobs(
+    quick: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers = [_Job(dead=True), None, _Job(dead=True)]
+    asked = []
+
+    def submit(_: object, __: object, *, is_first: bool) -> _Job | None:
+        asked.append(is_first)
+        return answers.pop(0)
+
+    monkeypatch.setattr(quick, "submit", submit)
+    quick.main([f"dir={tmp_path}", "cluster=debug", "at_once=2", *GRID])
+    assert asked == [True, False, True]
+
+
+def test_a_refusal_of_slurm_is_one_sentence(
+    sweep: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("sbatch", "srun"):
+        (tmp_path / name).write_text("#!/bin/sh\necho 'sbatch: error: too many jobs' >&2\nexit 1\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    settings, (cell,) = sweep.parse([f"dir={tmp_path}/grid", "grid.arenas=8", *TINY])
+    assert sweep.submit(cell, settings, is_first=False) is None
+    with pytest.raises(
+        section.ConfigError, match=r"^cluster is slurm, but it takes no job: .*many"
+    ):
+        sweep.submit(cell, settings)
 
 
 def test_slurm_is_asked_for_devices_and_time_to_save(

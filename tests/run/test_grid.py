@@ -73,6 +73,11 @@ def test_values_are_read_as_hydra_does(
         (["grid.seed=1,1"], "two cells of the grid would be DIR/seed=1: give values that differ."),
         (["grid.seed=[1,2"], "grid.seed is '[1,2', which cannot be read: give values with commas"),
         (["grid.seed=" + "1," * 3000], "seed is '1,1,1,"),
+        (
+            ["grid.arenas=64,128", "arenas=32"],
+            "arenas is given twice: give each key once.",
+        ),
+        (["grid.arenas=64", "grid.arenas=128"], "arenas is given twice: give each key once."),
         (["grid.run.dir=a,b"], "grid.run.dir cannot be given: each cell of the grid has its own."),
         (
             ["grid.seed=1,2", "resume=a"],

@@ -12,7 +12,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from swarmjax.run import rank
+from swarmjax.run import hosts, rank
+from swarmjax.run.settings import load_train
 
 ROOT = Path(__file__).parents[2]
 WORDS = ["arenas=64", "algo.num_minibatches=4", "run.tensorboard=false"]
@@ -82,6 +83,26 @@ def test_lines_of_an_abort_are_left_out() -> None:
 def test_a_death_is_a_sentence(joined: bool, code: int, capsys: pytest.CaptureFixture) -> None:
     assert rank._died(-signal.SIGABRT, joined=joined) == code
     assert capsys.readouterr().err.startswith("swarmjax.train: error: ")
+
+
+@pytest.mark.slow
+def test_a_process_whose_peer_never_comes_is_refused_in_time(
+    tmp_path: Path, coordinator: str
+) -> None:
+    for process in (0, 1):  # the coordinator waits for the other, and the other for it
+        began = time.monotonic()
+        code, said = _said(_start(tmp_path / "run", coordinator, process, "devices=2"))
+        assert code == 2
+        assert "did not meet within" in said
+        assert "Traceback" not in said
+        # 45 s of waiting, and the start of a process on a busy machine.
+        assert time.monotonic() - began < 90.0
+
+
+def test_processes_of_other_versions_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = load_train(["seed=1"])
+    monkeypatch.setattr(hosts.provenance, "versions", lambda: {"jax": "0.0.1"})
+    assert hosts._comparable(settings)["version of jax"] == "0.0.1"
 
 
 @pytest.mark.slow

@@ -153,8 +153,8 @@ def test_what_the_task_names_and_nobody_defines_is_refused() -> None:
 
 def test_a_way_of_drawing_that_is_missing_is_refused() -> None:
     assert refusal(partial(env.load, sim=SIM), (RING,)) == (
-        "stage ring: level is 'ring': give one of random, fixed, map, or extensions=FILE, a file that "
-        "defines it."
+        "stage ring: level is 'ring': give one of random, fixed, map, or extensions=FILE, a file "
+        "that defines it."
     )
 
 

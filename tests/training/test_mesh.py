@@ -70,6 +70,11 @@ def test_the_curriculum_decides_the_same(alone: Found, spread: Found, name: str)
     np.testing.assert_array_equal(spread[f"metrics/{name}"], alone[f"metrics/{name}"])
 
 
+def test_an_update_sums_once_a_minibatch_and_five_times_more(alone: Found, spread: Found) -> None:
+    assert int(alone["sums"]) == 0
+    assert int(spread["sums"]) == 1 + 5  # the first is in the loop over minibatches
+
+
 def test_the_curriculum_moves_on(alone: Found) -> None:
     assert np.ptp(alone["metrics/stage"]) > 1
 

@@ -3,7 +3,9 @@
 With a coordinator it is one of two processes, which have a device each.
 """
 
+import re
 import sys
+from typing import Any
 
 import jax
 import numpy as np
@@ -31,12 +33,13 @@ def main(out: str, devices: str, *more: str) -> None:
     config = load_train([*WORDS, f"devices={devices}"])
     program, schedule = programs.load(config)
     state = jax.jit(mesh.init(program))(schedule)
-    call = trainer.compile_chunk(program, schedule, state).call
+    call: Any = trainer.compile_chunk(program, schedule, state).call
     state, metrics = call(schedule, state, np.int32(config.updates))
     found = {
         jax.tree_util.keystr(path): np.asarray(leaf)
         for path, leaf in jax.tree_util.tree_leaves_with_path(state.learners)
     }
+    found["sums"] = np.array(len(re.findall(r" all-reduce(?:-start)?\(", call.as_text())))
     found |= {f"metrics/{name}": np.asarray(values) for name, values in metrics.items()}
     if jax.process_index() == 0:
         np.savez(out, allow_pickle=False, **found)
