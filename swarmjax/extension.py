@@ -96,7 +96,7 @@ class LevelDrawing(Piece):
     """A way of drawing levels: `(swarmjax.task.level.Level, key) -> Level`, of one arena."""
 
     kind: ClassVar[str] = "level"
-    taken: ClassVar[tuple[str, ...]] = ("random", "fixed")
+    taken: ClassVar[tuple[str, ...]] = ("random", "fixed", "map")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -14,12 +14,12 @@ from sentences import refusal
 from swarmjax.config import ConfigError, Section, about, build, files, to_dict
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.export.config import ExportConfig
-from swarmjax.report.config import ReportConfig
 from swarmjax.run.settings import RunConfig, TrainConfig, load_train
 from swarmjax.sim.config import SimConfig
 from swarmjax.task.config import RewardConfig
 from swarmjax.task.stage_config import StageConfig, smallest_side
 from swarmjax.task.stage_files import load_levels
+from swarmjax.verify import VerifyConfig
 
 STAGE = {"name": "s", "robots": 2, "side": 1.0}
 
@@ -154,7 +154,7 @@ def test_stages_of_a_curriculum_are_named_in_sentences():
 
 
 def test_a_missing_key_is_named():
-    assert refusal(files.load, ReportConfig, []) == "run is missing and has no default: give it."
+    assert refusal(files.load, VerifyConfig, []) == "run is missing and has no default: give it."
     assert refusal(build, TrainConfig, {"stage": [{"name": "s", "side": 1.0}]}) == (
         "stage.robots is missing and has no default: give it."
     )
