@@ -172,7 +172,7 @@ def _check_reach(
             raise ConfigError(
                 f"map has a target in row {target[0] + 1}, column {target[1] + 1} that cannot be "
                 f"reached from the start in row {start[0] + 1}, column {start[1] + 1}: leave a way "
-                "of whole cells."
+                "of cells that share edges."
             )
 
 

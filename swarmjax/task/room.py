@@ -37,9 +37,10 @@ def check(
         drawn = [level.sample(each, arrays, spacing, np) for each in uniforms]
         for area, problem in _AREAS.items():
             if any(problem(each, spacing) for each in drawn):
+                letters = int(arrays.map.pairs) if arrays.map else 0
                 raise ConfigError(
-                    f"stage {stage.name}: map has no room for {stage.robots} robots in {area}: "
-                    "give more or larger cells there, or fewer robots."
+                    f"stage {stage.name}: map has no room for {stage.robots - letters} robots in "
+                    f"{area}: give more or larger cells there, or fewer robots."
                 )
 
 
@@ -65,7 +66,7 @@ def _least(one: np.ndarray, other: np.ndarray) -> float:
 
 
 _AREAS = {
-    "T, or between targets with letters": _targets_overlap,
-    "S, or between starts with letters": _starts_overlap,
-    "S that is no target": _starts_arrived,
+    "T, beside targets with letters": _targets_overlap,
+    "S, beside starts with letters": _starts_overlap,
+    "S, apart from their targets": _starts_arrived,
 }

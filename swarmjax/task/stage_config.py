@@ -51,7 +51,10 @@ def complete(stage: dict[str, Any]) -> dict[str, Any]:
     rows = text.strip().split() if isinstance(text, str) else text
     rows = section.convert(tuple[str, ...], rows, "stage.map")
     cell = section.convert(float, stage.get("cell", StageConfig.cell), "stage.cell")
-    found = _read_map(typing.cast(tuple[str, ...], rows), typing.cast(float, cell))
+    try:
+        found = _read_map(typing.cast(tuple[str, ...], rows), typing.cast(float, cell))
+    except ConfigError as error:
+        raise ConfigError(f"stage {stage.get('name')}: {error}") from None
     said = {"side": found.side, "obstacles": len(found.wall), "level": "map"}
     return {**stage, "map": list(typing.cast(tuple[str, ...], rows)), **said}
 
@@ -143,11 +146,14 @@ class StageConfig(Section):
 
     def _check_robots(self, drawn: maps.Map) -> None:
         pairs = len(drawn.pair)
-        if self.robots < pairs or (self.robots > pairs and not len(drawn.start)):
+        if self.robots < pairs:
             raise ConfigError(
-                f"robots is {self.robots}, but map has letters for {pairs}"
-                f"{'' if len(drawn.start) else ' and no S and T'}: give {pairs}"
-                f"{' or more' if len(drawn.start) else ', or areas S and T'}."
+                f"robots is {self.robots}, but map has letters for {pairs}: give at least {pairs}."
+            )
+        if self.robots > pairs and not len(drawn.start):
+            raise ConfigError(
+                f"robots is {self.robots}, but map has letters for {pairs} and no S and T: give "
+                f"{pairs}, or areas S and T for the others."
             )
 
     @property

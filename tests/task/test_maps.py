@@ -103,14 +103,14 @@ def test_refuses_too_many_walls() -> None:
     rows = ["." * 12 if r % 2 else ".#" * 6 for r in range(16)]
     rows[0] = "S." * 5 + ".T"
     said = refusal(_stage, " ".join(rows), 1)
-    assert said.startswith("map has walls of ")
+    assert said.startswith("stage drawn: map has walls of ")
     assert "give at most 32" in said
 
 
 @pytest.mark.parametrize(
     ("text", "robots", "said"),
     [
-        (LETTERS, 1, "robots is 1, but map has letters for 2 and no S and T: give 2, or areas S "),
+        (LETTERS, 1, "robots is 1, but map has letters for 2: give at least 2."),
         (LETTERS, 3, "robots is 3, but map has letters for 2 and no S and T: give 2, or areas S "),
         ("aAST", 0, "robots is 0: give 1 to 100"),
     ],
@@ -141,8 +141,8 @@ def test_a_map_goes_with_its_level(given: dict) -> None:
 @pytest.mark.parametrize(
     ("text", "robots", "area"),
     [
-        ("S...T S...T S...T", 4, "T, or between targets with letters"),
-        ("S..TTT S..TTT ...TTT", 4, "S, or between starts with letters"),
+        ("S...T S...T S...T", 4, "T, beside targets with letters"),
+        ("S..TTT S..TTT ...TTT", 4, "S, beside starts with letters"),
     ],
 )
 def test_refuses_areas_without_room(text: str, robots: int, area: str) -> None:
