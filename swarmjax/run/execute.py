@@ -100,9 +100,11 @@ def _success(settings: TrainConfig, tally: Tally) -> str:
         found = spread([of_seed.get(stage.name) for of_seed in tally.targets_reached.values()])
         if found is not None:
             more = "" if stage.name == last else f"; {last} was not measured yet"
+            steps = settings.task.step_limit
+            seconds = steps * settings.task.control_step
             return (
-                f"targets reached on {stage.name}: {measured(found)}, over all episodes that began "
-                f"within one step limit{more}"
+                f"targets reached on {stage.name}: {measured(found)} within {steps} control steps "
+                f"({seconds:.3g} s), in a whole cohort of episodes{more}"
             )
     updates = words.count(
         math.ceil(settings.task.step_limit / settings.algo.rollout_length), "update"

@@ -17,14 +17,17 @@ def _tally(*by_seed: dict[str, float]) -> Tally:
 @pytest.mark.parametrize(
     ("by_seed", "said"),
     [
-        ([{"s1": 0.9, "s2": 0.65}], "targets reached on s2: 65.0 %, over all episodes that began"),
+        (
+            [{"s1": 0.9, "s2": 0.65}],
+            "targets reached on s2: 65.0 % within 500 control steps (16 s), in a whole cohort",
+        ),
         (
             [{"s2": 0.5}, {"s2": 0.7}],
-            "targets reached on s2: 60.0 % (50 to 70), over all episodes that began",
+            "targets reached on s2: 60.0 % (50 to 70) within 500 control steps (16 s), in a whole",
         ),
         (
             [{"s1": 0.9}],
-            "targets reached on s1: 90.0 %, over all episodes that began",
+            "targets reached on s1: 90.0 % within 500 control steps (16 s), in a whole cohort",
         ),
     ],
 )
