@@ -122,7 +122,7 @@ def take(
         Parameters and the optimiser's state after, and the metrics with `grad_norm`,
         `taken_steps` and `skipped_steps`, which are zero in a skipped step but for the last.
     """
-    (params, optimizer_state) = progress
+    params, optimizer_state = progress
     # In one sum: on several devices each one costs tens of microseconds, whatever its size.
     (gradient, metrics), devices = shards.sum((found, any_valid.astype(jnp.float32)))
     any_valid = devices > 0.0

@@ -56,8 +56,8 @@ class MapArrays(NamedTuple):
       wall: [W, 5] as in `Map`, float32.
       start: [C, 2] in units, int32.
       start_open: [C] whether it is a point of this stage, bool.
-      target: [D, 2] likewise.
-      target_open: [D] likewise.
+      target: [D, 2] in units, int32.
+      target_open: [D] whether it is a point of this stage, bool.
       pair: [P, 2, 2] in units, int32.
       pairs: how many of these there are, int32.
     """

@@ -46,12 +46,12 @@ def check(
 
 def _targets_overlap(drawn: Level, spacing: Spacing) -> bool:
     places = drawn.target[drawn.present]
-    return _least(places, places) < 2.0 * (spacing.hull_radius + MARGIN) - _ROUNDING
+    return _least(places) < 2.0 * (spacing.hull_radius + MARGIN) - _ROUNDING
 
 
 def _starts_overlap(drawn: Level, spacing: Spacing) -> bool:
     places = drawn.start[drawn.present, :2]
-    return _least(places, places) < 2.0 * spacing.hull_radius + MARGIN - _ROUNDING
+    return _least(places) < 2.0 * spacing.hull_radius + MARGIN - _ROUNDING
 
 
 def _starts_arrived(drawn: Level, spacing: Spacing) -> bool:
@@ -59,10 +59,10 @@ def _starts_arrived(drawn: Level, spacing: Spacing) -> bool:
     return bool(np.any(apart < spacing.target_radius))
 
 
-def _least(one: np.ndarray, other: np.ndarray) -> float:
-    """Returns the least distance of two different things, m."""
-    apart = np.linalg.norm(one[:, None] - other[None, :], axis=-1)
-    return float(np.min(apart + np.diag(np.full(len(one), np.inf)), initial=np.inf))
+def _least(places: np.ndarray) -> float:
+    """Returns the least distance between two of the places, m."""
+    apart = np.linalg.norm(places[:, None] - places[None, :], axis=-1)
+    return float(np.min(apart[np.triu_indices(len(places), 1)], initial=np.inf))
 
 
 _AREAS = {

@@ -1,5 +1,6 @@
 """A stage: its settings, the room that a level needs, and grids of stages."""
 
+import functools
 import itertools
 import math
 import re
@@ -59,7 +60,8 @@ def complete(stage: dict[str, Any]) -> dict[str, Any]:
     return {**stage, "map": list(typing.cast(tuple[str, ...], rows)), **said}
 
 
-def _read_map(rows: Sequence[str], cell: float) -> maps.Map:
+@functools.lru_cache(maxsize=64)
+def _read_map(rows: tuple[str, ...], cell: float) -> maps.Map:
     found = maps.read(rows, cell)
     if len(found.wall) > _MOST_OBSTACLES:
         raise ConfigError(
