@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.faults_runs import SECONDS, is_whole, start, train_command
+from benchmarks.faults_runs import is_whole, start, train_command, undisturbed
 from swarmjax.run import directory
 
 SIZES = 20
@@ -41,6 +41,7 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
     Returns:
         The kind of hindrance, what the run ended with, and what came of it.
     """
+    undisturbed()  # before a run starts: it takes as long as one
     number, random = seed % 1_000_000, np.random.default_rng(seed)
     if number < SIZES:
         return _judge("full disk", _full(number, folder), folder / "run")
@@ -136,7 +137,7 @@ def _begin(run: Path, random: np.random.Generator) -> None:
     """Trains for a while, then asks the run to stop."""
     process = start(run)
     with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(random.uniform(0.3, 1.0) * SECONDS)
+        process.wait(random.uniform(0.3, 1.0) * undisturbed().ends_s)
     process.terminate()
     process.communicate()
 
@@ -144,7 +145,7 @@ def _begin(run: Path, random: np.random.Generator) -> None:
 def _removed(random: np.random.Generator, folder: Path) -> dict[str, Any]:
     """Removes the directory of a run while it trains, and starts the run once more."""
     run = folder / "run"
-    wait = random.uniform(0.0, 0.3) * SECONDS
+    wait = random.uniform(0.0, 0.3) * undisturbed().ends_s
     log = run / directory.METRICS
     remove = f"while ! [ -e {log} ]; do sleep 0.05; done; sleep {wait:.3f}; rm -rf {run}"
     gone = subprocess.Popen(["sh", "-c", remove])
@@ -158,7 +159,7 @@ def _two(random: np.random.Generator, folder: Path) -> dict[str, Any]:
     """Starts a second process on the directory of a run."""
     run = folder / "run"
     first = start(run)
-    time.sleep(random.uniform(0.0, 0.8) * SECONDS)
+    time.sleep(random.uniform(0.0, 0.8) * undisturbed().ends_s)
     told = _hindered(train_command(run), {0, 2})
     first.communicate()
     # One of them trains and the other is refused; one that comes late finds nothing left to do.

@@ -16,7 +16,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,7 +40,6 @@ WORDS = (
 )
 INTERVAL = UPDATES // 10  # updates between two checkpoints
 KILLS = 4  # of a run, before it may end
-SECONDS = 8.0  # that a whole run takes, about
 _POLL = 0.002  # s
 
 
@@ -56,14 +55,45 @@ def start(run: Path) -> subprocess.Popen[str]:
     )
 
 
+class Undisturbed(NamedTuple):
+    """An undisturbed run.
+
+    Attributes:
+        digest: Of its last state.
+        begins_s: Seconds from its start until it logs its first update.
+        ends_s: Seconds from its start until its process ends.
+    """
+
+    digest: str
+    begins_s: float
+    ends_s: float
+
+
 @functools.cache
-def undisturbed() -> str:
-    """Digest of the last state of an undisturbed run."""
+def undisturbed() -> Undisturbed:
+    """Trains without a disturbance, on this machine and beside its other work."""
     with tempfile.TemporaryDirectory() as folder:
-        said, _ = start(Path(folder) / "run").communicate()
-        found = checkpoint.find(Path(folder) / "run")
+        run, began = Path(folder) / "run", time.monotonic()
+        process = start(run)
+        _wait_for_updates(process, run)
+        begins = time.monotonic() - began
+        said, _ = process.communicate()
+        ends, found = time.monotonic() - began, checkpoint.find(run)
         assert found.update == UPDATES, said
-        return digest(found.leaves)
+        return Undisturbed(digest(found.leaves), begins, ends)
+
+
+def _wait_for_updates(process: subprocess.Popen[str], run: Path) -> None:
+    """Waits until a run logs an update, or has ended. A run that goes on first cuts its log."""
+    before = now = _size(run / directory.METRICS)
+    while process.poll() is None and now <= before:
+        time.sleep(_POLL)
+        before, now = now, _size(run / directory.METRICS)
+
+
+def _size(file: Path) -> int:
+    """Bytes of a file; 0 if there is none."""
+    return file.stat().st_size if file.exists() else 0
 
 
 def newest(run: Path) -> int:
@@ -80,13 +110,14 @@ def logged(run: Path) -> list[int]:
 def kills(seed: int, folder: Path) -> dict[str, Any]:
     """Kills a run `KILLS` times, then lets it end.
 
-    Every other kill comes at any moment; the rest while a checkpoint is written, or within the
-    first second of a resume.
+    One comes at any moment, one while it trains, one while a checkpoint is written, and one within
+    the first second of a resume.
     """
+    undisturbed()  # before a run starts: it takes as long as one
     random, run = np.random.default_rng(seed), folder / "run"
     moments, repeated = [], []
     for number in range(KILLS):
-        how = ("any", "save", "any", "resume")[number % 4]
+        how = ("any", "save", "training", "resume")[number % 4]
         process = start(run)
         _MOMENTS[how](process, run, random)
         if process.poll() is None:  # otherwise the run ended before
@@ -111,7 +142,15 @@ def kills(seed: int, folder: Path) -> dict[str, Any]:
 
 def _at_any_moment(process: subprocess.Popen[str], _: Path, random: np.random.Generator) -> None:
     with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(random.uniform(0.0, SECONDS))
+        process.wait(random.uniform(0.0, undisturbed().ends_s))
+
+
+def _while_training(process: subprocess.Popen[str], run: Path, random: np.random.Generator) -> None:
+    """Waits until updates are logged, and up to as long as an undisturbed run trains."""
+    _wait_for_updates(process, run)
+    known = undisturbed()
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(random.uniform(0.0, known.ends_s - known.begins_s))
 
 
 def _while_saving(process: subprocess.Popen[str], run: Path, random: np.random.Generator) -> None:
@@ -141,6 +180,7 @@ def _in_the_first_second(
 
 _MOMENTS: dict[str, Callable[[subprocess.Popen[str], Path, np.random.Generator], None]] = {
     "any": _at_any_moment,
+    "training": _while_training,
     "save": _while_saving,
     "resume": _in_the_first_second,
 }
@@ -152,19 +192,25 @@ def is_whole(run: Path) -> dict[str, bool]:
         summary = json.loads((run / directory.SUMMARY).read_text())
         found = checkpoint.find(run)
         return {
-            "identical": found.update == UPDATES and digest(found.leaves) == undisturbed(),
+            "identical": found.update == UPDATES and digest(found.leaves) == undisturbed().digest,
             "log_complete": logged(run) == list(range(UPDATES)) and summary["updates"] == UPDATES,
         }
     return {"identical": False, "log_complete": False}
 
 
 def terms(seed: int, folder: Path) -> dict[str, Any]:
-    """Asks a run to stop, at any moment, as a scheduler does; then lets it end."""
+    """Asks a run to stop, as a scheduler does; then lets it end.
+
+    Two of three are asked while they train; the others at any moment, most of them while Python
+    starts and the program is compiled.
+    """
+    undisturbed()  # before the run starts: it takes as long as one
     random, run = np.random.default_rng(seed), folder / "run"
     number = (signal.SIGTERM, signal.SIGUSR1, signal.SIGINT)[seed % 3]
+    moment = "any" if seed // 3 % 3 == 0 else "training"
     process = start(run)
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(random.uniform(0.1, SECONDS))
+    time.sleep(0.1)  # until Python listens: a signal before that ends any program
+    _MOMENTS[moment](process, run, random)
     ended = process.poll() is not None
     process.send_signal(number)
     said, _ = process.communicate()
@@ -179,6 +225,7 @@ def terms(seed: int, folder: Path) -> dict[str, Any]:
     return {
         "outcome": "ok" if sound else "WRONG",
         "signal": signal.Signals(number).name,
+        "moment": moment,
         "code": process.returncode,
         "update": done,
         "repeated_updates": repeated,
