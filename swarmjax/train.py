@@ -36,7 +36,7 @@ def _command() -> int:
     heap.share()
     if rank.is_child():
         rank.begin()
-    with Stop(patient=rank.is_child()) as stop:
+    with Stop(patient=rank.is_child(), last=True) as stop:
         from swarmjax import command
         from swarmjax.run.errors import CheckpointError
         from swarmjax.run.settings import TrainConfig

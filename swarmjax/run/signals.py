@@ -37,14 +37,17 @@ class Stop:
       signalled: Whether somebody asked to stop, by a signal or by setting it.
     """
 
-    def __init__(self, until: float = math.inf, *, patient: bool = False) -> None:
+    def __init__(
+        self, until: float = math.inf, *, patient: bool = False, last: bool = False
+    ) -> None:
         """Nobody has asked yet; it stops by itself at `until`, of `time.monotonic`.
 
         One that is `patient` does not stop at once at a second signal: a scheduler sends each to a
-        process and to its parent, which hands it on.
+        process and to its parent, which hands it on. After one that is `last` the process ends, and
+        a signal no longer changes its exit code: what there was to save is saved.
         """
         self.signalled = False
-        self._patient = patient
+        self._patient, self._last = patient, last
         self.code: int | None = None
         self._until = until
 
@@ -71,10 +74,10 @@ class Stop:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Gives the signals back."""
+        """Gives the signals back; ignores them if the process ends."""
         signal.set_wakeup_fd(self._wakeup)
         for number, handler in self._before.items():
-            signal.signal(number, handler)
+            signal.signal(number, signal.SIG_IGN if self._last else handler)
         os.close(self._write)  # which ends the thread, when it has said what it has to
         self._thread.join()
 

@@ -80,3 +80,19 @@ def test_signals_are_given_back() -> None:
     with Stop():
         pass
     assert [signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGUSR1)] == before
+
+
+# Ends, as Python does after `sys.exit`, with a signal to itself on the way.
+_ENDING = """
+import atexit, os, sys
+from swarmjax.run.signals import Stop
+atexit.register(lambda: os.kill(os.getpid(), int(sys.argv[1])))
+with Stop(last=True):
+    pass
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
+def test_a_signal_after_all_is_saved_changes_no_exit_code(number: int) -> None:
+    process = subprocess.run([sys.executable, "-c", _ENDING, str(int(number))], check=False)
+    assert process.returncode == 0
