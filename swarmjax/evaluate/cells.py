@@ -28,6 +28,7 @@ from swarmjax.task.stage_config import StageConfig
 
 FORMAT = 1
 _TARGET_RADIUS = TaskConfig().target_radius
+_LARGEST_HALF = 2.5  # m, of a box: longer than half the largest arena
 MAX_BYTES = 2**30  # of all levels of a file; those of a thousand of s6 take 0.2 MB
 _LEAST_ROOM = 2**22  # bytes that any file may unpack to, and some times its own
 _PACKED = 20  # numbers drawn at random are packed to half their size, never to a thousandth
@@ -43,7 +44,7 @@ class Cell(NamedTuple):
         realism: Name of a preset, or None for that of the command.
         seed: That the levels were drawn with.
         episodes: [E] their numbers.
-        levels: [E], obstacles as the boxes that they are put together of, of the same sizes in all.
+        levels: [E], obstacles as the boxes that they are put together of.
     """
 
     name: str
@@ -61,8 +62,13 @@ class Cell(NamedTuple):
 
     @property
     def half(self) -> np.ndarray:
-        """[M, 2] half edges of the boxes, m."""
+        """[M, 2] half edges of the boxes of the first level, m; those of others may differ."""
         return self.levels.obstacle[0, :, 3:]
+
+    @property
+    def largest_half(self) -> np.ndarray:
+        """[M, 2] largest half edges of each box in any level, m."""
+        return self.levels.obstacle[..., 3:].max(axis=0)
 
 
 class Suite(NamedTuple):
@@ -349,8 +355,8 @@ def _check_levels(name: str, levels: Level, stage: StageConfig) -> None:
         "start lies outside the walls": np.abs(levels.start[..., :2]) > half,
         "target lies outside the walls": np.abs(levels.target) > half,
         "obstacle has half edges of 0 or less": boxes <= 0.0,
-        "obstacle has half edges that differ from level to level": boxes != boxes[:1],
         "obstacle lies outside the walls": levels.obstacle_present[..., None] & (place > half),
+        "obstacle is longer than the largest arena": boxes > _LARGEST_HALF,
         "obstacle is not present, but stands inside the walls": ~levels.obstacle_present
         & (place < beyond).all(axis=-1),
     }

@@ -38,7 +38,7 @@ class Arenas(NamedTuple):
     """Arenas between two control steps. Of these, MuJoCo edits `data` in place.
 
     Attributes:
-        model: [A] of `MjModel`, all the same one unless robots differ from the nominal one.
+        model: [A] of `MjModel`, all the same one unless robots or boxes differ between episodes.
         data: [A] of `MjData`, positions up to date.
         factors: [A] of the episodes.
         memory: [A] of the robots' electronics.
@@ -109,7 +109,7 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
 
     Args:
         judge: What the arenas share.
-        levels: [A], with the robots of the judge's stage, and boxes of the sizes it has.
+        levels: [A], with as many robots and boxes as the judge's stage has.
 
     Returns:
         The arenas at rest, observed.
@@ -121,7 +121,7 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     seed, side = begun.seed, begun.side
     realism, robot, boxes = judge.config.realism, judge.config.robot, obstacle.shape[1]
     factors = task_factors.draw(seed, realism, robot, judge.spacing.robots, boxes, np)
-    model = _models(judge, factors, len(levels))
+    model = _models(judge, factors, obstacle[..., 3:])
     data = np.empty(len(levels), object)
     data[:] = [place(judge, *each) for each in zip(model, pose, obstacle, side, strict=True)]
     outcome = _no_outcome(len(levels), judge.spacing.robots)
@@ -163,21 +163,30 @@ def _no_outcome(count: int, robots: int) -> Outcome:
     )
 
 
-def _models(judge: Judge, factors: Factors, count: int) -> np.ndarray:
-    """Returns the models [A] of arenas, each with the robots that its episode has."""
-    models = np.full(count, judge.model, object)
+def _models(judge: Judge, factors: Factors, half: np.ndarray) -> np.ndarray:
+    """Returns the models [A] of arenas, with the robots and boxes [A, M, 2] of each episode."""
+    models = _with_boxes(judge, half)
     chassis = electronics.chassis(factors)
     if all(part is None for part in chassis):
         return models
     body = sim_model.BODIES[judge.config.robot.body]
-    for i in range(count):
-        models[i] = copy.copy(judge.model)
+    for i in range(len(models)):
+        models[i] = copy.copy(models[i])
         mine = _select(chassis, i)
         changes = body.changes(mine, judge.ids.robots, judge.config.robot, judge.model)
         for name, (rows, values) in changes.items():
             getattr(models[i], name)[rows] = values
         # What MuJoCo derives from them: it reads the inertia of a planar robot from there.
         mujoco.mj_setConst(models[i], mujoco.MjData(models[i]))
+    return models
+
+
+def _with_boxes(judge: Judge, half: np.ndarray) -> np.ndarray:
+    """Returns models [A] with boxes of these half edges [A, M, 2]; one where they are alike."""
+    models = np.full(len(half), judge.model, object)
+    compiled = judge.model.geom_size[judge.ids.obstacle_geom, :2]
+    for i in np.flatnonzero((half != compiled).any(axis=(1, 2))):
+        models[i] = sim_model.resize_obstacles(judge.model, judge.ids, half[i])
     return models
 
 
@@ -194,7 +203,7 @@ def place(
         judge: What the arenas share.
         model: Of the arena.
         pose: [R, 3] x (m), y (m), yaw (rad).
-        obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m; those the model was compiled for).
+        obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m; those of the model).
         side: Of the arena, m; the stage's if there is none.
 
     Returns:

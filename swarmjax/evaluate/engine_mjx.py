@@ -31,7 +31,7 @@ from swarmjax.ppo.learner import LearnerState
 from swarmjax.sim import noise, physics
 from swarmjax.sim.config import SimConfig
 from swarmjax.sim.noise import Stream
-from swarmjax.task import electronics, env, level
+from swarmjax.task import electronics, env, level, placement
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
 from swarmjax.task.level import Level, Spacing
@@ -106,7 +106,7 @@ def _make_room(drawn: Level, spacing: Spacing) -> Level:
         target=widened(drawn.target, robots),
         obstacle_present=widened(drawn.obstacle_present, obstacles),
         # Whatever is parked has edges too; these nobody meets.
-        obstacle=widened(drawn.obstacle, obstacles, (0, 0, 0, level.MARGIN, level.MARGIN)),
+        obstacle=widened(drawn.obstacle, obstacles, (0, 0, 0, placement.MARGIN, placement.MARGIN)),
     )
     return level.park(wider, np)
 
@@ -125,7 +125,8 @@ def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
     Raises:
       ConfigError: if a box is larger than the engine may be compiled for.
     """
-    stage = config.stage if config.stage.level == "fixed" else _largest(config.stage, half)
+    fits = half.max(initial=0.0) <= task_stage.largest_half([config.stage])
+    stage = config.stage if fits else _largest(config.stage, half)
     sim = SimConfig(
         max_robots=stage.robots, max_obstacles=len(half), substeps=judge.substeps(config)
     )

@@ -1,7 +1,6 @@
 """The judge's infrared rays: MuJoCo's own, cast on the real shapes. No JAX."""
 
 from dataclasses import dataclass
-from functools import partial
 
 import mujoco
 import numpy as np
@@ -50,7 +49,7 @@ def cast_rays(
 
     Args:
         scene: What rays are cast in.
-        data: [A] of `MjData`, positions up to date.
+        data: [A] of `MjData`, positions up to date, each of a model whose boxes have its sizes.
         pose: [A, R, 3] x (m), y (m), yaw (rad).
         obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
         mount: How far off the sensors sit.
@@ -69,11 +68,11 @@ def cast_rays(
     toward = np.concatenate([direction, flat, -direction, flat], axis=-1)
     distance, normal = np.zeros((len(origin), 2)), np.zeros_like(toward)
     met = np.full((len(origin), 2), -1, np.int32)
-    cast_one, far = partial(mujoco.mj_multiRay, scene.model), mujoco.mjMAXVAL
+    cast_one, far = mujoco.mj_multiRay, mujoco.mjMAXVAL
     body = scene.ids.hull_body[robot].tolist()
     rays = zip(data[arena], body, origin, toward, met, distance, normal, strict=True)
     for where, me, start, ways, geom, reach, face in rays:
-        cast_one(where, start, ways, _RAY_GROUPS, True, me, geom, reach, face, 2, far)
+        cast_one(where.model, where, start, ways, _RAY_GROUPS, True, me, geom, reach, face, 2, far)
     leaves = (normal * toward).reshape(-1, 2, 3).sum(axis=-1) > 0.0
     ahead = np.where(distance[:, 0] < 0.0, limit, distance[:, 0])  # -1: nothing there
     seen, geoms = np.full(near.shape, limit), np.full(near.shape, -1)

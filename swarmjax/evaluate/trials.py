@@ -152,7 +152,7 @@ def _by_mjx(
     for cell in cells:
         mine, outcomes = specialise(config, cell, entrants[0].path), []
         with compile_cache.use(compile_cache.AUTO):
-            world = engine_mjx.load(mine, cell.half, len(cell.episodes))
+            world = engine_mjx.load(mine, cell.largest_half, len(cell.episodes))
             for each in entrants:
                 found = engine_mjx.play(
                     world,

@@ -133,7 +133,7 @@ class SimConfig(Section):
     )
     max_obstacles: int | None = field(
         default=None,
-        metadata=about("obstacles compiled in; null: 4, or as many as the stages need", 0, 32),
+        metadata=about("obstacles compiled in; null: 4, or as many as the stages need", 0, 64),
     )
     substeps: int | None = field(
         default=None,

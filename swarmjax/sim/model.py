@@ -4,6 +4,7 @@ Everything that a stage may change (side, obstacles, who is there) is a pose or 
 run time; the model itself is compiled once for the largest case. MuJoCo only, no JAX.
 """
 
+import copy
 import itertools
 from typing import Any, Literal, NamedTuple
 
@@ -113,6 +114,27 @@ def ids(model: mujoco.MjModel, size: ArenaSize) -> Ids:
         hull_body=np.array([model.body(f"robot{i}").id for i in range(size.robots)], np.int32),
         robots=find_rows(model, size.robots),
     )
+
+
+def resize_obstacles(model: mujoco.MjModel, ids: Ids, half: np.ndarray) -> mujoco.MjModel:
+    """Gives the obstacles of a compiled arena other sizes.
+
+    MuJoCo derives the bounds of a box from its size when it compiles one, and nothing else.
+
+    Args:
+      model: of `build`, with `fixtures="mocap"`; it stays as it is.
+      ids: of `ids`.
+      half: [M, 2] half edges, m.
+
+    Returns:
+      The model that `build` makes with these sizes.
+    """
+    found, geoms = copy.copy(model), ids.obstacle_geom
+    size = np.column_stack([half, np.full(len(half), HALF_HEIGHT)])
+    found.geom_size[geoms] = size
+    found.geom_rbound[geoms] = np.linalg.norm(size, axis=-1)
+    found.geom_aabb[geoms, 3:] = size
+    return found
 
 
 def fixture_rectangles(side: Any, obstacle: Any, xp: Any) -> Any:

@@ -12,13 +12,18 @@ import numpy as np
 from swarmjax.sim import noise
 from swarmjax.sim.noise import Stream
 from swarmjax.task import fixed_level
+from swarmjax.task.layouts import drawing
+from swarmjax.task.layouts.drawing import Kind, LayoutArrays, RobotSizes
 from swarmjax.task.maps import MapArrays
 from swarmjax.task.placement import (
     UNITS,
     Gap,
+    clearance,
+    gaps_of,
     lattice,
     metres,
     place,
+    round_up,
     score_open,
     score_rectangles,
     score_things,
@@ -32,8 +37,6 @@ Array = Any
 
 PARKING = 5.0  # m; where absent robots and obstacles wait, outside the walls of any arena
 PARKING_SPACING = 0.5  # m
-MARGIN = 0.02  # m; least free space beside anything at the start
-TARGET_SPACING = 0.25  # m; least distance of targets where the arena has room
 
 
 class Level(NamedTuple):
@@ -126,6 +129,10 @@ def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
         mapped = _mapped(drawn, stage, stage.map, spacing, xp)
         choose = partial(xp.where, stage.map.mapped)
         level = Level(*(choose(m, other) for m, other in zip(mapped, level, strict=True)))
+    for kind, arrays in (stage.layouts or {}).items():
+        laid_out = _laid_out(kind, arrays, level.seed, stage, spacing, xp)
+        choose = partial(xp.where, arrays.chosen)
+        level = Level(*(choose(mine, other) for mine, other in zip(laid_out, level, strict=True)))
     return park(level, xp)
 
 
@@ -183,9 +190,9 @@ def _side(stage: Stage, seed: Array, xp: Any) -> Array:
 def _place_obstacles(drawn: _Uniforms, stage: Stage, side: Array, xp: Any) -> _Obstacles:
     """Places boxes, turned at random, so that their outer circles leave a passage everywhere."""
     radius = units(stage.obstacle_size * np.float32(math.sqrt(0.5)), xp) + 1
-    gap = 2 * radius + _units(PASSAGE)
+    gap = 2 * radius + round_up(PASSAGE)
     points = lattice(drawn.obstacle_shift, side, xp)
-    score = score_walls(points, side, radius + _units(PASSAGE), xp)
+    score = score_walls(points, side, radius + round_up(PASSAGE), xp)
     there = xp.arange(drawn.obstacle.shape[0]) < stage.obstacles
     centre, there = place(points, score, drawn.obstacle, there, Gap(gap, gap), xp)
     return _Obstacles(centre, there, radius)
@@ -197,13 +204,13 @@ def _place_targets(
     """Places targets so that parked robots leave a way through; returns [R, 2] units."""
     hull, reach = spacing.hull_radius, spacing.target_radius
     beside = Gap(
-        around.radius + _units(hull + MARGIN),
+        around.radius + clearance(hull),
         # A robot parked on this side of its target, and another one passing behind it.
-        around.radius + _units(reach + 3.0 * hull),
+        around.radius + round_up(reach + 3.0 * hull),
     )
-    apart = _gaps(hull, reach).target
+    apart = gaps_of(hull, reach).target
     points = lattice(drawn.target_shift, side, xp)
-    score = score_walls(points, side, _units(hull + MARGIN), xp)
+    score = score_walls(points, side, clearance(hull), xp)
     score = xp.minimum(score, score_things(points, around.centre, around.there, beside, xp))
     return place(points, score, drawn.target, present, apart, xp)[0]
 
@@ -219,34 +226,14 @@ def _place_starts(
 ) -> Array:
     """Places starts clear of everything that is or may come to be there; returns [R, 2] units."""
     hull, reach = spacing.hull_radius, spacing.target_radius
-    beside = _units(hull + MARGIN) + around.radius
-    _, from_target, apart = _gaps(hull, reach)
+    beside = clearance(hull) + around.radius
+    _, from_target, apart = gaps_of(hull, reach)
     points = lattice(drawn.start_shift, side, xp)
-    score = score_walls(points, side, _units(hull + MARGIN), xp)
+    score = score_walls(points, side, clearance(hull), xp)
     walled = score_things(points, around.centre, around.there, Gap(beside, beside), xp)
     clear = score_things(points, target, present, from_target, xp)
     score = xp.minimum(score, xp.minimum(walled, clear))
     return place(points, score, drawn.start, present, apart, xp)[0]
-
-
-class _Gaps(NamedTuple):
-    """Distances between targets, from starts to targets, and between starts."""
-
-    target: Gap
-    from_target: Gap
-    start: Gap
-
-
-def _gaps(hull: float, reach: float) -> _Gaps:
-    """Works the distances out, of a hull's radius and of that of the arrival zone, m."""
-    # Two robots parked on the near sides of their targets let a third one through.
-    through = max(TARGET_SPACING, 2.0 * reach + 4.0 * hull)
-    return _Gaps(
-        target=Gap(_units(2.0 * hull + 2.0 * MARGIN), _units(through)),
-        # No robot starts where it has arrived already; better, none starts where another may park.
-        from_target=Gap(_units(reach + MARGIN), _units(reach + 2.0 * hull + MARGIN)),
-        start=Gap(_units(2.0 * hull + MARGIN), _units(2.0 * hull + 2.0 * MARGIN)),
-    )
 
 
 def _fixed(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
@@ -270,7 +257,7 @@ def _mapped(drawn: _Uniforms, stage: Stage, arena: MapArrays, spacing: Spacing, 
     pair = _rows(arena.pair, spacing.robots, xp)
     hull, reach = spacing.hull_radius, spacing.target_radius
     score = partial(_score_on_map, stage, arena, spacing, xp)
-    target_apart, from_target, start_apart = _gaps(hull, reach)
+    target_apart, from_target, start_apart = gaps_of(hull, reach)
     among = partial(_place_among, present=present, paired=paired, xp=xp)
     free = score(arena.target, arena.target_open)
     target = among(arena.target, free, pair[:, 1], target_apart, drawn.target)
@@ -291,11 +278,32 @@ def _mapped(drawn: _Uniforms, stage: Stage, arena: MapArrays, spacing: Spacing, 
     )
 
 
+def _laid_out(
+    kind: Kind, of: LayoutArrays, seed: Array, stage: Stage, spacing: Spacing, xp: Any
+) -> Level:
+    """Lays an arena out; robots and walls beyond those of the layout are absent."""
+    present = xp.arange(spacing.robots) < stage.robots
+    sizes = RobotSizes(spacing.hull_radius, spacing.target_radius)
+    arena = drawing.draw(kind, of, seed, present, sizes, xp)
+    walls, count = len(arena.obstacle), spacing.obstacles
+    absent = xp.stack([xp.zeros_like(stage.obstacle_size)] * 3 + [0.5 * stage.obstacle_size] * 2)
+    mine = np.arange(count)[:, None] < walls
+    return Level(
+        side=arena.side,
+        present=present,
+        start=arena.start,
+        target=arena.target,
+        obstacle_present=_rows(arena.obstacle_present, count, xp),
+        obstacle=xp.where(mine, _rows(arena.obstacle, count, xp), absent),
+        seed=seed,
+    )
+
+
 def _score_on_map(
     stage: Stage, arena: MapArrays, spacing: Spacing, xp: Any, points: Array, is_open: Array
 ) -> Array:
     """Scores the points of an area by whether a robot has room there, [P]."""
-    gap = _units(spacing.hull_radius + MARGIN)
+    gap = clearance(spacing.hull_radius)
     there = xp.arange(arena.wall.shape[0]) < stage.obstacles
     rectangle = units(arena.wall[:, np.array([0, 1, 3, 4])], xp)
     beside = score_rectangles(points, rectangle, there, gap, xp)
@@ -349,8 +357,3 @@ def park(level: Level, xp: Any) -> Level:
         target=xp.where(present, level.target, robot[:, :2]),
         obstacle=xp.concatenate([place, level.obstacle[:, 2:]], axis=-1),
     )
-
-
-def _units(metres: float) -> int:
-    """Rounds a length up to units, so that no distance comes out shorter than asked."""
-    return math.ceil(metres * UNITS)

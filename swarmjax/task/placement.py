@@ -5,12 +5,15 @@ unit is 1/4096 m: a power of two, so that metres come out of it exactly, and so 
 distances within the largest arena fit an int32.
 """
 
+import math
 from typing import Any, NamedTuple
 
 Array = Any
 
 UNITS = 4096  # per metre; (4 m * sqrt(2) * 4096)**2 = 5.4e8 < 2**30
 LATTICE = 24  # points along a side
+MARGIN = 0.02  # m; least free space beside anything at the start
+TARGET_SPACING = 0.25  # m; least distance of targets where the arena has room
 _FORBIDDEN = -(2**30)  # scores at or below half of this break a hard distance
 
 
@@ -24,6 +27,44 @@ class Gap(NamedTuple):
 
     hard: Array
     soft: Array
+
+
+class Gaps(NamedTuple):
+    """Distances between targets, from starts to targets, and between starts."""
+
+    target: Gap
+    from_target: Gap
+    start: Gap
+
+
+def gaps_of(hull: float, reach: float) -> Gaps:
+    """Works out how far apart starts and targets are.
+
+    Args:
+      hull: radius of a robot, m.
+      reach: radius of the zone of arrival, m.
+
+    Returns:
+      Distances in units.
+    """
+    # Two robots parked on the near sides of their targets let a third one through.
+    through = max(TARGET_SPACING, 2.0 * reach + 4.0 * hull)
+    return Gaps(
+        target=Gap(round_up(2.0 * hull + 2.0 * MARGIN), round_up(through)),
+        # No robot starts where it has arrived already; better, none starts where another may park.
+        from_target=Gap(round_up(reach + MARGIN), round_up(reach + 2.0 * hull + MARGIN)),
+        start=Gap(round_up(2.0 * hull + MARGIN), round_up(2.0 * hull + 2.0 * MARGIN)),
+    )
+
+
+def clearance(hull: float) -> int:
+    """Least distance of a robot's centre to a wall at the start, units."""
+    return round_up(hull + MARGIN)
+
+
+def round_up(metres: float) -> int:
+    """Rounds a length up to units, so that no distance comes out shorter than asked."""
+    return math.ceil(metres * UNITS)
 
 
 def units(metres: Array, xp: Any) -> Array:

@@ -1,24 +1,26 @@
-"""Whether the areas of a stage's map have room for its robots."""
+"""Whether the map or the layout of a stage has room for its robots."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from swarmjax.config import ConfigError
+from swarmjax.config import ConfigError, show
 from swarmjax.extension import LevelDrawing
 from swarmjax.task import level
 from swarmjax.task import stage as task_stage
-from swarmjax.task.level import MARGIN, Level, Spacing
+from swarmjax.task.level import Level, Spacing
+from swarmjax.task.placement import MARGIN
 from swarmjax.task.stage_config import StageConfig
 
 _TRIED = 16  # levels of a map that are looked at
 _ROUNDING = 1.0 / 1024  # m; points are rounded to units of 1/4096 m, each way
+_BESIDE = 0.003  # m, between a hull and either jamb of the narrowest door
 
 
 def check(
     stages: Sequence[StageConfig], spacing: Spacing, drawings: Sequence[LevelDrawing] = ()
 ) -> None:
-    """Refuses maps in which robots or targets would be on top of each other.
+    """Refuses maps and layouts in which robots or targets would be on top of each other.
 
     Args:
       stages: those that will be run.
@@ -26,22 +28,58 @@ def check(
       drawings: an extension's ways of drawing levels.
 
     Raises:
-      ConfigError: naming the stage, the area and what would help.
+      ConfigError: naming the stage, what has no room, and what would help.
     """
+    for stage in stages:
+        if stage.map:
+            _check_map(stage, _sample(stage, spacing, drawings), spacing)
+        elif stage.kind is not None:
+            _check_gap(stage, spacing)
+            _check_layout(stage, _sample(stage, spacing, drawings), spacing)
+
+
+def _sample(stage: StageConfig, spacing: Spacing, drawings: Sequence[LevelDrawing]) -> list[Level]:
+    """Draws some levels of a stage."""
     count = level.uniform_count(spacing)
     uniforms = np.random.default_rng(0).random((_TRIED, count), dtype=np.float32)
-    for stage in stages:
-        if not stage.map:
-            continue
-        arrays = task_stage.single(stage, drawings)
-        drawn = [level.sample(each, arrays, spacing, np) for each in uniforms]
-        for area, problem in _AREAS.items():
-            if any(problem(each, spacing) for each in drawn):
-                letters = int(arrays.map.pairs) if arrays.map else 0
-                raise ConfigError(
-                    f"stage {stage.name}: map has no room for {stage.robots - letters} robots in "
-                    f"{area}: give more or larger cells there, or fewer robots."
-                )
+    arrays = task_stage.single(stage, drawings)
+    return [level.sample(each, arrays, spacing, np) for each in uniforms]
+
+
+def _check_map(stage: StageConfig, drawn: Sequence[Level], spacing: Spacing) -> None:
+    for area, problem in _AREAS.items():
+        if any(problem(each, spacing) for each in drawn):
+            letters = len(stage.drawn_map.pair) if stage.drawn_map else 0
+            raise ConfigError(
+                f"stage {stage.name}: map has no room for {stage.robots - letters} robots in "
+                f"{area}: give more or larger cells there, or fewer robots."
+            )
+
+
+def _check_gap(stage: StageConfig, spacing: Spacing) -> None:
+    """Refuses doors and corridors that are narrower than a robot."""
+    least = 2.0 * (spacing.hull_radius + _BESIDE)
+    for key in ("gap", "width"):
+        found = stage.smallest(key)
+        if found is not None and found < least:
+            raise ConfigError(
+                f"stage {stage.name}: {key} is {show(found)}, but a robot is "
+                f"{show(2.0 * spacing.hull_radius)} m wide: give at least {show(round(least, 4))}."
+            )
+
+
+def _check_layout(stage: StageConfig, drawn: Sequence[Level], spacing: Spacing) -> None:
+    problems = (_hulls_overlap, _starts_arrived)
+    if any(problem(each, spacing) for each in drawn for problem in problems):
+        raise ConfigError(
+            f"stage {stage.name}: level={stage.level} has no room for {stage.robots} robots in an "
+            f"arena of {show(stage.side)} m: give fewer robots, or a larger side."
+        )
+
+
+def _hulls_overlap(drawn: Level, spacing: Spacing) -> bool:
+    places = (drawn.target[drawn.present], drawn.start[drawn.present, :2])
+    return min(map(_least, places)) < 2.0 * spacing.hull_radius
 
 
 def _targets_overlap(drawn: Level, spacing: Spacing) -> bool:

@@ -8,7 +8,11 @@ import numpy as np
 from swarmjax.config import ConfigError, show
 from swarmjax.extension import LevelDrawing
 from swarmjax.task import fixed_level, maps
+from swarmjax.task.layouts import drawing
+from swarmjax.task.layouts.drawing import Kind, LayoutArrays
+from swarmjax.task.layouts.site import THICKNESS
 from swarmjax.task.maps import MapArrays
+from swarmjax.task.placement import UNITS
 from swarmjax.task.stage_config import BUILT_IN, StageConfig
 
 Array = Any
@@ -27,6 +31,7 @@ class Stage(NamedTuple):
       fence: the obstacle of a fixed level is the fence instead of boxes, bool.
       drawing: 1 + index of the extension's way of drawing its levels, 0 for none, int32.
       map: the maps; None if no stage has one.
+      layouts: numbers of those that stages are laid out by, by kind; None if none is.
     """
 
     robots: Array
@@ -38,6 +43,7 @@ class Stage(NamedTuple):
     fence: Array
     drawing: Array
     map: MapArrays | None = None
+    layouts: dict[Kind, LayoutArrays] | None = None
 
 
 def stack(stages: Sequence[StageConfig], drawings: Sequence[LevelDrawing] = ()) -> Stage:
@@ -63,6 +69,7 @@ def stack(stages: Sequence[StageConfig], drawings: Sequence[LevelDrawing] = ()) 
         fence=np.array([s.layout == "fence" for s in stages]),
         drawing=np.array([_drawing(s, names) for s in stages], np.int32),
         map=maps.stack([stage.drawn_map for stage in stages]),
+        layouts=drawing.stack([stage.laid_out for stage in stages]) or None,
     )
 
 
@@ -73,9 +80,14 @@ def single(stage: StageConfig, drawings: Sequence[LevelDrawing] = ()) -> Stage:
 
 def select(stages: Stage, index: Array) -> Stage:
     """Picks stages [...] by index [...] out of [S]."""
-    *fields, drawn = stages
+    *fields, drawn, laid_out = stages
     drawn = None if drawn is None else MapArrays(*(field[index] for field in drawn))
-    return Stage(*(field[index] for field in fields), map=drawn)
+    if laid_out is not None:
+        laid_out = {
+            kind: LayoutArrays(*(field[index] for field in arrays))
+            for kind, arrays in laid_out.items()
+        }
+    return Stage(*(field[index] for field in fields), map=drawn, layouts=laid_out)
 
 
 def largest_half(stages: Sequence[StageConfig]) -> float:
@@ -110,6 +122,8 @@ def _drawing(stage: StageConfig, drawings: Sequence[str]) -> int:
 
 def _half(stage: StageConfig) -> float:
     """Half the longest edge of the obstacles of a stage, m."""
+    if stage.laid_out is not None:
+        return 0.5 * stage.sides[1] + THICKNESS / UNITS  # no wall is longer than the arena
     if (drawn := stage.drawn_map) is not None:
         return float(drawn.wall[:, 3:].max(initial=0.5 * stage.obstacle_size))
     if stage.layout == "fence":

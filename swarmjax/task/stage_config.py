@@ -12,6 +12,10 @@ from typing import Any, Literal
 from swarmjax.config import ConfigError, Section, about, section, show
 from swarmjax.sim.config import SimConfig
 from swarmjax.task import maps
+from swarmjax.task.layouts import LAYOUTS
+from swarmjax.task.layouts.drawing import Kind
+from swarmjax.task.layouts.site import NUMBERS, ArenaLayout, Demand
+from swarmjax.task.placement import UNITS
 
 # The room that a random level asks for. A start and a target each take a square of 0.15 m (two
 # hulls of 0.074 m side by side); an obstacle takes the square about its circumscribed circle,
@@ -26,11 +30,11 @@ PASSAGE = 0.10  # m; between obstacles, and between an obstacle and a wall
 FILLING = 0.4  # boxes per square of a grid that random placing surely reaches
 
 
-BUILT_IN = ("random", "fixed", "map")  # ways of drawing levels
+BUILT_IN = ("random", "fixed", "map", *LAYOUTS)  # ways of drawing levels
 _OR = "or the name of a drawing of extensions"
 
 
-_MOST_OBSTACLES = 32
+_MOST_OBSTACLES = 64
 _SMALLEST_CELL = 0.08  # m; a robot of 0.074 m and 3 mm on either side
 
 
@@ -48,7 +52,7 @@ def complete(stage: dict[str, Any]) -> dict[str, Any]:
     """
     text = stage.get("map")
     if not text:
-        return stage
+        return _with_walls(stage)
     rows = text.strip().split() if isinstance(text, str) else text
     rows = section.convert(tuple[str, ...], rows, "stage.map")
     cell = section.convert(float, stage.get("cell", StageConfig.cell), "stage.cell")
@@ -58,6 +62,15 @@ def complete(stage: dict[str, Any]) -> dict[str, Any]:
         raise ConfigError(f"stage {stage.get('name')}: {error}") from None
     said = {"side": found.side, "obstacles": len(found.wall), "level": "map"}
     return {**stage, "map": list(typing.cast(tuple[str, ...], rows)), **said}
+
+
+def _with_walls(stage: dict[str, Any]) -> dict[str, Any]:
+    """Adds to a stage with a layout how many walls it has, unless it says so itself."""
+    if stage.get("level") not in LAYOUTS or "obstacles" in stage:
+        return stage
+    cells = section.convert(int | None, stage.get("cells"), "stage.cells")
+    kind = Kind(stage["level"], typing.cast(int | None, cells) or 0, bool(stage.get("breadth")))
+    return {**stage, "obstacles": kind.walls}
 
 
 @functools.lru_cache(maxsize=64)
@@ -71,6 +84,7 @@ def _read_map(rows: tuple[str, ...], cell: float) -> maps.Map:
     return found
 
 
+_Length = float | tuple[float, float] | None
 _Cell = tuple[int, int, float | tuple[float, float]]  # robots, obstacles, side
 
 
@@ -91,7 +105,8 @@ class StageConfig(Section):
         default="random",
         metadata=about(
             "random: a new one every episode; fixed: always the same; map: the walls of map, with "
-            "new starts and targets; or a drawing of extensions"
+            f"new starts and targets; {', '.join(LAYOUTS)}: new walls, laid out so; or a drawing "
+            "of extensions"
         ),
     )
     layout: Literal["boxes", "fence"] = field(
@@ -108,6 +123,37 @@ class StageConfig(Section):
         default=0.12, metadata=about("edge of a letter of map, m", _SMALLEST_CELL, 1.0)
     )
 
+    breadth: _Length = field(
+        default=None,
+        metadata=about(
+            "extent across side of a layout's arena, m, or a range; null: as long as side", 0.2, 4.0
+        ),
+    )
+    gap: _Length = field(
+        default=None,
+        metadata=about("free width of a door or a corridor, m, or a range", _SMALLEST_CELL, 1.0),
+    )
+    width: _Length = field(
+        default=None,
+        metadata=about(
+            "free width of a trap, or of a corridor at its bay, m, or a range", 0.1, 2.0
+        ),
+    )
+    depth: _Length = field(default=None, metadata=about("of a trap, m, or a range", 0.05, 2.0))
+    length: _Length = field(
+        default=None, metadata=about("of a fence, or of a bay, m, or a range", 0.1, 4.0)
+    )
+    radius: _Length = field(
+        default=None, metadata=about("of the circle of starts, m, or a range", 0.1, 1.9)
+    )
+    apart: _Length = field(
+        default=None,
+        metadata=about(
+            "distance between targets, or of targets from a door, m, or a range", 0.05, 1
+        ),
+    )
+    cells: int | None = field(default=None, metadata=about("of a maze, along its side", 2, 6))
+
     def _check(self) -> None:
         if not re.fullmatch(r"[a-z][a-z0-9_]{0,39}", self.level):
             raise ConfigError(f"level is {show(self.level)}: give {' or '.join(BUILT_IN)}, {_OR}.")
@@ -120,7 +166,8 @@ class StageConfig(Section):
         if self.level == "fixed" and isinstance(self.side, tuple):
             raise ConfigError(f"side is {show(self.side)}, but level is fixed: give one number.")
         self._check_map()
-        least = 0.0 if self.map else smallest_side(self)
+        self._check_layout()
+        least = 0.0 if self.map or self.level in LAYOUTS else smallest_side(self)
         if self.sides[0] < least:
             raise ConfigError(
                 f"side is {show(self.side)}, too small for robots={self.robots}, "
@@ -157,6 +204,78 @@ class StageConfig(Section):
                 f"robots is {self.robots}, but map has letters for {pairs} and no S and T: give "
                 f"{pairs}, or areas S and T for the others."
             )
+
+    def _check_layout(self) -> None:
+        layout = LAYOUTS.get(self.level)
+        reads = () if layout is None else layout.reads
+        keys = [*NUMBERS, *(["breadth"] if layout is None or layout.square else [])]
+        for key in [*keys, *([] if self.level == "maze" else ["cells"])]:
+            given = getattr(self, key)
+            if given is not None and key not in reads:
+                raise ConfigError(
+                    f"{key} is {show(given)}, but level is {self.level}, which has none: leave "
+                    f"{key} out."
+                )
+            if given is None and key in reads:
+                raise ConfigError(f"{key} is missing: level={self.level} needs {_and(reads)}.")
+        if layout is not None:
+            self._check_size(layout)
+
+    def _check_size(self, layout: ArenaLayout) -> None:
+        if self.level == "maze" and self.cells is None:
+            raise ConfigError("cells is missing: level=maze needs it, as in cells=4.")
+        if self.robots > layout.most_robots:
+            raise ConfigError(
+                f"robots is {self.robots}, but level={self.level} has room for "
+                f"{layout.most_robots}: give at most that."
+            )
+        assert self.kind is not None
+        if self.obstacles != self.kind.walls:
+            raise ConfigError(
+                f"obstacles is {self.obstacles}, but level={self.level} has {self.kind.walls} "
+                "walls: leave obstacles out."
+            )
+        breadth = _ends(self.breadth or self.side)
+        numbers = {key: _ends(getattr(self, key)) for key in layout.reads}
+        demand = Demand(self.robots, self.sides[0], breadth[0], self.cells or 0, numbers)
+        for key, found, least in zip(
+            ("side", "breadth"), (self.sides[0], breadth[0]), layout.least(demand), strict=True
+        ):
+            if found < least - 1e-9:
+                raise ConfigError(
+                    f"{key} is {show(getattr(self, key) or self.side)}, too small for level="
+                    f"{self.level} with robots={self.robots} and {self._said(layout)}: give at "
+                    f"least {math.ceil(100 * least - 1e-6) / 100}."
+                )
+
+    def _said(self, layout: ArenaLayout) -> str:
+        keys = [*layout.reads, *(["cells"] if self.cells else [])]
+        return " ".join(f"{key}={show(getattr(self, key))}" for key in keys)
+
+    def smallest(self, key: str) -> float | None:
+        """Returns the smaller end of one of the numbers of a layout, m; None without it."""
+        given = getattr(self, key)
+        return None if given is None else _ends(given)[0]
+
+    @property
+    def kind(self) -> Kind | None:
+        """What of its layout is compiled in; None without one."""
+        if self.level not in LAYOUTS:
+            return None
+        return Kind(self.level, self.cells or 0, self.breadth is not None)
+
+    @property
+    def laid_out(self) -> tuple[Kind, dict[str, Any]] | None:
+        """The layout with its numbers in units, as `drawing.stack` takes them; None without one."""
+        if self.kind is None:
+            return None
+        ends = [_ends(getattr(self, key) or 0.0) for key in NUMBERS]
+        return self.kind, {
+            "side": _whole(self.side),
+            "breadth": [0, 0] if self.breadth is None else _whole(self.breadth),
+            "low": [round(low * UNITS) for low, _ in ends],
+            "high": [round(high * UNITS) for _, high in ends],
+        }
 
     @property
     def drawn_map(self) -> maps.Map | None:
@@ -216,6 +335,15 @@ def _smallest_side(robots: int, obstacles: int, obstacle_size: float, *, random:
     return PASSAGE + math.sqrt(area)
 
 
+def _whole(length: float | tuple[float, float]) -> list[int]:
+    """Rounds an extent to an even number of units, so that its half is a whole one."""
+    return [2 * round(end * UNITS / 2) for end in _ends(length)]
+
+
+def _and(words: Sequence[str]) -> str:
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
 def _ends(side: float | tuple[float, float]) -> tuple[float, float]:
     return side if isinstance(side, tuple) else (side, side)
 
@@ -225,7 +353,9 @@ class GridConfig(Section):
     """Stages: every number of robots with every number of obstacles in every arena."""
 
     robots: tuple[int, ...] = field(metadata=about("active robots", 1, 100))
-    obstacles: tuple[int, ...] = field(default=(0,), metadata=about("obstacles", 0, 32))
+    obstacles: tuple[int, ...] = field(
+        default=(0,), metadata=about("obstacles", 0, _MOST_OBSTACLES)
+    )
     side: tuple[float | tuple[float, float], ...] = field(
         metadata=about("sides of the square arena, m, or ranges that they are drawn from", 0.4, 4.0)
     )

@@ -16,7 +16,7 @@ from swarmjax.sim import gaps
 from swarmjax.task import level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.level import Level, Spacing
-from swarmjax.task.placement import LATTICE, UNITS
+from swarmjax.task.placement import LATTICE, MARGIN, UNITS
 from swarmjax.task.stage_config import StageConfig, smallest_side
 
 STAGES = (
@@ -260,7 +260,7 @@ def test_levels_fill_the_arena(stage: StageConfig, drawn: Level) -> None:
         assert stats.chisquare(counts).pvalue > 1e-5, counts
         # Rounded up from the hull and 2 cm, a robot's centre comes as near to any wall; what is
         # left over is less than one step of the lattice.
-        rim = 0.5 * stage.sides[0] - HULL - level.MARGIN - np.array([place.max(), -place.min()])
+        rim = 0.5 * stage.sides[0] - HULL - MARGIN - np.array([place.max(), -place.min()])
         assert (rim < stage.sides[0] / LATTICE + 1 / UNITS).all()
         # No ninth of it is left out. The middle one has the least, where the obstacle of a small
         # arena must stand: a fifth of its share was seen (34 of 159), 3 standard deviations of the

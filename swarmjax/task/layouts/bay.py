@@ -1,0 +1,94 @@
+"""A corridor for one robot at a time, with a bay in which one lets the other pass."""
+
+from typing import Any
+
+import numpy as np
+
+from swarmjax.task.layouts.site import (
+    MARGIN_UNITS,
+    THICKNESS,
+    ArenaLayout,
+    Demand,
+    Drawn,
+    Site,
+    between,
+    in_units,
+    pick,
+    rows,
+    split,
+)
+
+Array = Any
+_ENDS = 0.10  # m, along which targets are spread at either end of the corridor
+_AHEAD = 0.20  # m, between the end of where one robot's target is and where the other starts
+
+
+def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
+    """Draws a corridor along x with a bay on its left.
+
+    Args:
+      uniforms: [K] in [0, 1).
+      site: the arena; reads `gap` (of the corridor), `width` (at the bay) and `length` (of it).
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      What is drawn. The first robot starts at the left end and the second at the right, each with
+      its target at the other's end, behind where the other starts.
+    """
+    count = site.present.shape[0]
+    place, starts, targets, aside = split(uniforms, [2, count, count, 2 * count])
+    half_x, half_y = site.half[0], site.half[1]
+    gap, recess = site.numbers.gap, site.numbers.width - site.numbers.gap
+    most = xp.maximum(half_y - gap // 2 - recess - THICKNESS, 0)
+    middle = pick(place[0], -most, most, xp)
+    bay = pick(place[1], -(half_x // 4), half_x // 4, xp)
+    # The first goes right, the second left; there is no third.
+    way = xp.where(np.arange(count) % 2 == 0, 1, -1)
+    end = half_x - site.clear
+    last = in_units(_ENDS)
+    target_x = way * pick(targets, end - last, end, xp)
+    ahead = last + in_units(_AHEAD)
+    start_x = -way * pick(starts, end - ahead - last, end - ahead, xp)
+    most = xp.maximum(gap // 2 - site.hull - MARGIN_UNITS // 4, 0)
+    off = middle + pick(aside, -most, most, xp)
+    return Drawn(
+        wall=_walls(site, bay, middle, recess, xp),
+        there=np.ones(4, bool),
+        start=xp.stack([start_x, off[:count]], axis=-1),
+        target=xp.stack([target_x, off[count:]], axis=-1),
+    )
+
+
+def _walls(site: Site, bay: Array, middle: Array, recess: Array, xp: Any) -> Array:
+    """The wall on the right, those on the left before, behind and beyond the bay, [4, 4] units."""
+    half_x, thin, aside = site.half[0], THICKNESS // 2, site.numbers.gap // 2
+    along = site.numbers.length // 2
+    left = between(-half_x, bay - along)
+    right = between(bay + along, half_x)
+    deep = (recess + 2 * thin + 1) // 2
+    upper = middle + aside
+    return rows(
+        (
+            (0 * bay, middle - aside - thin, half_x, thin),
+            (left[0], upper + deep, left[1], deep),
+            (right[0], upper + deep, right[1], deep),
+            (bay, upper + recess + thin, along, thin),
+        ),
+        xp,
+    )
+
+
+def _least(demand: Demand) -> tuple[float, float]:
+    # The bay lies within the middle quarter on either side, and the robots start beyond it.
+    side = 4 / 3 * (demand.numbers["length"][1] + 2 * (2 * _ENDS + _AHEAD) + 0.12)
+    return min(side, 1.2), demand.numbers["width"][1] + 2 * THICKNESS / 4096
+
+
+BAY = ArenaLayout(
+    draw=draw,
+    uniforms=lambda robots, _: 2 + 4 * robots,
+    walls=lambda _: 4,
+    reads=("gap", "width", "length"),
+    least=_least,
+    most_robots=2,
+)

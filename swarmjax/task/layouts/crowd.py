@@ -1,0 +1,68 @@
+"""A crowd without obstacles: robots start anywhere but in a zone of arrival.
+
+Targets are `apart` while there is room. One that finds no such place takes the point that is
+farthest from those before it, so that as many fit as are asked for.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from swarmjax.task.layouts.site import MARGIN_UNITS, ArenaLayout, Demand, Drawn, Site, split
+from swarmjax.task.placement import Gap, place, score_things
+
+Array = Any
+_LATTICE = 40  # points along a side: 3 cm apart in an arena of 1.2 m
+_FILLING = 0.5  # of the arena by discs of the targets' distance; placed at random they jam at 0.547
+
+
+def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
+    """Places targets, then starts.
+
+    Args:
+      uniforms: [K] in [0, 1).
+      site: the arena; reads `apart`.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      What is drawn, without walls.
+    """
+    count = site.present.shape[0]
+    shifts, targets, starts = split(uniforms, [4, count, count])
+    area = _points(site, shifts[:2], xp)
+    touching = 2 * site.hull + MARGIN_UNITS // 2
+    apart = Gap(touching, site.numbers.apart)
+    target, _ = place(area, 0 * area[:, 0], targets, site.present, apart, xp)
+    area = _points(site, shifts[2:], xp)
+    outside = site.reach + MARGIN_UNITS // 4
+    score = score_things(area, target, site.present, Gap(outside, outside), xp)
+    start, _ = place(area, score, starts, site.present, Gap(touching, touching), xp)
+    return Drawn(xp.zeros((0, 4), xp.int32), np.zeros(0, bool), start, target)
+
+
+def _points(site: Site, shift: Array, xp: Any) -> Array:
+    """Points [P, 2] that cover where robots have room, units."""
+    extent = 2 * (site.half - site.clear)
+    offset = xp.floor(shift * extent.astype(xp.float32)).astype(xp.int32)
+    steps = np.arange(_LATTICE, dtype=np.int32)[:, None]
+    axes = site.clear - site.half + (steps * extent + offset) // _LATTICE
+    x = xp.broadcast_to(axes[:, None, 0], (_LATTICE, _LATTICE))
+    y = xp.broadcast_to(axes[None, :, 1], (_LATTICE, _LATTICE))
+    return xp.stack([x.reshape(-1), y.reshape(-1)], axis=-1)
+
+
+def _least(demand: Demand) -> tuple[float, float]:
+    disc = math.pi * (0.5 * demand.numbers["apart"][1]) ** 2
+    area = demand.robots * disc / _FILLING
+    side = math.sqrt(area) + 2 * 0.065 - demand.numbers["apart"][1]
+    return max(side, 0.4), area / demand.side
+
+
+CROWD = ArenaLayout(
+    draw=draw,
+    uniforms=lambda robots, _: 4 + 2 * robots,
+    walls=lambda _: 0,
+    reads=("apart",),
+    least=_least,
+)

@@ -1,0 +1,187 @@
+"""Levels of layouts: the numbers of a level drawn, its arena laid out, turned and put in metres."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from swarmjax.sim import noise
+from swarmjax.sim.noise import Stream
+from swarmjax.task.layouts import LAYOUTS
+from swarmjax.task.layouts.site import NUMBERS, Drawn, Numbers, Site, between, pick, rows, split
+from swarmjax.task.placement import clearance, gaps_of, metres, round_up
+
+Array = Any
+_TURNS = 8  # quarter turns, and their mirror images
+_BARS = 2  # walls that make an arena narrower than it is long
+
+
+class LaidOut(NamedTuple):
+    """What a layout makes of a level; all of it replaces that of the level.
+
+    Attributes:
+      side: [] m.
+      start: [R, 3] x (m), y (m), yaw (rad).
+      target: [R, 2] m.
+      obstacle_present: [W] whether the wall is there.
+      obstacle: [W, 5] x (m), y (m), yaw (0 rad), half edges (m).
+    """
+
+    side: Array
+    start: Array
+    target: Array
+    obstacle_present: Array
+    obstacle: Array
+
+
+class LayoutArrays(NamedTuple):
+    """One layout's numbers in stages, [S, ...] or [...].
+
+    Attributes:
+      chosen: whether the stage is laid out so, bool.
+      side: smallest and largest extent along x, [2] units, int32.
+      breadth: smallest and largest extent along y, [2] units, int32; 0 of a square.
+      low: [6] smallest `NUMBERS`, units, int32.
+      high: [6] largest, units, int32.
+    """
+
+    chosen: Array
+    side: Array
+    breadth: Array
+    low: Array
+    high: Array
+
+
+class RobotSizes(NamedTuple):
+    """Sizes of robots that a level is drawn for.
+
+    Attributes:
+      hull_radius: m.
+      target_radius: within which a robot has arrived, m.
+    """
+
+    hull_radius: float
+    target_radius: float
+
+
+class Kind(NamedTuple):
+    """What of a layout is compiled in.
+
+    Attributes:
+      name: in `LAYOUTS`.
+      cells: of a maze, along a side; 0 for others.
+      narrow: whether there are bars, so that an arena may be narrower than it is long.
+    """
+
+    name: str
+    cells: int = 0
+    narrow: bool = False
+
+    @property
+    def walls(self) -> int:
+        """How many walls a level of this kind may have."""
+        return LAYOUTS[self.name].walls(self.cells) + _BARS * self.narrow
+
+
+Entry = tuple[Kind, Mapping[str, Any]]
+
+
+def stack(entries: Sequence[Entry | None]) -> dict[Kind, LayoutArrays]:
+    """Stacks the layouts of stages into NumPy arrays [S, ...], by kind.
+
+    Args:
+      entries: of the stages, the kind and what `LayoutArrays` holds but for `chosen`; None where a
+        stage has none.
+    """
+    kinds = sorted({each[0] for each in entries if each is not None})
+    return {kind: _stack(kind, entries) for kind in kinds}
+
+
+def _stack(kind: Kind, entries: Sequence[Entry | None]) -> LayoutArrays:
+    mine = [each[1] if each is not None and each[0] == kind else None for each in entries]
+    none = {"side": [1, 1], "breadth": [0, 0], "low": [0] * 6, "high": [0] * 6}
+    found = [none if each is None else each for each in mine]
+    table = {key: np.array([each[key] for each in found], np.int32) for key in none}
+    return LayoutArrays(chosen=np.array([each is not None for each in mine]), **table)
+
+
+def draw(
+    kind: Kind, of: LayoutArrays, seed: Array, present: Array, sizes: RobotSizes, xp: Any
+) -> LaidOut:
+    """Lays an arena out.
+
+    Args:
+      kind: what is compiled in.
+      of: its numbers, fields [...] of one stage.
+      seed: [] uint32 of the level; all that is random follows from it.
+      present: [R] whether the robot takes part.
+      sizes: of robots and targets.
+      xp: `numpy` or `jax.numpy`; both draw the same arena.
+
+    Returns:
+      The arena, a square in which bars of wall leave what is narrower.
+    """
+    layout, count = LAYOUTS[kind.name], present.shape[0]
+    own = layout.uniforms(count, kind.cells)
+    uniforms = noise.uniform(seed, 0, Stream.LAYOUT, (2 + len(NUMBERS) + 1 + count + own,), xp)
+    lengths, turn, heading, rest = split(uniforms, [2 + len(NUMBERS), 1, count, own])
+    side, breadth, numbers = _numbers(of, lengths, xp)
+    half = xp.stack([side, breadth]) // 2
+    site = Site(
+        half=half,
+        numbers=Numbers(*(numbers[i] for i in range(len(NUMBERS)))),
+        cells=kind.cells,
+        present=present,
+        hull=round_up(sizes.hull_radius),
+        clear=clearance(sizes.hull_radius),
+        reach=round_up(sizes.target_radius),
+        gaps=gaps_of(sizes.hull_radius, sizes.target_radius),
+    )
+    drawn = layout.draw(rest, site, xp)
+    drawn = _with_bars(drawn, half, xp) if kind.narrow else drawn
+    drawn = _turned(drawn, pick(turn[0], xp.int32(0), xp.int32(_TURNS - 1), xp), xp)
+    yaw = (heading * 2.0 - 1.0) * np.float32(math.pi)
+    wall = metres(drawn.wall, xp)
+    level = xp.zeros_like(wall[:, :1])
+    return LaidOut(
+        side=metres(xp.maximum(side, breadth), xp),
+        start=xp.concatenate([metres(drawn.start, xp), yaw[:, None]], axis=-1),
+        target=metres(drawn.target, xp),
+        obstacle_present=drawn.there,
+        obstacle=xp.concatenate([wall[:, :2], level, wall[:, 2:]], axis=-1),
+    )
+
+
+def _numbers(of: LayoutArrays, uniforms: Array, xp: Any) -> tuple[Array, Array, Array]:
+    """Draws the extents along x and y, and the `NUMBERS` [6], units."""
+    side = pick(uniforms[0], of.side[0], of.side[1], xp)
+    breadth = pick(uniforms[1], of.breadth[0], of.breadth[1], xp)
+    return side, xp.where(breadth > 0, breadth, side), pick(uniforms[2:], of.low, of.high, xp)
+
+
+def _with_bars(drawn: Drawn, half: Array, xp: Any) -> Drawn:
+    """Fills the square about an arena that is narrower than it is long with walls."""
+    middle, deep = between(half[1], half[0])
+    there = half[1] < half[0]
+    deep = xp.maximum(deep, 1)  # an absent wall has edges too
+    bars = rows(((0, middle, half[0], deep), (0, -middle, half[0], deep)), xp)
+    return drawn._replace(
+        wall=xp.concatenate([drawn.wall, bars]),
+        there=xp.concatenate([xp.asarray(drawn.there), xp.stack([there, there])]),
+    )
+
+
+def _turned(drawn: Drawn, turn: Array, xp: Any) -> Drawn:
+    """Turns a layout by quarters, and mirrors it for turns from 4 on."""
+    across, flip_x, flip_y = turn % 2 == 1, turn // 2 % 2 == 1, turn // 4 == 1
+
+    def place(point: Array) -> Array:
+        x, y = point[..., 0], point[..., 1]
+        x, y = xp.where(across, y, x), xp.where(across, x, y)
+        return xp.stack([xp.where(flip_x, -x, x), xp.where(flip_y, -y, y)], axis=-1)
+
+    half = drawn.wall[:, 2:]
+    half = xp.where(across, half[:, ::-1], half)
+    wall = xp.concatenate([place(drawn.wall[:, :2]), half], axis=-1)
+    return drawn._replace(wall=wall, start=place(drawn.start), target=place(drawn.target))

@@ -1,0 +1,128 @@
+"""Braided mazes: every cell has two ways out at least, so that there are rings to go round.
+
+A random spanning tree by Kruskal's method (Kruskal 1956, "On the shortest spanning subtree of a
+graph"), with edges in random order; then each dead end is opened once more.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from swarmjax.task.layouts.site import (
+    THICKNESS,
+    ArenaLayout,
+    Demand,
+    Drawn,
+    Site,
+    pick,
+    split,
+)
+
+Array = Any
+_PASSAGE = 0.20  # m, least free width: a robot passes one that has parked in the middle
+
+
+def edges(cells: int) -> np.ndarray:
+    """Lists the pairs of neighbours of a maze.
+
+    Args:
+      cells: along a side.
+
+    Returns:
+      [E, 2] numbers of cells, row by row from below, those beside each other along x first.
+    """
+    number = np.arange(cells * cells).reshape(cells, cells)
+    along = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], axis=-1)
+    across = np.stack([number[:-1].ravel(), number[1:].ravel()], axis=-1)
+    return np.concatenate([along, across])
+
+
+def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
+    """Draws a maze.
+
+    Args:
+      uniforms: [K] in [0, 1).
+      site: the arena, a square; reads `cells`.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      What is drawn; starts and targets lie in cells of their own.
+    """
+    count, cells = site.present.shape[0], site.cells
+    pairs = edges(cells)
+    order, rooms, aside = split(uniforms, [len(pairs), cells * cells, 4 * count])
+    open_ = _braid(pairs, _tree(pairs, order, xp), order, cells, xp)
+    edge = 2 * site.half[0] // cells
+    corner = -site.half[0]
+    chosen = xp.argsort(rooms, stable=True)[: 2 * count].astype(xp.int32)
+    if cells * cells < 2 * count:  # more are compiled in than a maze has room for
+        lacking = xp.zeros(2 * count - cells * cells, xp.int32)
+        chosen = xp.concatenate([chosen, lacking])
+    centre = xp.stack([chosen % cells, chosen // cells], axis=-1) * edge + corner + edge // 2
+    most = xp.maximum(edge // 2 - THICKNESS // 2 - site.clear, 0)
+    place = centre + pick(aside.reshape(2 * count, 2), -most, most, xp)
+    # Interleaved, so that a robot keeps its cells whatever number is compiled in.
+    return Drawn(_walls(pairs, cells, edge, corner, xp), ~open_, place[0::2], place[1::2])
+
+
+def _tree(pairs: np.ndarray, order: Array, xp: Any) -> Array:
+    """Opens the edges of a random spanning tree, [E]."""
+    label = xp.arange(pairs.max() + 1, dtype=xp.int32)
+    ranked = xp.argsort(order, stable=True)
+    table = xp.asarray(pairs)
+    numbers = np.arange(len(pairs))
+    open_ = xp.zeros(len(pairs), bool)
+    for i in range(len(pairs)):
+        edge = ranked[i]
+        one, other = label[table[edge, 0]], label[table[edge, 1]]
+        open_ = open_ | ((numbers == edge) & (one != other))
+        label = xp.where(label == other, one, label)
+    return open_
+
+
+def _braid(pairs: np.ndarray, open_: Array, order: Array, cells: int, xp: Any) -> Array:
+    """Opens one more edge of each cell that has but one open, [E].
+
+    One that leads to another such cell if there is one, so that most walls stay.
+    """
+    touches = np.arange(cells * cells)[:, None, None] == pairs  # [C, E, 2]
+    for cell in range(cells * cells):
+        ways = xp.sum(open_ & touches.any(axis=-1), axis=-1, dtype=xp.int32)
+        dead = ways < 2
+        other = np.where(touches[cell, :, 0], pairs[:, 1], pairs[:, 0])
+        rank = order + dead[other].astype(xp.float32)
+        mine = touches[cell].any(axis=-1) & ~open_
+        best = xp.argmax(xp.where(mine, rank, np.float32(-1.0)))
+        open_ = open_ | (dead[cell] & (np.arange(len(pairs)) == best))
+    return open_
+
+
+def _walls(pairs: np.ndarray, cells: int, edge: Array, corner: Array, xp: Any) -> Array:
+    """Walls between neighbours, [E, 4] units, long enough to meet at their ends."""
+    thin = THICKNESS // 2
+    column, row = pairs[:, 0] % cells, pairs[:, 0] // cells
+    beside = pairs[:, 1] - pairs[:, 0] == 1
+    x = corner + np.where(beside, column + 1, column).astype(np.int32) * edge
+    y = corner + np.where(beside, row, row + 1).astype(np.int32) * edge
+    half = (edge + 1) // 2
+    x, y = xp.where(beside, x, x + half), xp.where(beside, y + half, y)
+    long = half + thin
+    halves = xp.where(
+        beside[:, None], xp.stack([thin + 0 * long, long]), xp.stack([long, thin + 0 * long])
+    )
+    return xp.concatenate([xp.stack([x, y], axis=-1), halves], axis=-1).astype(xp.int32)
+
+
+def _least(demand: Demand) -> tuple[float, float]:
+    side = demand.cells * (_PASSAGE + THICKNESS / 4096)
+    return side, demand.side
+
+
+MAZE = ArenaLayout(
+    draw=draw,
+    uniforms=lambda robots, cells: 2 * cells * (cells - 1) + cells**2 + 4 * robots,
+    walls=lambda cells: 2 * cells * (cells - 1),
+    reads=(),
+    least=_least,
+    square=True,
+)

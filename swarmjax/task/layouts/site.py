@@ -1,0 +1,188 @@
+"""What layouts share: the arena that they are drawn in, walls, and areas to place robots in."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from swarmjax.task.placement import MARGIN, UNITS, Gap, Gaps, place, score_things
+
+Array = Any
+NUMBERS = ("gap", "width", "depth", "length", "radius", "apart")  # of a stage, m
+THICKNESS = math.ceil(0.02 * UNITS)  # of walls within an arena, units
+LATTICE = 24  # points along either edge of an area
+
+
+class Numbers(NamedTuple):
+    """Lengths that a layout is drawn with, [] int32 units each; a layout reads those it names.
+
+    Attributes:
+      gap: free width of a door or a corridor.
+      width: free width of a trap, or of a corridor at its bay.
+      depth: of a trap.
+      length: of a fence, or of a bay along its corridor.
+      radius: of the circle on which robots start.
+      apart: distance between targets, or of targets from a door.
+    """
+
+    gap: Array
+    width: Array
+    depth: Array
+    length: Array
+    radius: Array
+    apart: Array
+
+
+class Site(NamedTuple):
+    """The arena that a layout is drawn in. Lengths are units, int32.
+
+    Attributes:
+      half: [2] half of the arena's extent along x and y.
+      numbers: of this level.
+      cells: of a maze, along a side; 0 for other layouts.
+      present: [R] whether the robot takes part.
+      hull: radius of the robots.
+      clear: least distance of a robot's centre to a wall at the start.
+      reach: radius of the zone of arrival.
+      gaps: distances between starts and targets.
+    """
+
+    half: Array
+    numbers: Numbers
+    cells: int
+    present: Array
+    hull: int
+    clear: int
+    reach: int
+    gaps: Gaps
+
+
+class Drawn(NamedTuple):
+    """A layout, before it is turned.
+
+    Attributes:
+      wall: [W, 4] x, y and half edges of rectangles, units.
+      there: [W] whether the wall is there.
+      start: [R, 2] units.
+      target: [R, 2] units.
+    """
+
+    wall: Array
+    there: Array
+    start: Array
+    target: Array
+
+
+class Demand(NamedTuple):
+    """Numbers of a stage that a layout must have room for, m.
+
+    Attributes:
+      robots: how many.
+      side: smallest extent along x.
+      breadth: smallest extent along y.
+      cells: of a maze, along a side.
+      numbers: smallest and largest of those that the layout reads.
+    """
+
+    robots: int
+    side: float
+    breadth: float
+    cells: int
+    numbers: Mapping[str, tuple[float, float]]
+
+
+class ArenaLayout(NamedTuple):
+    """A way of laying out arenas.
+
+    Attributes:
+      draw: from uniform numbers [K] in [0, 1), a site and the array module to what is drawn.
+      uniforms: how many numbers it takes for so many robots and cells.
+      walls: how many walls it may have, by the cells of a maze.
+      reads: the `NUMBERS` of a stage that it is drawn with.
+      least: the smallest side and breadth that it has room in, m, of a demand.
+      most_robots: that it has room for, however large the arena.
+      square: whether the arena cannot be narrower than it is long.
+    """
+
+    draw: Callable[[Array, Site, Any], Drawn]
+    uniforms: Callable[[int, int], int]
+    walls: Callable[[int], int]
+    reads: tuple[str, ...]
+    least: Callable[[Demand], tuple[float, float]]
+    most_robots: int = 100
+    square: bool = False
+
+
+def pick(uniform: Array, low: Array, high: Array, xp: Any) -> Array:
+    """Picks a whole number of low..high, each as likely as the next; `low` if there is none."""
+    count = xp.maximum(high - low + 1, 1)
+    above = xp.floor(uniform * count.astype(xp.float32)).astype(xp.int32)
+    return low + xp.minimum(above, count - 1)
+
+
+def split(uniforms: Array, counts: Sequence[int]) -> list[Array]:
+    """Deals uniform numbers out, in parts of so many each."""
+    ends = np.cumsum(counts)
+    return [uniforms[end - count : end] for end, count in zip(ends, counts, strict=True)]
+
+
+def rows(table: Sequence[Sequence[Array]], xp: Any) -> Array:
+    """Makes an array [W, 4] of rectangles: x, y and half edges, units."""
+    return xp.stack([xp.stack([xp.asarray(x, xp.int32) for x in row]) for row in table])
+
+
+def between(low: Array, high: Array) -> tuple[Array, Array]:
+    """Returns the middle of an interval and half its length, rounded up, so that it is covered."""
+    return (low + high) // 2, (high - low + 1) // 2
+
+
+def points(low: Sequence[Array], high: Sequence[Array], shift: Array, xp: Any) -> Array:
+    """Spreads points evenly over a rectangle, shifted by a part of their spacing.
+
+    Args:
+      low: its corner with the smallest x and y, units.
+      high: its corner with the largest.
+      shift: [2] in [0, 1), of the spacing.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [LATTICE**2, 2] int32, units.
+    """
+    steps = np.arange(LATTICE, dtype=np.int32)
+    axes = []
+    for axis in range(2):
+        extent = xp.maximum(xp.asarray(high[axis] - low[axis], xp.int32), 0)
+        offset = xp.floor(shift[axis] * extent.astype(xp.float32)).astype(xp.int32)
+        axes.append(low[axis] + (steps * extent + offset) // LATTICE)
+    x = xp.broadcast_to(axes[0][:, None], (LATTICE, LATTICE))
+    y = xp.broadcast_to(axes[1][None, :], (LATTICE, LATTICE))
+    return xp.stack([x.reshape(-1), y.reshape(-1)], axis=-1)
+
+
+def place_targets(
+    site: Site, area: Array, score: Array, picks: Array, there: Array, xp: Any
+) -> Array:
+    """Places the targets of some robots in an area; returns [R, 2] units."""
+    return place(area, score, picks, there, site.gaps.target, xp)[0]
+
+
+def place_starts(
+    site: Site, area: Array, target: Array, picks: Array, there: Array, xp: Any
+) -> Array:
+    """Places some robots in an area, clear of all targets; returns [R, 2] units."""
+    score = score_things(area, target, site.present, site.gaps.from_target, xp)
+    return place(area, score, picks, there, site.gaps.start, xp)[0]
+
+
+def beyond(passage: int) -> Gap:
+    """Returns a distance to keep that no room is so small as to shorten."""
+    return Gap(passage, passage)
+
+
+def in_units(metres: float) -> int:
+    """Rounds a length up to units."""
+    return math.ceil(metres * UNITS)
+
+
+MARGIN_UNITS = in_units(MARGIN)
