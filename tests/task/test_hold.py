@@ -36,6 +36,10 @@ class Episode(NamedTuple):
 Play = Callable[..., Episode]
 
 
+def _stack[Tree](trees: list[Tree]) -> Tree:
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
+
+
 @pytest.fixture(scope="module")
 def play(tiny_world: World) -> Play:
     """Plays the scene by a rule, to a step limit, with actions [64, 3, 2]."""
@@ -61,8 +65,7 @@ def play(tiny_world: World) -> Play:
             states.append(state)
             steps.append(came)
         slim = [dataclasses.replace(each, sim=physics.pack(each.sim)) for each in states]
-        stacked = (jax.tree.map(lambda *x: np.stack(x), *each) for each in (slim, steps))
-        return Episode(*stacked, len(traces))
+        return Episode(_stack(slim), _stack(steps), len(traces))
 
     return play
 
