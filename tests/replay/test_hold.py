@@ -45,7 +45,7 @@ def _act(judge: Judge, arenas: Arenas) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def recordings(policy: Path) -> Iterator[list[Recording]]:
+def recordings(policy: Path) -> list[Recording]:
     """The scene, beside one in which robot 1 has far to go; 80 steps at most."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(engine_c, "act", _act)
@@ -53,7 +53,7 @@ def recordings(policy: Path) -> Iterator[list[Recording]]:
         judge = evaluate_judge.load(settings.evaluation, policy_file.read(policy))
         one = holding.level()
         far = one._replace(target=np.array([one.target[0], [0.35, -0.35]], np.float32))
-        yield record.record(judge, [one, far])
+        return record.record(judge, [one, far])
 
 
 def test_an_episode_ends_when_all_are_there_whatever_others_do(
