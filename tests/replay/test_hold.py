@@ -62,6 +62,21 @@ def test_an_episode_ends_when_all_are_there_whatever_others_do(
     assert [len(each.pose) for each in recordings] == [RETURNS + 1, 81]
 
 
+def test_recording_ends_with_the_last_episode_though_robots_have_left_again(
+    policy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine_c, "act", _act)
+    settings = _settings(policy, "task.arrival=hold", "steps=140")
+    judge = evaluate_judge.load(settings.evaluation, policy_file.read(policy))
+    one, steps = holding.level(), []
+    # Robot 0 drives on and is 50 mm from this target, or less, after 38 steps: it is at 120.6 mm
+    # after step 61. By then it has left the one of the other arena, 60 mm away, long ago.
+    behind = one._replace(target=np.array([[-0.08, 0.0], one.target[1]], np.float32))
+    found = record.record(judge, [one, behind], steps.append)
+    assert [len(each.pose) - 1 for each in found] == [RETURNS, holding.TURNED + 38]
+    assert sum(steps) == holding.TURNED + 38
+
+
 def test_who_is_within_its_target_is_recorded_step_by_step(recordings: list[Recording]) -> None:
     np.testing.assert_array_equal(recordings[0].arrived[1:], holding.arrived())
     assert recordings[0].arrival.tolist() == [RETURNS, OTHER]
