@@ -55,8 +55,11 @@ class MujocoArena:
           first: number of the first level.
 
         Raises:
-          ConfigError: if the reward has a term that `rewards` does not know.
+          ConfigError: if the reward has a term that `rewards` does not know, or robots go on after
+            arrival.
         """
+        if settings.task.arrival != "latch":
+            raise ConfigError(f"task.arrival is {settings.task.arrival}: give latch.")
         for name in ("arrival", "robot_contact"):
             weight = getattr(settings.task.reward, name)
             if weight:

@@ -29,6 +29,7 @@ ENCODINGS = ("metric", "webots")
 ACTIVATIONS = ("tanh", "relu", "swish")
 BODIES = ("planar", "wheeled")
 RESPONSES = ("ideal", "webots", "real")
+ARRIVALS = ("latch", "hold")
 
 NETWORK_FORMAT = 3  # of a policy whose network is code that its file does not hold
 _NETWORK = "network/"
@@ -442,6 +443,8 @@ def _check_embodiment(meta: Mapping[str, Any]) -> None:
     _check_positive(sensors, "range", "meta.sensors")
     for key in ("control_step", "target_radius"):
         _check_positive(task, key, "meta.task")
+    if "arrival" in task:  # older files are all of the first rule
+        _choice(task, "arrival", ARRIVALS, "meta.task")
 
 
 def _check_preset(mapping: Mapping[str, Any], where: str) -> None:

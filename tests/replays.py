@@ -60,6 +60,7 @@ def wandering(robots: int, frames: int, seed: int = 0) -> Recording:
         reward=earning,
         touching=draw.random((frames, robots, 3)) < 0.02 / 3,
         contacts=begins.cumsum(axis=0),
+        arrived=np.zeros((frames, robots), bool),
         arrival=np.zeros(robots, int),
     )
 

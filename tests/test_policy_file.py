@@ -228,6 +228,11 @@ _GOOD = policies.arrays()
         (_GOOD, _part("sensors", response=1), r"meta.sensors.response is 1: expected ideal or web"),
         (_GOOD, _part("sensors", range=None), r"meta.sensors.range is null: expected a number ab"),
         (_GOOD, {"task": {}}, r"meta.task.control_step is null: expected a number above 0"),
+        (
+            _GOOD,
+            _part("task", arrival="stay"),
+            r'meta.task.arrival is "stay": expected latch or hold',
+        ),
     ],
 )
 def test_read_refuses_in_one_sentence(

@@ -27,7 +27,7 @@ from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps, noise
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.noise import Stream
-from swarmjax.task import electronics, level, observation
+from swarmjax.task import arrival, electronics, level, observation
 from swarmjax.task import factors as task_factors
 from swarmjax.task.electronics import Memory, Sight
 from swarmjax.task.factors import Factors
@@ -70,6 +70,8 @@ class Arenas(NamedTuple):
 
 def simulate(judge: Judge, levels: Sequence[level.Level]) -> Outcome:
     """Runs episodes side by side, each until all its robots have arrived or the time is out.
+
+    By `task.arrival=hold` they have arrived once all are within their targets.
 
     Args:
         judge: What the arenas share.
@@ -232,18 +234,17 @@ def step(judge: Judge, arenas: Arenas) -> Arenas:
     Raises:
         ConfigError: If a position is not finite.
     """
-    task, active = judge.config.task, ~arenas.outcome.arrived
-    memory, pose, impulse = _drive(judge, arenas, active)
+    task, before = judge.config.task, arenas.outcome.arrived
+    memory, pose, impulse = _drive(judge, arenas, arrival.drives(task.arrival, before))
     sight = look(judge, arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)
-    arrives = active & (sight.distance <= task.target_radius)
+    arrived = arrival.arrived(task.arrival, before, sight.distance <= task.target_radius)
     touches = touching(judge, arenas.data)
     gap = np.where(touches, 0.0, np.inf)
     begins, apart = gaps.count_contacts(gap, arenas.apart, task.control_step, np)
     clock = arenas.outcome.clock + 1
-    arrived = arenas.outcome.arrived | arrives
     sight = _look_by_extension(judge, sight, pose, arenas.level, arrived, clock)
     memory, seen = electronics.sense(judge.electronics, memory, arenas.factors, sight, clock, np)
-    step = _Step(active, arrives, begins, touches, impulse, sight.ray < task.sensor_range)
+    step = _Step(arrived, begins, touches, impulse, sight.ray < task.sensor_range)
     anchor, outcome = _tally(arenas, pose, step)
     return arenas._replace(
         memory=memory, pose=pose, observation=seen, apart=apart, anchor=anchor, outcome=outcome
@@ -267,11 +268,10 @@ def _look_by_extension(
 class _Step(NamedTuple):
     """What happened in a control step: [A, R], with three kinds of contact or K rays each.
 
-    `active` was on its way before it; `near` are the rays that met something.
+    `arrived` are those that have arrived after it; `near` are the rays that met something.
     """
 
-    active: np.ndarray
-    arrives: np.ndarray
+    arrived: np.ndarray
     begins: np.ndarray
     touches: np.ndarray
     impulse: np.ndarray
@@ -281,26 +281,28 @@ class _Step(NamedTuple):
 def _tally(arenas: Arenas, pose: np.ndarray, step: _Step) -> tuple[np.ndarray, Outcome]:
     """Adds a control step to what episodes have come to; returns it with the new anchors."""
     before, clock = arenas.outcome, arenas.outcome.clock + 1
+    under_way = ~before.arrived
+    since = np.where(under_way, clock[:, None], before.arrival)
     driven = np.linalg.norm(pose[..., :2] - arenas.pose[..., :2], axis=-1)
     away = np.linalg.norm(pose[..., :2] - arenas.anchor, axis=-1) > measures.STILL_RADIUS
     return np.where(away[..., None], pose[..., :2], arenas.anchor), Outcome(
         clock=clock,
-        arrived=before.arrived | step.arrives,
-        arrival=np.where(step.arrives, clock[:, None], before.arrival),
+        arrived=step.arrived,
+        arrival=np.where(step.arrived, since, 0),
         contacts=before.contacts + step.begins,
         touched=before.touched + step.touches,
         impulse=before.impulse + step.impulse,
-        sensed=before.sensed + (step.active & step.near.any(axis=-1)),
-        moving=before.moving + step.active,
-        path=before.path + np.where(step.active, driven, 0.0),
-        still=np.where(away, 0, before.still + 1),
+        sensed=before.sensed + (under_way & step.near.any(axis=-1)),
+        moving=before.moving + under_way,
+        path=before.path + np.where(under_way, driven, 0.0),
+        still=np.where(away | step.arrived, 0, before.still + 1),
     )
 
 
 def _drive(
     judge: Judge, arenas: Arenas, active: np.ndarray
 ) -> tuple[Memory, np.ndarray, np.ndarray]:
-    """Lets the robots that are on their way drive.
+    """Lets the robots that are active drive.
 
     Returns:
         Memory, new poses [A, R, 3], and impulses [A, R, 3] (N s) by kind of contact.

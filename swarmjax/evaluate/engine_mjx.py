@@ -361,13 +361,14 @@ def _count(world: World, counts: _Counts, before: EnvState, after: EnvState) -> 
     start, place = poses(before.sim)[..., :2], poses(after.sim)[..., :2]
     driven = jnp.linalg.norm(place - start, axis=-1)
     active = before.level.present & ~before.arrived
+    since = jnp.where(active, after.clock[:, None], counts.arrival)
     away = jnp.linalg.norm(place - counts.anchor, axis=-1) > measures.STILL_RADIUS
     return _Counts(
-        arrival=jnp.where(after.arrived & active, after.clock[:, None], counts.arrival),
+        arrival=jnp.where(after.arrived, since, 0),
         touched=counts.touched + ((after.apart == 0.0) & before.level.present[..., None]),
         path=counts.path + jnp.where(active, driven, 0.0),
         anchor=jnp.where(away[..., None], place, counts.anchor),
-        still=jnp.where(away, 0, counts.still + 1),
+        still=jnp.where(away | after.arrived, 0, counts.still + 1),
     )
 
 

@@ -24,16 +24,18 @@ class Outcome(NamedTuple):
 
     Attributes:
         clock: [A] control steps since the start.
-        arrived: [A, R] whether the robot has arrived.
-        arrival: [A, R] control steps until it arrived, 0 if it has not.
+        arrived: [A, R] whether the robot has arrived; by `task.arrival=hold`, is within its target.
+        arrival: [A, R] control steps until it arrived, 0 if it has not; by `hold`, until it was
+            within its target and never outside since.
         contacts: [A, R, 3] contacts of each kind of `gaps.KINDS`, also after arrival.
         touched: [A, R, 3] control steps at whose end it touched something, likewise.
         impulse: [A, R, 3] of the normal forces at these contacts, N s, likewise; nan where the
             engine does not tell.
         sensed: [A, R] control steps before arrival with an infrared ray shorter than its range.
-        moving: [A, R] control steps before arrival.
-        path: [A, R] driven before arrival, m.
-        still: [A, R] control steps for which it has stayed within STILL_RADIUS of one place.
+        moving: [A, R] control steps before arrival; by `hold`, those that began outside the target.
+        path: [A, R] driven before arrival, m; by `hold`, in these steps.
+        still: [A, R] control steps for which it has stayed within STILL_RADIUS of one place
+            without having arrived.
     """
 
     clock: np.ndarray

@@ -19,7 +19,7 @@ from swarmjax.task import stage_files
 from swarmjax.task.config import TaskConfig, describe
 
 # Of the task, what a judge asks for too; rewards and step limit are those of training.
-_TASK = ("control_step", "target_radius", "observations")
+_TASK = ("control_step", "target_radius", "arrival", "observations")
 BODY = "wheeled"  # of a judge, unless a word or a file names another
 _TOLD = ("robot", "task", "realism")  # what a line names that a word set otherwise
 

@@ -61,6 +61,7 @@ def _about(trained: Policy) -> dict[str, str]:
         "control_step": short(task["control_step"]),
         "control_step_f": number(task["control_step"]),
         "target_radius_f": number(task["target_radius"]),
+        "holds": str(int(export_layout.holds(trained))),
         "observations": str(sizes[0]),
         "actions": str(sizes[-1]),
         "learners": str(learners),

@@ -61,6 +61,18 @@ def trained_as(policy: Policy) -> str:
     )
 
 
+def holds(policy: Policy) -> bool:
+    """Tells whether a policy was trained to drive on within its target, by `task.arrival=hold`.
+
+    Args:
+        policy: the policy.
+
+    Returns:
+        False of files that do not say, which are older than that rule.
+    """
+    return policy.meta["task"].get("arrival", "latch") == "hold"
+
+
 def short(value: float) -> str:
     """Writes a number in the digits of a float32.
 

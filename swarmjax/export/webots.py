@@ -82,6 +82,8 @@ def _about(trained: Policy, answers: Literal["webots", "real"], name: str) -> di
         f"   - of the {learners} policies each robot takes its own: add `robot=0` to "
         f"`robot={learners - 1}`.\n"
     )
+    stops = f"A robot stops at {task['target_radius']:g} m from its target."
+    stays = "A robot drives on at its target: the policy is trained to stay there by itself."
     who = {
         "webots": "the sensors that Webots simulates",
         "real": "the sensors of real e-pucks, zeroed to read 0 in free space",
@@ -91,7 +93,7 @@ def _about(trained: Policy, answers: Literal["webots", "real"], name: str) -> di
         "digest": trained.digest,
         "period": f"{1000 * task['control_step']:g}",
         "robots": "" if trained.is_shared else each,
-        "target_radius": f"{task['target_radius']:g}",
+        "arrival": stays if layout.holds(trained) else stops,
         "trained": layout.trained_as(trained),
         "observes": f"encoding `{trained.encoding}`, infrared up to {meta['sensors']['range']:g} m",
         "answers": who[answers],

@@ -248,7 +248,7 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
     period = control_period(trained, robot.getBasicTimeStep())
     devices = find_devices(robot, period)
     given, draw = parse(words), np.random.default_rng()
-    parked_at = None
+    stops, parked_at = trained.meta["task"].get("arrival", "latch") == "latch", None
     while robot.step(period) != -1:  # the first step gives all sensors a value
         orders = parse([*_custom(robot, given), *words])
         wheels = np.zeros(len(MOTORS))
@@ -258,7 +258,7 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
             )
             counts = [sensor.getValue() for sensor in devices.infrared]
             # A robot that has arrived stays where it is, as in training.
-            if distance <= trained.meta["task"]["target_radius"]:
+            if stops and distance <= trained.meta["task"]["target_radius"]:
                 parked_at = orders.target
             else:
                 seen = observe(trained, sensors, counts, distance, bearing)

@@ -128,6 +128,9 @@ def _columns(recording: Recording, reach: float) -> dict[str, np.ndarray]:
         "touch": touch,
         "contacts": recording.contacts,
     }
+    latched = (recording.arrival > 0) & (np.arange(rows)[:, None] >= recording.arrival)
+    if (recording.arrived != latched).any():  # it left again: `arrival` alone does not say
+        series["arrived"] = recording.arrived.astype(int)
     for name, term in recording.reward.items():
         series[f"reward.{name}"] = np.cumsum(term, axis=0) / REWARD
     return {name: np.rint(each).reshape(rows, -1) for name, each in series.items()}

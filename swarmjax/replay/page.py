@@ -46,6 +46,7 @@ def page(
         "hull": settings.robot.hull_radius,
         "range": task.sensor_range,
         "targetRadius": task.target_radius,
+        "arrival": task.arrival,
     }
     packed = pack.pack(header, episodes, task.sensor_range)
     return fill(f"Replay of {' and '.join(settings.policies)} on {_levels(settings)}", packed)
@@ -105,11 +106,12 @@ def _facts(settings: ReplayConfig, policies: Sequence[Policy], words: str) -> li
     """Says how the episodes came about and how exactly they are shown, a line each."""
     names = zip(settings.policies, policies, strict=True)
     length, angle = 1e3 * pack.LENGTH, pack.ANGLE
+    earned = "; nothing after arrival" if settings.task.arrival == "latch" else ""
     return [
         *((f"policy {name}", f"SHA-256 {trained.digest}") for name, trained in names),
         ("levels", _choice(settings)),
         ("time", f"control steps of {settings.task.control_step:g} s, {settings.steps} at most"),
-        ("reward", "by the weights that the policy was trained with; nothing after arrival"),
+        ("reward", f"by the weights that the policy was trained with{earned}"),
         (
             "exactness",
             f"positions to {length / 2:g} mm and headings to {angle / 2:g} rad of the simulated "

@@ -14,7 +14,7 @@ from swarmjax.evaluate.engine_c import Arenas, Judge
 from swarmjax.extension import RewardTerm
 from swarmjax.policy import Policy, PolicyError
 from swarmjax.sim import gaps, infrared
-from swarmjax.task import electronics
+from swarmjax.task import arrival, electronics
 from swarmjax.task.config import RewardConfig, TaskConfig
 from swarmjax.task.level import Level
 
@@ -46,10 +46,12 @@ class Recording:
         ray: [N, R, K] from a sensor to what it meets, m; no more than the sensor's range.
         distance: [N, R] to the target, m.
         reward: By term [N, R], its weight included: what the step that led here earned, 0 at the
-            start and after arrival.
+            start and, by `task.arrival=latch`, after arrival.
         touching: [N, R, 3] whether the robot touches something of each kind of `gaps.KINDS`.
         contacts: [N, R, 3] contacts so far of each kind.
-        arrival: [R] control steps until it arrived, 0 if it has not.
+        arrived: [N, R] whether the robot has arrived; by `task.arrival=hold`, is within its target.
+        arrival: [R] control steps until it arrived, 0 if it has not; by `hold`, until it was within
+            its target for good.
     """
 
     scene: ReplayScene
@@ -59,6 +61,7 @@ class Recording:
     reward: Mapping[str, np.ndarray]
     touching: np.ndarray
     contacts: np.ndarray
+    arrived: np.ndarray
     arrival: np.ndarray
 
 
@@ -84,7 +87,7 @@ class Frame(NamedTuple):
         ray: [A, R, K] as far as the electronics reach, m.
         distance: [A, R] to the target, m.
         touching: [A, R, 3] whether the robot touches something of each kind.
-        arrived: [A, R] whether the robot has arrived.
+        arrived: [A, R] whether the robot has arrived; by `hold`, is within its target.
         contacts: [A, R, 3] contacts so far of each kind.
         action: [A, R, 2] that led here, clipped to -1..1; 0 at the start.
     """
@@ -106,8 +109,9 @@ class Steps(NamedTuple):
         distance: [..., R] after the step, m.
         infrared: [..., R, K] ray lengths after the step, m.
         sensor_range: m.
-        arrives: [..., R] whether the robot arrived in this step.
+        arrives: [..., R] whether the robot arrived in this step; by `hold`, whether all did.
         contact_begins: [..., R, 3] whether a contact of each kind began in this step.
+        outside: [..., R] whether the robot had not arrived when the step began; None: all had not.
     """
 
     distance_before: np.ndarray
@@ -116,6 +120,7 @@ class Steps(NamedTuple):
     sensor_range: float
     arrives: np.ndarray
     contact_begins: np.ndarray
+    outside: np.ndarray | None = None
 
 
 def terms(steps: Steps, weights: RewardConfig) -> dict[str, np.ndarray]:
@@ -128,13 +133,14 @@ def terms(steps: Steps, weights: RewardConfig) -> dict[str, np.ndarray]:
     Returns:
         [..., R] by name: each term times its weight; those of weight 0 are left out.
     """
+    under_way = np.ones(steps.distance.shape) if steps.outside is None else steps.outside
     found = {
         "progress": steps.distance_before - steps.distance,
-        "proximity": (steps.infrared < steps.sensor_range).any(axis=-1),
+        "proximity": under_way * (steps.infrared < steps.sensor_range).any(axis=-1),
         "arrival": steps.arrives,
         "contact": steps.contact_begins.sum(axis=-1),
         "robot_contact": steps.contact_begins[..., gaps.KINDS.index("robot")],
-        "step_penalty": np.ones_like(steps.distance),
+        "step_penalty": under_way,
     }
     weighted = {name: getattr(weights, name) * term for name, term in found.items()}
     return {name: term for name, term in weighted.items() if getattr(weights, name)}
@@ -167,7 +173,7 @@ def record(
         report: Told how many more control steps there were, one by one.
 
     Returns:
-        Each episode up to the step in which the last robot arrived or the time was out.
+        Each episode up to the step in which all robots had arrived or the time was out.
 
     Raises:
         ConfigError: If the physics of an episode breaks down, or the policy's weights are none.
@@ -178,17 +184,19 @@ def record(
     arenas = engine_c.start(judge, levels)
     mount = electronics.mount(arenas.factors)
     frames = [_look(judge, arenas, np.zeros_like(arenas.pose[..., :2]))]
-    while len(frames) <= judge.config.steps and not frames[-1].arrived.all():
+    over = np.zeros(len(levels), bool)  # by `hold` robots may leave again, and it stays over
+    while len(frames) <= judge.config.steps and not over.all():
         action = np.clip(engine_c.act(judge, arenas), -1.0, 1.0)
         arenas = engine_c.step(judge, arenas)
         frames.append(_look(judge, arenas, action))
+        over |= frames[-1].arrived.all(axis=-1)
         report(1)
     every = Frame(*(np.stack(field) for field in zip(*frames, strict=True)))
     return [
         _cut(
             Frame(*(field[:, i] for field in every)),
             _scene(level, _of_arena(mount, i)),
-            judge.config.task.sensor_range,
+            judge.config.task,
             earning,
             own,
         )
@@ -236,28 +244,32 @@ def _look(judge: Judge, arenas: Arenas, action: np.ndarray) -> Frame:
 def _cut(
     frames: Frame,
     scene: ReplayScene,
-    reach: float,
+    task: TaskConfig,
     earning: RewardConfig,
     own: Sequence[tuple[RewardTerm, float]],
 ) -> Recording:
     """Makes a recording of the frames of one arena [N, ...], up to the end of its episode."""
     over = frames.arrived.all(axis=-1)
     frames = Frame(*(field[: over.argmax() + 1 if over.any() else None] for field in frames))
-    active = ~frames.arrived[:-1]
+    before = frames.arrived[:-1]
+    active, arrives = arrival.drives(task.arrival, before), ~before & frames.arrived[1:]
+    if task.arrival == "hold":
+        arrives = np.broadcast_to(frames.arrived[1:].all(axis=-1, keepdims=True), before.shape)
     steps = Steps(
         distance_before=frames.distance[:-1],
         distance=frames.distance[1:],
         infrared=frames.ray[1:],
-        sensor_range=reach,
-        arrives=active & frames.arrived[1:],
+        sensor_range=task.sensor_range,
+        arrives=arrives,
         contact_begins=np.diff(frames.contacts, axis=0),
+        outside=~before,
     )
     earned = terms(steps, earning) | _own(own, steps, frames)
     none = np.zeros_like(frames.distance[:1])
     return Recording(
         scene=scene,
         pose=frames.pose,
-        ray=np.minimum(frames.ray, reach),
+        ray=np.minimum(frames.ray, task.sensor_range),
         distance=frames.distance,
         reward={
             name: np.concatenate([none, np.where(active, term, 0.0)])
@@ -265,8 +277,15 @@ def _cut(
         },
         touching=frames.touching,
         contacts=frames.contacts,
-        arrival=frames.arrived.argmax(axis=0),  # 0 also where there is none: no one starts there
+        arrived=frames.arrived,
+        arrival=_since(frames.arrived),
     )
+
+
+def _since(arrived: np.ndarray) -> np.ndarray:
+    """Finds the row [R] from which on robots have arrived [N, R] to the end; 0 if they have not."""
+    away = len(arrived) - 1 - np.argmin(arrived[::-1], axis=0)  # the last row outside
+    return np.where(arrived[-1], away + 1, 0)
 
 
 def _own(

@@ -20,7 +20,7 @@ from swarmjax.training import seeds
 POLICY = "policy.npz"
 
 
-_TASK = ("control_step", "target_radius", "step_limit")
+_TASK = ("control_step", "target_radius", "arrival", "step_limit")
 
 
 def policy_arrays(leaves: Leaves) -> dict[str, np.ndarray]:

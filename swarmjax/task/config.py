@@ -9,6 +9,7 @@ from swarmjax.config import ConfigError, Section, about, files, show
 from swarmjax.config.section import MAX_COUNT, ByName
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
+from swarmjax.task.arrival import Arrival
 
 # Beyond, returns squared, as the value's loss has them, may leave float32.
 _MOST_WEIGHT = 1e6
@@ -27,14 +28,19 @@ class RewardConfig(Section):
 
     progress: float = field(default=1.0, metadata=_weight("per metre nearer to the target"))
     proximity: float = field(
-        default=0.0, metadata=_weight("per control step with something in infrared range")
+        default=0.0,
+        metadata=_weight("per control step before arrival with something in infrared range"),
     )
-    arrival: float = field(default=0.0, metadata=_weight("once, on arrival"))
+    arrival: float = field(
+        default=0.0, metadata=_weight("once: on arrival, by hold when all are there")
+    )
     contact: float = field(default=-0.2, metadata=_weight("per contact event, of whatever kind"))
     robot_contact: float = field(
         default=0.0, metadata=_weight("besides, per contact event with another robot")
     )
-    step_penalty: float = field(default=-0.002, metadata=_weight("per control step until arrival"))
+    step_penalty: float = field(
+        default=-0.002, metadata=_weight("per control step that begins before arrival")
+    )
     extra: dict[str, float] = field(
         default_factory=ByName,
         metadata=_weight("weights of the terms of extensions, by their names; 0: off"),
@@ -55,6 +61,13 @@ class TaskConfig(Section):
         default=0.05,
         metadata=about("distance of the centres that counts as arrival, m", above=0.0, high=0.1),
     )
+    arrival: Arrival = field(
+        default="latch",
+        metadata=about(
+            "latch: a robot that comes within its target stops for good; hold: it goes on, and the "
+            "episode is complete when all are within their targets at once"
+        ),
+    )
     sensor_range: float = field(
         default=epuck.SENSOR_RANGE, metadata=about("infrared range, m", above=0.0, high=1.0)
     )
@@ -74,7 +87,8 @@ def describe(robot: RobotConfig, task: TaskConfig, realism: RealismConfig) -> st
     return (
         f"hull {robot.hull_radius:g} m, infrared to {task.sensor_range:g} m, at most "
         f"{robot.max_speed:g} m/s and {robot.max_turn_rate:g} rad/s, control step "
-        f"{task.control_step:g} s, realism {files.preset_of('realism', realism)}"
+        f"{task.control_step:g} s, arrival {task.arrival}, realism "
+        f"{files.preset_of('realism', realism)}"
     )
 
 

@@ -20,8 +20,8 @@ from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps as sim_gaps
 from swarmjax.sim.config import RobotConfig, SimConfig, physics_substeps
 from swarmjax.sim.realism_config import RealismConfig
+from swarmjax.task import arrival, extended, observation, pieces, reward, room
 from swarmjax.task import electronics as task_electronics
-from swarmjax.task import extended, observation, pieces, reward, room
 from swarmjax.task import factors as task_factors
 from swarmjax.task import stage as task_stage
 from swarmjax.task.config import TaskConfig
@@ -75,7 +75,7 @@ class EnvState:
       memory: what the robots' electronics carry along.
       observation: [R, O] what the policy sees now.
       clock: [] control steps since the start, int32.
-      arrived: [R] whether the robot has arrived.
+      arrived: [R] whether the robot has arrived; by `task.arrival=hold`, is within its target now.
       distance: [R] to the target, m.
       apart: [R, 3] for how long there was no contact of each kind, s.
       episode: sums since the start.
@@ -99,9 +99,10 @@ class TimeStep(NamedTuple):
     Attributes:
       observation: [R, O].
       reward: [R].
-      terminated: [R] the robot arrived in this step.
+      terminated: [R] the robot arrived in this step; by `task.arrival=hold`, all are there now.
       truncated: [R] the time ran out for the robot.
-      valid: [R] the robot was on its way, and the physics sound: a transition to learn from.
+      valid: [R] the robot drove (by `latch`: had not arrived), and the physics sound: a transition
+        to learn from.
       done: [] the arena's episode is over.
       sound: [] the physics is finite, and so are rewards, distances and observations.
     """
@@ -239,12 +240,15 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
       The new state, and what the step came to.
     """
     chex.assert_shape(action, (state.level.present.shape[0], 2))
-    level, active = state.level, state.level.present & ~state.arrived
+    level, rule = state.level, world.task.arrival
+    active = level.present & arrival.drives(rule, state.arrived)
     clock = state.clock + 1
     data, memory, pose, sound = _move(world, state, action, active)
     sight = _look(world, pose, level, state.factors)
-    arrives = active & (sight.distance <= world.task.target_radius)
-    arrived = state.arrived | arrives
+    within = active & (sight.distance <= world.task.target_radius)
+    arrived = arrival.arrived(rule, state.arrived, within)
+    complete = jnp.all(arrived | ~level.present)
+    arrives = level.present & complete if rule == "hold" else within
     sight = _look_by_extension(world, sight, pose, level, arrived, clock)
     memory, seen = task_electronics.sense(
         world.electronics, memory, state.factors, sight, clock, jnp
@@ -259,9 +263,10 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
         world.task.sensor_range,
         arrives,
         begins & active[:, None],
+        None if rule == "latch" else ~state.arrived,
     )
     if world.terms:
-        earned = _complete(world, earned, state, action, pose)
+        earned = _fill(world, earned, state, action, pose)
     gained = reward.total(earned, world.task.reward, world.terms)
     sound &= _is_finite(gained, active) & _is_finite(sight.distance, level.present)
     sound &= _is_finite(seen, level.present[:, None])
@@ -269,7 +274,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     gained = jnp.where(valid, gained, 0.0)
     # The step of an arena that broke is not learned from, and the critic need not see it either.
     seen = jnp.where(sound, seen, state.observation)
-    episode = _tally(state.episode, gained, begins, earned, valid)
+    episode = _tally(state.episode, gained, begins, earned, valid & ~state.arrived)
     timeout = clock >= world.task.step_limit
     new = replace(
         state,
@@ -288,7 +293,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
         terminated=arrives,
         truncated=active & ~arrives & (timeout | ~sound),
         valid=valid,
-        done=jnp.all(arrived | ~level.present) | timeout | ~sound,
+        done=complete | timeout | ~sound,
         sound=sound,
     )
 
@@ -301,7 +306,7 @@ def _is_finite(numbers: Array, counted: Array) -> Array:
 def _move(
     world: World, state: EnvState, action: Array, active: Array
 ) -> tuple[Any, Memory, Array, Array]:
-    """Lets the robots that are on their way drive.
+    """Lets the robots drive that may.
 
     Returns:
       Data, memory, poses, and whether the physics is sound.
@@ -345,11 +350,12 @@ def _look_by_extension(
     return sight._replace(own=extended.look(world.electronics.own, view))
 
 
-def _complete(
+def _fill(
     world: World, step: reward.Step, state: EnvState, action: Array, pose: Array
 ) -> reward.Step:
     """Adds what only the terms of an extension look at."""
     return step._replace(
+        outside=~state.arrived,
         pose_before=physics.poses(world.physics, state.sim),
         pose=pose,
         action=jnp.clip(action, -1.0, 1.0),
@@ -359,13 +365,13 @@ def _complete(
 
 
 def _tally(
-    episode: Episode, gained: Array, begins: Array, earned: reward.Step, valid: Array
+    episode: Episode, gained: Array, begins: Array, earned: reward.Step, counted: Array
 ) -> Episode:
-    """Adds a step to the sums of the episode."""
-    sensed = valid & (reward.proximity(earned) > 0.0)
+    """Adds a step to the sums of the episode; `counted` [R] were on their way in a sound arena."""
+    sensed = counted & (reward.proximity(earned) > 0.0)
     return Episode(
         reward=episode.reward + gained,
         contacts=episode.contacts + begins,
         sensed=episode.sensed + sensed,
-        moving=episode.moving + valid,
+        moving=episode.moving + counted,
     )

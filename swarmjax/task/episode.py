@@ -11,9 +11,10 @@ class Episode(NamedTuple):
     Attributes:
       reward: [R] sum of rewards.
       contacts: [R, 3] contacts of each kind.
-      sensed: [R] control steps with an infrared ray shorter than its range (the paper's
+      sensed: [R] those of them with an infrared ray shorter than its range (the paper's
         collision rule).
-      moving: [R] control steps before arrival.
+      moving: [R] control steps that began before arrival; by `task.arrival=hold`, outside the
+        target.
     """
 
     reward: Array
@@ -27,7 +28,7 @@ class Robots(NamedTuple):
 
     Attributes:
       present: took part; where not, the rest means nothing.
-      reached: arrived.
+      reached: had arrived at the end.
       reward: sum over the episode, nothing discounted.
       robot_steps: control steps before arrival.
       sensed: those with an infrared ray shorter than its range.
@@ -50,8 +51,8 @@ class Ended(NamedTuple):
       stage: on which it began.
       cohort: in which it began; -1 where none ended.
       targets: robots that took part.
-      reached: robots that arrived.
-      all_reached: 1 where every robot arrived.
+      reached: robots that had arrived at the end.
+      all_reached: 1 where every robot had.
       steps: control steps.
       robot_steps: control steps before arrival, over all robots.
       sensed: those with an infrared ray shorter than its range.

@@ -181,7 +181,7 @@ class View(NamedTuple):
       bearing: [R] of the own target, rad.
       infrared: [R, K] length of each ray, m.
       present: [R] whether the robot takes part, bool.
-      arrived: [R] whether it has arrived, bool.
+      arrived: [R] whether it has arrived, bool; by `task.arrival=hold`, is within its target now.
       side: [] of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
       obstacle_present: [M] bool.

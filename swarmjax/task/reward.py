@@ -26,9 +26,13 @@ class Step(NamedTuple):
       distance: [R] to the target after the step, m.
       infrared: [R, K] ray lengths after the step, m.
       sensor_range: m.
-      arrives: [R] whether the robot arrived in this step.
+      arrives: [R] whether the robot arrived in this step; by `task.arrival=hold` whether all did,
+        which ends the episode.
       contact_begins: [R, 3] whether a contact of each kind began in this step.
-      pose_before: [R, 3] x (m), y (m), yaw (rad); this and what follows for extensions alone.
+      outside: [R] whether the robot had not arrived when the step began; None where that is so of
+        all that earn, as by `task.arrival=latch`.
+      pose_before: [R, 3] x (m), y (m), yaw (rad); this and what follows for extensions alone, which
+        also find `outside` filled by both rules.
       pose: [R, 3] after the step.
       action: [R, 2] clipped to -1..1, which spans the commands.
       present: [R] whether the robot takes part, bool.
@@ -41,6 +45,7 @@ class Step(NamedTuple):
     sensor_range: float
     arrives: Array
     contact_begins: Array
+    outside: Any = None
     pose_before: Any = None
     pose: Any = None
     action: Any = None
@@ -57,11 +62,11 @@ def proximity(step: Step) -> Array:
     """1 where any ray is shorter than the sensor's range, once a step (equation 3)."""
     rays = step.infrared.shape[-1]
     nearest = least((step.infrared[..., i] for i in pieces(rays, jnp)), step.sensor_range, jnp)
-    return (nearest < step.sensor_range).astype(jnp.float32)
+    return _before_arrival(step, (nearest < step.sensor_range).astype(jnp.float32))
 
 
 def arrival(step: Step) -> Array:
-    """1 in the step in which the robot arrives."""
+    """1 in the step in which the robot arrives; by hold, in which all have."""
     return step.arrives.astype(jnp.float32)
 
 
@@ -76,8 +81,13 @@ def robot_contact(step: Step) -> Array:
 
 
 def step_penalty(step: Step) -> Array:
-    """1 for every control step."""
-    return jnp.ones_like(step.distance)
+    """1 for every control step that begins before arrival."""
+    return _before_arrival(step, jnp.ones_like(step.distance))
+
+
+def _before_arrival(step: Step, price: Array) -> Array:
+    """Charges a price [R] to the robots that had not arrived."""
+    return price if step.outside is None else jnp.where(step.outside, price, 0.0)
 
 
 TERMS: dict[str, Callable[[Step], Array]] = {

@@ -54,7 +54,7 @@ class Trajectory(NamedTuple):
       value: of the observation.
       next_value: of the observation after the step, before any reset.
       reward: of the step.
-      terminated: the robot arrived in this step.
+      terminated: the robot arrived in this step; by `task.arrival=hold`, all were there at once.
       truncated: the time ran out for the robot.
       valid: a transition to learn from.
     """

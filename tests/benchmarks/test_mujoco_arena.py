@@ -75,6 +75,11 @@ def test_a_reward_that_it_does_not_know_is_refused(settings: EvaluateConfig) -> 
     )
 
 
+def test_a_rule_of_arrival_that_it_does_not_know_is_refused(settings: EvaluateConfig) -> None:
+    task = replace(settings.task, arrival="hold")
+    assert refusal(MujocoArena, replace(settings, task=task)) == "task.arrival is hold: give latch."
+
+
 def test_returns_end_with_their_episodes() -> None:
     # The first is 1 and half of the second, which ends; the last three go on, halved each time.
     found = cpu_paper_way.discounted([1, 2, 3, 4, 5], [False, True, False, False, False], 0.5)

@@ -128,7 +128,7 @@ def _edit(name: str, index: Any, value: Any) -> Callable[[dict[str, Any]], None]
         (_edit("one/side", 0, 0.6), "cell one: side is outside [0.5,0.5] m."),
         (_edit("one/present", 0, False), "cell one: present is not all true."),
         (_edit("two/obstacle", (0, 0, 3), 0.0), "cell two: obstacle has half edges of 0 or less."),
-        (_edit("two/obstacle", (0, 0, 3), 0.1), "cell two: obstacle has half edges that differ "),
+        (_edit("two/obstacle", (0, 0, 3), 9.0), "cell two: obstacle is longer than the largest "),
         (_edit("two/obstacle_present", (0, 0), False), "cell two: obstacle is not present, but "),
         (_edit("two/obstacle", (0, 0, 0), 0.1), "cell two of the file has the digest "),
         (_set("two/obstacle", np.array([None])), "it cannot be read: 'two/obstacle.npy' is not"),

@@ -42,6 +42,30 @@ def test_hull_sensors_task_realism_and_stage_are_those_of_training(odd: str) -> 
     assert found.realism == replace(real, mass=None)
 
 
+def test_the_rule_of_arrival_is_that_of_training(tmp_path: Path) -> None:
+    word = _policy(tmp_path / "hold.npz", "task.arrival=hold")
+    settings, said = witness.load(EvaluateConfig, [word])
+    assert settings.task.arrival == "hold"
+    assert "arrival hold" in said
+    assert _load(word, "task.arrival=latch").task.arrival == "latch"
+
+
+def test_a_policy_that_does_not_say_stops_at_its_target(tmp_path: Path) -> None:
+    policies.saved(tmp_path / "old.npz")
+    assert "arrival" not in policies.meta()["task"]
+    assert _load(f"policy={tmp_path / 'old.npz'}").task.arrival == "latch"
+
+
+def test_policies_of_both_rules_are_not_compared_until_told(tmp_path: Path) -> None:
+    paths = [tmp_path / f"{rule}.npz" for rule in ("latch", "hold")]
+    for path in paths:
+        _policy(path, f"task.arrival={path.stem}")
+    words = [f"compare={paths[0]},{paths[1]}"]
+    sentence = refusal(_load, *words)
+    assert "were trained differently, with task.arrival its default and 'hold':" in sentence
+    assert _load(*words, "task.arrival=hold").task.arrival == "hold"
+
+
 def test_the_body_is_on_wheels_unless_it_is_told(odd: str) -> None:
     assert _load(odd).robot.body == "wheeled"
     assert _load(odd, "robot=planar").robot.body == "planar"
@@ -85,7 +109,9 @@ def test_a_cell_of_a_grid_is_judged_without_a_file(tmp_path: Path) -> None:
 def test_the_first_line_says_what_was_taken_and_what_was_told(odd: str) -> None:
     said = witness.load(EvaluateConfig, [odd, "task.sensor_range=0.05"])[1]
     assert said.startswith("as trained but for task.sensor_range=0.05: hull 0.044 m, infrared to ")
-    assert said.endswith("control step 0.016 s, realism custom; wheeled body, stage s3")
+    assert said.endswith(
+        "control step 0.016 s, arrival latch, realism custom; wheeled body, stage s3"
+    )
 
 
 def test_the_first_line_does_not_take_a_file_of_realism_for_a_preset(tmp_path: Path) -> None:

@@ -55,6 +55,17 @@ def test_it_builds_without_warnings_and_its_self_test_passes(
     assert _run(folder, "./self_test").returncode == 0
 
 
+@pytest.mark.parametrize(
+    ("said", "holds"), [({}, 0), ({"arrival": "latch"}, 0), ({"arrival": "hold"}, 1)]
+)
+def test_the_header_says_whether_the_robot_is_to_stop(
+    said: dict, holds: int, tmp_path: Path
+) -> None:
+    trained = saved(tmp_path / "p.npz", task=policies.meta()["task"] | said)
+    header = export_c.render(trained)["policy.h"].decode()
+    assert f"#define POLICY_HOLDS {holds} " in header
+
+
 @needs_gcc
 def test_the_self_test_notices_a_changed_weight(tmp_path: Path) -> None:
     folder = _written(tmp_path / "c", saved(tmp_path / "p.npz"))

@@ -85,8 +85,13 @@ def test_the_policy_says_what_it_was_trained_with(tmp_path: Path) -> None:
     sensors = said["sensors"]
     assert (sensors["preset"], sensors["response"], sensors["range"]) == ("real", "real", 0.04)
     assert sensors["poses"][2] == [0.0, -0.031, -math.pi / 2]  # ps2 looks to the right
-    task = {"control_step": 0.064, "target_radius": 0.05, "step_limit": 500, "observations": []}
-    assert said["task"] == task
+    assert said["task"] == {
+        "control_step": 0.064,
+        "target_radius": 0.05,
+        "arrival": "latch",
+        "step_limit": 500,
+        "observations": [],
+    }
     assert (said["realism"], said["extensions"]) == (to_dict(trained.realism), {})
     assert said["observation"]["encoding"] == "metric"
     assert (said["update"], said["seed"]) == (7, 4)

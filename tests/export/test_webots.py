@@ -252,6 +252,17 @@ def test_a_robot_stays_where_it_has_arrived_until_its_target_moves(tmp_path: Pat
     assert moving.tolist() == [True, True, True, False, False, True, False]
 
 
+def test_a_robot_that_holds_drives_on_at_its_target(tmp_path: Path) -> None:
+    task = policies.meta()["task"] | {"arrival": "hold"}
+    _, folder = _exported(tmp_path, task=task)
+    north = {"counts": [67.19] * 8, "compass": [0.0, 1.0, 0.0], "custom": "target=0,0"}
+    steps = [north | {"gps": [-x, 0.0, 0.0]} for x in (0.051, 0.049, 0.01, 0.06)]
+    done = _simulate(folder, steps, "action=mean")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (np.abs(_told(folder, len(steps))).max(axis=1) > 0).all()
+    assert "A robot drives on at its target" in (folder / "README.md").read_text()
+
+
 def test_the_arguments_win_over_custom_data(tmp_path: Path) -> None:
     _, folder = _exported(tmp_path)
     step = {"counts": [67.19] * 8, "compass": [0.0, 1.0, 0.0], "gps": [0.0, 0.0, 0.0]}

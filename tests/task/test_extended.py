@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 
 import extensions
+import holding
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +18,7 @@ from swarmjax.sim import physics
 from swarmjax.sim.config import SimConfig
 from swarmjax.task import env, extended, level, observation
 from swarmjax.task import stage as task_stage
+from swarmjax.task.arrival import Arrival
 from swarmjax.task.config import RewardConfig, TaskConfig
 from swarmjax.task.env import World
 from swarmjax.task.stage_config import StageConfig
@@ -175,3 +177,38 @@ def test_what_is_not_finite_ends_the_episode_and_teaches_nothing(tmp_path: Path,
     assert came.done
     assert not came.valid.any()
     assert not came.reward.any()
+
+
+BY_RULE = """
+@reward_term(weight=1.0)
+def away(step):
+    return step.outside * 1.0 + step.arrives * 10.0
+
+@observation()
+def there(view):
+    return view.arrived * 1.0
+"""
+
+
+@pytest.mark.parametrize("rule", ["latch", "hold"])
+def test_pieces_see_who_is_there_by_either_rule(tmp_path: Path, rule: Arrival) -> None:
+    """One robot stands at its target and one has far to go; then the first has left it again."""
+    file = extensions.write(tmp_path / "own.py", BY_RULE)
+    price = RewardConfig(progress=0.0, contact=0.0, step_penalty=0.0, extra={"away": 1.0})
+    pair = StageConfig(name="pair", robots=2, side=0.8)
+    world = _world(file, (pair,), arrival=rule, reward=price)
+    scene = holding.level(4, 1)
+    at_first = np.concatenate([scene.start[:1, :2], scene.target[1:]])
+    state = env.reset(world, scene._replace(target=at_first))
+    state = dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
+    step = jax.jit(partial(env.step, world))
+    still = np.tile(np.float32(holding.STILL), (4, 1))
+    state, first = step(state, still)
+    moved = state.level._replace(target=state.level.target.at[0].set(jnp.array([0.3, 0.0])))
+    state, second = step(dataclasses.replace(state, level=moved), still)
+    state, third = step(state, still)
+    there = [each.observation[0, -1] for each in (first, second, third)]
+    earned = [each.reward[0] for each in (first, second, third)]
+    # By latch it has arrived in the first step, which says so, and then earns nothing.
+    assert there == ([1, 1, 1] if rule == "latch" else [1, 0, 0])
+    assert earned == ([11, 0, 0] if rule == "latch" else [1, 0, 1])

@@ -104,12 +104,12 @@ function readNumbers() {
   for (const view of state.views) {
     view.status.textContent = describeRun(view.run, frame);
     [...view.robots.children].forEach((item, i) => {
-      const done = view.run.arrived(i, frame) ? " ✓" : "";
+      const there = view.run.arrived(i, frame);
       const distance = view.run.distance(i, frame).toFixed(2);
       item.querySelector(".state").textContent =
-        `${distance} m, ${signed(view.run.reward(i, frame), 2)}${done}`;
+        `${distance} m, ${signed(view.run.reward(i, frame), 2)}${there ? " ✓" : ""}`;
       item.firstChild.setAttribute("aria-label", `Robot ${i + 1}: ${distance} m from its target, `
-        + `reward ${signed(view.run.reward(i, frame), 2)}${done ? ", arrived" : ""}`);
+        + `reward ${signed(view.run.reward(i, frame), 2)}${there ? `, ${atTarget(1)}` : ""}`);
     });
     view.detail.textContent = describeRobot(view.run, state.look.chosen, frame);
   }
@@ -121,7 +121,7 @@ function describeRun(run, t) {
   const there = robots.filter((i) => run.arrived(i, t)).length;
   const contacts = robots.flatMap((i) => run.contacts(i, t)).reduce((sum, n) => sum + n, 0);
   const over = t >= run.last && run.last < state.last ? `, over at ${seconds(run.last)}` : "";
-  return `${there} of ${run.robots} arrived, ${plural(contacts, "contact")}${over}`;
+  return `${there} of ${run.robots} ${atTarget(run.robots)}, ${plural(contacts, "contact")}${over}`;
 }
 
 /** Says how one robot stands, its reward term by term. */
@@ -131,11 +131,19 @@ function describeRobot(run, robot, t) {
   const met = run.contacts(robot, t)
     .map((count, kind) => (count ? `${count} with ${state.header.kinds[kind]}` : ""))
     .filter(Boolean).join(", ");
-  const arrival = run.arrived(robot, t) ? `; arrived at ${seconds(run.arrival(robot))}` : "";
+  const since = run.arrival(robot);
+  const when = since && t >= since ? ` ${holds() ? "since" : "at"} ${seconds(since)}` : "";
+  const arrival = run.arrived(robot, t) ? `; ${atTarget(1)}${when}` : "";
   return `Robot ${robot + 1}: ${run.distance(robot, t).toFixed(3)} m to go; reward `
     + `${signed(run.reward(robot, t), 3)} (${terms}); contacts: ${met || "none"}${arrival}`;
 }
 
+/** Whether robots drive on within their targets, and may leave them again. */
+const holds = () => state.header.arrival === "hold";
+const atTarget = (count) => {
+  if (!holds()) return "arrived";
+  return count === 1 ? "within its target" : "within their targets";
+};
 const seconds = (frame) => `${(frame * state.header.step).toFixed(2)} s`;
 const plural = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
 const signed = (value, digits) => value.toFixed(digits).replace(/^-(?=0(\.0*)?$)/, "")

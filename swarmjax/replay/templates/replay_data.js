@@ -68,7 +68,11 @@ function openRun(header, bytes, episode, run) {
     /** Contacts since the start, one number a kind. */
     contacts: (i, t) => header.kinds.map((_, kind) =>
       cell("contacts", i * header.kinds.length + kind, t)),
-    arrived: (i, t) => run.arrival[i] > 0 && t >= run.arrival[i],
+    /** Whether it has arrived; a robot that may leave again has a series of its own. */
+    arrived: (i, t) => (table.arrived
+      ? cell("arrived", i, t) === 1
+      : run.arrival[i] > 0 && t >= run.arrival[i]),
+    /** The frame from which on it has arrived to the end, or 0. */
     arrival: (i) => run.arrival[i],
   };
 }

@@ -25,6 +25,7 @@ $action
 #define POLICY_DIGEST "$digest"
 #define POLICY_CONTROL_STEP $control_step_f /* s */
 #define POLICY_TARGET_RADIUS $target_radius_f /* m, distance to the target that counts as arrival */
+#define POLICY_HOLDS $holds /* 1: it drives on within that distance; 0: the robot is to stop there for good */
 
 /* Scales quantities, in the units above, to an observation. */
 void policy_observe(const float quantity[POLICY_OBSERVATIONS],

@@ -1,0 +1,186 @@
+"""Both judges by `task.arrival=hold`: by a scene worked out by hand, and on the same levels."""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import holding
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import steering
+from holding import ENTERS, LEAVES, OTHER, PACE, RETURNS
+
+from swarmjax import policy_file
+from swarmjax.evaluate import cells, engine_c, engine_mjx, judge, measures
+from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.evaluate.evaluation import Evaluation, evaluate
+from swarmjax.evaluate.measures import Outcome
+from swarmjax.policy import Policy
+from swarmjax.sim.config import RobotConfig
+from swarmjax.task import observation
+from swarmjax.task.config import TaskConfig
+from swarmjax.task.env import EnvState
+from swarmjax.task.level import Level
+from swarmjax.task.stage_config import StageConfig
+
+PAIR = StageConfig(name="pair", robots=2, side=0.8)
+HOLD = TaskConfig(arrival="hold")
+SECOND = 0.032
+
+Play = Callable[[np.ndarray], Outcome]
+
+
+def _settings(path: Path, **rest: Any) -> EvaluateConfig:
+    """Of the planar body, whose motion is worked out by hand."""
+    given: dict[str, Any] = {"stage": PAIR, "robot": RobotConfig(), "task": HOLD, "workers": 1}
+    return EvaluateConfig(policy=str(path), **(given | rest))
+
+
+def _told(trained: Policy, action: np.ndarray) -> Policy:
+    """A policy that does what it is told, [R, 2], whatever it sees."""
+    none = np.zeros((len(action), observation.SIZE), np.float32)
+    layer = np.zeros((len(action), observation.SIZE, 2), np.float32), action
+    return trained._replace(
+        layers=[layer],
+        log_std=np.full_like(action, steering.NO_NOISE),
+        mean=none,
+        std=none + 1.0,
+        is_shared=False,
+    )
+
+
+def _by_c(path: Path, actions: np.ndarray) -> Outcome:
+    """Plays the scene in MuJoCo C, until it is over."""
+    trained = policy_file.read(str(path))
+    mine = judge.load(_settings(path), trained)
+    arenas = engine_c.start(mine, [holding.level()])
+    for action in actions:
+        told = dataclasses.replace(mine, policy=_told(trained, action))
+        arenas = engine_c.step(told, arenas)
+        if arenas.outcome.arrived.all():
+            break
+    return arenas.outcome
+
+
+def _by_mjx(path: Path, actions: np.ndarray) -> Outcome:
+    """Plays it in the engine that trains."""
+    levels = Level(*(np.asarray(field)[None] for field in holding.level()))
+    world = engine_mjx.load(_settings(path), np.zeros((0, 2)), 1)
+
+    def act(arenas: EnvState) -> jax.Array:
+        row = jnp.minimum(arenas.clock, len(actions) - 1)
+        return jnp.asarray(actions)[row]
+
+    run = jax.jit(partial(engine_mjx._run, world, act, steps=len(actions) + 5))
+    arenas, counts, broken = run(levels)
+    assert not np.asarray(broken).any()
+    return Outcome(**jax.tree.map(np.asarray, engine_mjx._outcome(arenas, counts)))
+
+
+@pytest.fixture(scope="module", params=[_by_c, _by_mjx], ids=["c", "mjx"])
+def play(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Play:
+    path = steering.write(tmp_path_factory.mktemp("hold") / "policy.npz")
+    return partial(request.param, path)
+
+
+def test_complete_is_all_within_their_targets_at_once(play: Play) -> None:
+    found = play(holding.actions())
+    assert found.clock.tolist() == [RETURNS]
+    assert found.arrived.tolist() == [[True, True]]
+    # Since when they have been there: not when robot 0 first came.
+    assert found.arrival.tolist() == [[RETURNS, OTHER]]
+
+
+def test_what_counts_as_on_the_way_are_steps_begun_outside(play: Play) -> None:
+    found = play(holding.actions())
+    # Robot 0: until it enters, and from the step after it left until it is back.
+    assert found.moving.tolist() == [[ENTERS + RETURNS - LEAVES, OTHER]]
+    # Of these it turned in 31; 1e-3 m for the first stride, which speeds up in C, and float32.
+    strides = ENTERS + RETURNS - LEAVES - 31
+    np.testing.assert_allclose(found.path, [[strides * PACE, OTHER * PACE]], atol=1e-3)
+
+
+def test_who_waits_within_the_target_never_stands_still(play: Play) -> None:
+    """Robot 1 waits for 24 steps; robot 0, which turned for 31, has come back."""
+    assert play(holding.actions()).still.tolist() == [[0, 0]]
+
+
+# --- episodes cut short, which the engine on the device does not know
+
+
+@pytest.fixture(scope="module")
+def steer(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return steering.write(tmp_path_factory.mktemp("cut") / "policy.npz")
+
+
+@pytest.mark.parametrize("steps", [ENTERS, LEAVES - 1, LEAVES, OTHER, RETURNS - 1])
+def test_nobody_has_arrived_for_good_before(steer: Path, steps: int) -> None:
+    found = _by_c(steer, holding.actions()[:steps])
+    np.testing.assert_array_equal(found.arrived[0], holding.arrived()[steps - 1])
+    assert found.arrival[0, 0] == (ENTERS if steps < LEAVES else 0)
+
+
+def test_who_stays_away_is_late_and_the_other_has_arrived(steer: Path) -> None:
+    outcome = _by_c(steer, holding.actions(drives_on=True))
+    found = measures.per_level(outcome, SECOND, RETURNS)
+    assert found["targets_reached"].tolist() == [0.5]
+    assert found["all_reached"].tolist() == [0.0]
+    assert found["time_outs"].tolist() == [1.0]
+    assert found["time_to_reach_s"] == pytest.approx([(RETURNS + OTHER) / 2 * SECOND])
+
+
+# --- the same levels
+
+
+STAGE = StageConfig(name="s3", robots=3, side=0.7, obstacles=1)
+EPISODES, STEPS = 24, 150
+
+
+def _judged(path: Path, engine: Any, **rest: Any) -> Evaluation:
+    given = {"stage": STAGE, "episodes": EPISODES, "steps": STEPS, "seed": 1}
+    return evaluate(_settings(path, engine=engine, **(given | rest)))
+
+
+def test_the_judges_agree_on_the_same_levels(tmp_path: Path) -> None:
+    # Turns to its target, and drives slowly: it comes to rest nowhere, and passes through.
+    path = steering.write(tmp_path / "policy.npz", ((0.2, 0.0), (-2.0, 2.0), (-2.0, -2.0)))
+    (c,), (mjx,) = (_judged(path, engine).trials for engine in ("c", "mjx"))
+    free = c.found["contacts_per_robot"][0] == 0.0
+    assert 5 < free.sum() < EPISODES
+    assert 0.0 < c.found["all_reached"].mean() < 1.0
+    for name in ("targets_reached", "all_reached", "contacts_per_robot", "deadlocks", "time_outs"):
+        np.testing.assert_array_equal(mjx.found[name][0, free], c.found[name][0, free], name)
+    for name in ("time_to_reach_s", "episode_time_s"):
+        # Without contacts paths differ by rounding, which may shift an arrival by a step.
+        found, expected = mjx.found[name][0, free], c.found[name][0, free]
+        np.testing.assert_allclose(found, expected, atol=1.01 * SECOND, err_msg=name)
+    np.testing.assert_allclose(mjx.found["spl"][0, free], c.found["spl"][0, free], atol=2e-3)
+
+
+def test_the_rule_changes_what_is_judged_and_not_the_levels(tmp_path: Path) -> None:
+    """Robots that drive ahead pass through their targets: by latch they stop there."""
+    path = steering.write(tmp_path / "policy.npz", steering.AHEAD)
+    latch, hold = (_judged(path, "c", task=TaskConfig(arrival=rule)) for rule in ("latch", "hold"))
+    digests = [each.result["cells"][0]["digest"] for each in (latch, hold)]
+    assert digests[0] == digests[1]
+    reached = [each.trials[0].found["targets_reached"].sum() for each in (latch, hold)]
+    assert reached[0] > reached[1] == 0.0
+    assert hold.result["task"]["arrival"] == "hold"
+
+
+def test_a_level_is_judged_alike_beside_whatever_others(tmp_path: Path) -> None:
+    """An arena that is complete stays so while others go on."""
+    path = steering.write(tmp_path / "policy.npz")
+    settings = _settings(path, stage=STAGE, episodes=12, steps=STEPS)
+    mine = judge.load(settings, policy_file.read(str(path)))
+    levels = cells.split(cells.load(settings).cells[0].levels)
+    together = engine_c.simulate(mine, levels)
+    assert together.arrived.all(axis=-1).any()
+    for i, level in enumerate(levels):
+        alone = engine_c.simulate(mine, [level])
+        for whole, one in zip(together, alone, strict=True):
+            np.testing.assert_array_equal(whole[i], one[0])
