@@ -9,7 +9,7 @@ from swarmjax.config import ConfigError, Section, about, build, files, show
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.task import stage_files
 from swarmjax.task.shapes import Shape
-from swarmjax.task.stage_config import StageConfig
+from swarmjax.task.stage_config import StageConfig, complete
 
 # Seeds of a suite's levels begin here, so that none is drawn by hand, or by a benchmark, which
 # take small ones. Training draws from another generator altogether, JAX's.
@@ -95,5 +95,5 @@ def _cell(cell: Any) -> Any:
     if isinstance(stage, str):
         return {**cell, "stage": stage_files.pick_one(stage_files.read_stage(stage), stage)}
     if isinstance(stage, Mapping):
-        return {**cell, "stage": {"name": cell.get("name"), **stage}}
+        return {**cell, "stage": complete({"name": cell.get("name"), **stage})}
     return cell

@@ -1,0 +1,87 @@
+"""Draws levels of a suite: `python -m benchmarks.worlds_figure suite=worlds out=FILE.png`.
+
+One level of each cell, seen from above: walls and boxes in black, robots as discs, their targets as
+circles of the zone of arrival in the same colour.
+"""
+
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+
+from benchmarks import key_value
+from swarmjax import command, epuck
+from swarmjax.config import Section, about
+from swarmjax.config.section import MAX_COUNT
+from swarmjax.evaluate import cells
+from swarmjax.evaluate.suite_config import CellConfig, read_suite
+from swarmjax.task.config import TaskConfig
+from swarmjax.task.level import Level
+
+mpl.use("Agg")
+from matplotlib import patches, transforms
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+
+COLUMNS = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldsFigureConfig(Section):
+    """What is drawn."""
+
+    suite: str = field(default="worlds", metadata=about("a name of configs/suites/, or a file"))
+    out: str = field(metadata=about("file .png"))
+    level: int = field(default=0, metadata=about("which of each cell", 0, MAX_COUNT))
+
+
+def draw(chosen: Sequence[CellConfig], number: int, out: Path) -> None:
+    """Draws a level of each cell.
+
+    Args:
+        chosen: The cells.
+        number: Of the level.
+        out: The file.
+    """
+    count = math.ceil(len(chosen) / COLUMNS)
+    figure, axes = plt.subplots(count, COLUMNS, figsize=(2.2 * COLUMNS, 2.4 * count), squeeze=False)
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for axis, cell in zip(axes.flat, chosen, strict=False):
+        one = replace(cell, levels=1, episodes=(number,), digest=None)
+        _draw_level(axis, cells.split(cells.draw_cell(one).levels)[0], cell.name)
+    figure.tight_layout()
+    figure.savefig(out, dpi=100)
+    plt.close(figure)
+
+
+def _draw_level(axis: Axes, drawn: Level, name: str) -> None:
+    half = 0.5 * float(drawn.side)
+    axis.set(xlim=(-half, half), ylim=(-half, half), aspect="equal", title=name)
+    axis.add_patch(patches.Rectangle((-half, -half), 2 * half, 2 * half, fill=False, linewidth=1.5))
+    for x, y, yaw, half_x, half_y in drawn.obstacle[drawn.obstacle_present]:
+        turn = transforms.Affine2D().rotate(float(yaw)).translate(float(x), float(y))
+        corner = (-float(half_x), -float(half_y))
+        box = patches.Rectangle(corner, 2 * float(half_x), 2 * float(half_y), color="black")
+        box.set_transform(turn + axis.transData)
+        axis.add_patch(box)
+    for i in np.flatnonzero(drawn.present):
+        colour, start, target = f"C{i % 10}", drawn.start[i, :2], drawn.target[i]
+        axis.add_patch(patches.Circle(tuple(start), epuck.HULL_RADIUS, color=colour))
+        reach = TaskConfig().target_radius
+        axis.add_patch(patches.Circle(tuple(target), reach, color=colour, fill=False))
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    settings = key_value.load(WorldsFigureConfig, arguments)
+    draw(read_suite(settings.suite).cells, settings.level, Path(settings.out))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("worlds_figure", main, WorldsFigureConfig))
