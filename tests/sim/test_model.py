@@ -170,3 +170,21 @@ def test_fixtures_stand_where_the_level_says(compiled: mujoco.MjModel) -> None:
         assert np.dot(box.xpos[:2] - extent * outward, outward) == pytest.approx(0.45, abs=1e-6)
         # Along the wall it is longer than the largest arena, 4 m.
         assert (extent * (1 - np.abs(outward))).sum() >= 2.0
+
+
+def test_resized_obstacles_are_those_that_would_be_compiled(compiled: mujoco.MjModel) -> None:
+    half = np.array([[0.3, 0.01], [0.02, 0.2]])
+    found = model.resize_obstacles(compiled, model.ids(compiled, SIZE), half)
+    spec = model.build(RobotConfig(), SIZE, STEP)
+    for i, edges in enumerate(half):
+        spec.geom(f"obstacle{i}_box").size[:2] = edges
+    expected = spec.compile()
+    for name in dir(expected):
+        if isinstance(theirs := getattr(expected, name), np.ndarray):
+            np.testing.assert_array_equal(getattr(found, name), theirs, err_msg=name)
+
+
+def test_resizing_leaves_the_compiled_model_as_it_was(compiled: mujoco.MjModel) -> None:
+    before = compiled.geom_size.copy()
+    model.resize_obstacles(compiled, model.ids(compiled, SIZE), np.full((2, 2), 0.3))
+    np.testing.assert_array_equal(compiled.geom_size, before)

@@ -21,12 +21,18 @@ from swarmjax.training import program as programs
 Impl = Literal["jax", "warp"]
 Solver = Literal["mjx", "swarm"]
 ROBOTS, ARENAS, STEP = 5, 24, 0.032
-SIZE = model.ArenaSize(ROBOTS, 1, 0.05)
 BOX = np.array([[0.05, 0.02, 0.4, 0.05, 0.05]], np.float32)
 
 
-def _load(impl: Impl, body: BodyName, solver: Solver, obstacles: int = 1) -> physics.Physics:
-    stage = StageConfig(name="box", robots=ROBOTS, side=1.3, obstacles=obstacles, obstacle_size=0.1)
+def _load(
+    impl: Impl,
+    body: BodyName,
+    solver: Solver,
+    obstacles: int = 1,
+    stage: StageConfig | None = None,
+) -> physics.Physics:
+    box = StageConfig(name="box", robots=ROBOTS, side=1.3, obstacles=obstacles, obstacle_size=0.1)
+    stage = box if stage is None else stage
     sim = SimConfig(impl=impl, solver=solver, max_robots=ROBOTS, max_obstacles=obstacles)
     robot = RobotConfig(body=body)
     settings = TrainConfig(stage=(stage,), robot=robot, sim=sim, arenas=ARENAS, budget=10_000)
@@ -46,29 +52,40 @@ def _crowds(side: float) -> tuple[np.ndarray, np.ndarray]:
     return pose.astype(np.float32), wheels.astype(np.float32)
 
 
-def _on_device(loaded: physics.Physics, side: float, pose: np.ndarray, wheels: np.ndarray) -> Any:
+def _on_device(
+    loaded: physics.Physics,
+    side: float,
+    pose: np.ndarray,
+    wheels: np.ndarray,
+    box: np.ndarray = BOX,
+) -> Any:
     """Velocities of the joints [A, V] after a control step from rest."""
 
     def move(pose: Any, wheels: Any) -> Any:
         data = physics.unpack(loaded, physics.rest(loaded, pose))
-        return physics.step(loaded, data, jnp.float32(side), jnp.asarray(BOX), wheels).qvel
+        return physics.step(loaded, data, jnp.float32(side), jnp.asarray(box), wheels).qvel
 
     return np.asarray(jax.jit(jax.vmap(move))(pose, wheels))
 
 
 def _in_c(
-    robot: RobotConfig, side: float, pose: np.ndarray, wheels: np.ndarray
+    robot: RobotConfig,
+    side: float,
+    pose: np.ndarray,
+    wheels: np.ndarray,
+    box: np.ndarray = BOX,
 ) -> tuple[np.ndarray, int]:
     """The same by MuJoCo C in float64, converged; and how many pairs of robots touch at first."""
     count = physics_substeps(robot, None)
-    spec = model.build(robot, SIZE, STEP / count)
+    size = model.ArenaSize(ROBOTS, len(box), 0.05)
+    spec = model.build(robot, size, STEP / count)
     spec.option.iterations, spec.option.tolerance = 100, 1e-14
     spec.option.ls_iterations, spec.option.ls_tolerance = 100, 1e-6
     built = spec.compile()
-    ids, body = model.ids(built, SIZE), model.BODIES[robot.body]
-    built.geom_size[ids.obstacle_geom, :2] = BOX[:, 3:]
+    ids, body = model.ids(built, size), model.BODIES[robot.body]
+    built = model.resize_obstacles(built, ids, box[:, 3:])
     data = mujoco.MjData(built)
-    place, turn = model.fixture_poses(side, BOX, np)
+    place, turn = model.fixture_poses(side, box, np)
     data.mocap_pos[ids.fixture_mocap], data.mocap_quat[ids.fixture_mocap] = place, turn
     data.qpos[:] = body.qpos(pose.astype(np.float64), np)
     data.ctrl[:] = body.ctrl(wheels.astype(np.float64), AS_BUILT, robot, np)
@@ -98,6 +115,48 @@ CROWDS = {
     ("warp", "wheeled", "mjx", 0.5): (2.1e-5, 1.7e-5),
     ("jax", "planar", "mjx", 0.5): (4.2e-6, 1.6e-6),
 }
+# A wall across the arena with a door of 0.13 m.
+DOOR = np.array([[0.0, 0.315, 0.0, 0.01, 0.25], [0.0, -0.315, 0.0, 0.01, 0.25]], np.float32)
+# Off by these shares of the fastest joint were the velocities seen, as above.
+JAMS = {
+    ("warp", "planar", "swarm"): 1.3e-5,
+    ("jax", "planar", "swarm"): 8.5e-6,
+    ("warp", "wheeled", "swarm"): 4.3e-6,
+    ("warp", "planar", "mjx"): 1.8e-5,
+    ("warp", "wheeled", "mjx"): 1.1e-5,
+}
+
+
+@pytest.mark.parametrize(("impl", "body", "solver"), JAMS)
+def test_robots_jam_in_a_doorway_as_in_c(impl: Impl, body: BodyName, solver: Solver) -> None:
+    pose, wheels = _jams()
+    # Warp looks for contacts within the largest box of the stages.
+    stage = StageConfig(
+        name="door", level="door", robots=ROBOTS, side=1.3, obstacles=2, gap=0.13, apart=0.25
+    )
+    loaded = _load(impl, body, solver, 2, stage)
+    found = _on_device(loaded, 1.13, pose, wheels, DOOR)
+    robot = RobotConfig(body=body)
+    each = [_in_c(robot, 1.13, p, w, DOOR) for p, w in zip(pose, wheels, strict=True)]
+    expected, pairs = np.array([one[0] for one in each]), [one[1] for one in each]
+    assert min(pairs) >= 2
+    assert _off(found, expected) <= 2.0 * JAMS[impl, body, solver]
+
+
+def _jams() -> tuple[np.ndarray, np.ndarray]:
+    """Poses and speeds of wheels of three robots that push into a door, and two that stand by."""
+    random = np.random.default_rng(4)
+    # Each a millimetre or two within the others; the first two touch the jambs.
+    places = np.array([(-0.01, 0.030), (-0.01, -0.030), (-0.070, 0.0), (-0.3, 0.3), (0.3, -0.3)])
+    pose = np.zeros((ARENAS, ROBOTS, 3), np.float32)
+    pose[..., :2] = places + random.uniform(-0.002, 0.002, (ARENAS, ROBOTS, 2))
+    pose[..., 2] = random.uniform(-0.5, 0.5, (ARENAS, ROBOTS))
+    robot = drive.from_config(RobotConfig())
+    action = np.stack([np.ones((ARENAS, ROBOTS)), np.zeros((ARENAS, ROBOTS))], axis=-1)
+    wheels = drive.wheel_speeds(drive.command(action, robot, np), robot, np)
+    return pose, wheels.astype(np.float32)
+
+
 PAIRS = {0.16: 9, 0.5: 2}  # of robots that touch, at least
 
 
