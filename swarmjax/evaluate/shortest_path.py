@@ -4,9 +4,13 @@ Where the straight line is free and ends inside the walls, it is the way. Elsewh
 along the outlines of obstacles, widened by the disc's radius, whose round corners are replaced by
 `CORNER` points outside of them: that makes a way longer by 0.8 mm at most for each right angle that
 it turns (tan(x) / x - 1 = 1.3 % of a quarter circle of 0.037 m, x = 11.25 degrees). NumPy only.
+
+The robots of an arena share these points. Whether a line between two of them is free is found out
+once, and only if a way as short as the shortest may lead along it.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +18,68 @@ CORNER = 4  # points for each round corner
 GOAL = 24  # points on the circle about a target, where the way straight to its centre is barred
 _SLACK = 1e-6  # m; what touches is not barred
 _SIGNS = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
+# Three numbers that change how long it takes, never what is found.
+_DETOUR = 1.1  # times the straight line: ways that are looked for first, the most common ones
+_NEAREST = 8  # boxes that lines from a point are held against first: among walls few lines get past
+_MANY = 1000  # pairs of a line and a box from which on that pays
+
+
+class _Boxes(NamedTuple):
+    """Boxes of an arena, and how near the centre of the disc may come to them.
+
+    Attributes:
+        box: [M, 5] x (m), y (m), yaw (rad), half edges (m).
+        half: [2, M] the half edges, m.
+        radius: Of the disc, less the slack, m.
+    """
+
+    box: np.ndarray
+    half: np.ndarray
+    radius: float
+
+
+class _Points(NamedTuple):
+    """Points of an arena, and where its boxes have them.
+
+    Attributes:
+        place: [V, 2] m.
+        local: [2, V, M] x and y in the frames of the boxes, m.
+        beyond: [V, M] which sides of each widened box a point lies beyond, a bit each. No line
+            meets a box if both of its ends lie beyond the same side.
+    """
+
+    place: np.ndarray
+    local: np.ndarray
+    beyond: np.ndarray
+
+
+class _Lines(NamedTuple):
+    """Straight lines, L of them, from rows [L] of the first points to rows [L] of the second."""
+
+    first: _Points
+    begin: np.ndarray
+    second: _Points
+    end: np.ndarray
+
+
+class _Arena(NamedTuple):
+    """What the robots of an arena share.
+
+    Attributes:
+        inside: Half edge of the square that the centre of the disc keeps to, m.
+        boxes: Those that are not far away.
+        outline: V points about the boxes, clear of all boxes and walls.
+        legs: [V, V] lengths of the straight lines between these points, m; inf where barred, NaN
+            where nobody has asked yet. `_are_free` fills it in.
+        part: [V] numbers, the same for points that are joined by free lines; -1 where nobody has
+            asked yet. `_divide` fills it in.
+    """
+
+    inside: float
+    boxes: _Boxes
+    outline: _Points
+    legs: np.ndarray
+    part: np.ndarray
 
 
 def shortest(
@@ -46,45 +112,150 @@ def shortest(
     barred = _barred(start[:, :, None], ends[:, :, None], obstacle[:, None], hull_radius)
     inside = 0.5 * np.asarray(side, np.float64) - hull_radius
     walled = (found > 0.0) & ~_within(ends, inside[:, None])
-    for arena, robot in np.argwhere(barred.any(axis=-1) | walled):
-        found[arena, robot] = _way(
-            float(inside[arena]),
-            start[arena, robot],
-            target[arena, robot],
-            obstacle[arena],
-            barred[arena, robot],
-            (hull_radius, target_radius),
-        )
+    bent = barred.any(axis=-1) | walled
+    for each in np.flatnonzero(bent.any(axis=-1)):
+        arena = _arena(float(inside[each]), obstacle[each], hull_radius)
+        for robot in np.flatnonzero(bent[each]):
+            found[each, robot] = _way(arena, start[each, robot], target[each, robot], target_radius)
     return found
 
 
-def _way(
-    inside: float,
-    start: np.ndarray,
-    target: np.ndarray,
-    obstacle: np.ndarray,
-    known: np.ndarray,
-    radii: tuple[float, float],
-) -> float:
+def _arena(inside: float, obstacle: np.ndarray, hull: float) -> _Arena:
+    """Finds the points about obstacles [M, 5] that ways may lead through."""
+    nearest = np.abs(obstacle[:, :2]).max(axis=-1) - np.hypot(*obstacle[:, 3:].T)
+    box = obstacle[nearest <= inside + hull]
+    boxes = _Boxes(box, box[:, 3:].T, hull - _SLACK)
+    outline = _free(_see(_outlines(box, hull).reshape(-1, 2), boxes), boxes, inside)
+    count = len(outline.place)
+    return _Arena(inside, boxes, outline, np.full((count, count), np.nan), np.full(count, -1))
+
+
+def _way(arena: _Arena, start: np.ndarray, target: np.ndarray, reach: float) -> float:
     """Length of the shortest way of one robot, m.
 
-    Only the obstacles [M] that are known are gone around. A way that is shortest among these, and
-    meets no other, is shortest among all; else those that it meets become known too.
+    A way of some length keeps to the ellipse of points from which start and target are that far
+    in all. So the points in a small ellipse will do, if they give a way that is no longer.
     """
-    hull, reach = radii
-    circle = _circle(target, reach, inside)
-    while True:
-        boxes = obstacle[known]
-        corners = _outlines(boxes, hull).reshape(-1, 2)
-        points = np.concatenate([start[None], _free(corners, boxes, hull, inside)])
-        ends = _free(circle, boxes, hull, inside)
-        length, way = _search(points, ends, target, boxes, (*radii, inside))
-        if math.isinf(length):
-            return length
-        met = _barred(way[:-1, None], way[1:, None], obstacle[None], hull).any(axis=0)
-        if not (met & ~known).any():
-            return length
-        known = known | met
+    boxes, place = arena.boxes, arena.outline.place
+    begin = _see(start[None], boxes)
+    circle = _free(_see(_circle(target, reach, arena.inside), boxes), boxes, arena.inside)
+    around = np.linalg.norm(place - start, axis=-1)
+    around += np.maximum(np.linalg.norm(target - place, axis=-1) - reach, 0.0)
+    most = _DETOUR * max(math.dist(start, target), reach)
+    length = _way_through(arena, np.flatnonzero(around <= most), begin, circle, target, reach)
+    if math.isinf(length) and not _is_joined(arena, begin, circle, target, reach):
+        return math.inf
+    while length > most:
+        most = min(length + _SLACK, 2.0 * most)
+        length = _way_through(arena, np.flatnonzero(around <= most), begin, circle, target, reach)
+    return length
+
+
+def _is_joined(
+    arena: _Arena, begin: _Points, circle: _Points, target: np.ndarray, reach: float
+) -> bool:
+    """Whether any way leads from the start to the target: much less work than the shortest."""
+    _divide(arena)
+    seen = arena.part[np.isfinite(_legs(arena.boxes, _fan(begin, arena.outline)))]
+    points = _join(begin, _take(arena.outline, np.isin(arena.part, seen)))
+    if np.isfinite(_straight(arena, points, target, reach)).any():
+        return True
+    row, column = np.indices((len(points.place), len(circle.place))).reshape(2, -1)
+    return bool(np.isfinite(_legs(arena.boxes, _Lines(points, row, circle, column))).any())
+
+
+def _divide(arena: _Arena) -> None:
+    """Finds out which points of an arena are joined, unless that is known."""
+    for first in range(len(arena.part)):
+        if arena.part[first] < 0:
+            _flood(arena, first)
+
+
+def _flood(arena: _Arena, first: int) -> None:
+    """Gives the number of a point to all that are joined with it."""
+    arena.part[first], waiting = first, [first]
+    while waiting:
+        here, others = waiting.pop(), np.flatnonzero(arena.part < 0)
+        others = others[_are_free(arena, here, others)]
+        arena.part[others] = first
+        waiting += others.tolist()
+
+
+def _way_through(
+    arena: _Arena,
+    rows: np.ndarray,
+    begin: _Points,
+    circle: _Points,
+    target: np.ndarray,
+    reach: float,
+) -> float:
+    """Length of the shortest way through these rows [W] of the points of an arena, m."""
+    boxes, some = arena.boxes, _take(arena.outline, rows)
+    points = _join(begin, some)
+    rest = np.maximum(np.linalg.norm(target - some.place, axis=-1) - reach, 0.0)
+    last = _straight(arena, points, target, reach)
+    first = _legs(boxes, _fan(begin, some))
+    length = np.concatenate([[0.0], _search(arena, rows, first, rest, last)])
+    best = (length + last).min()
+    # The shortest way to the other points of the circle, from where the straight line is barred.
+    far = np.linalg.norm(points.place[:, None] - circle.place, axis=-1) + length[:, None]
+    row, column = np.nonzero((far < best) & np.isinf(last)[:, None])
+    around = length[row] + _legs(boxes, _Lines(points, row, circle, column))
+    return float(around.min(initial=best))
+
+
+def _straight(arena: _Arena, points: _Points, target: np.ndarray, reach: float) -> np.ndarray:
+    """Lengths [V] of the ways from points straight to a target, m; inf where barred."""
+    offset = target - points.place
+    apart = np.linalg.norm(offset, axis=-1)
+    share = np.maximum(apart - reach, 0.0) / np.maximum(apart, reach)
+    end, each = points.place + offset * share[:, None], np.arange(len(offset))
+    length = _legs(arena.boxes, _Lines(points, each, _see(end, arena.boxes), each))
+    length[~_within(end, arena.inside)] = np.inf
+    return length
+
+
+def _search(
+    arena: _Arena, rows: np.ndarray, first: np.ndarray, rest: np.ndarray, last: np.ndarray
+) -> np.ndarray:
+    """Lengths [W] of the shortest ways from the start to points of an arena, m.
+
+    A* on the visibility graph: the algorithm of Dijkstra 1959, "A note on two problems in connexion
+    with graphs", which leaves out points that are too far away even if the way leads straight on
+    from there (Hart, Nilsson & Raphael 1968, "A formal basis for the heuristic determination of
+    minimum cost paths").
+
+    Args:
+        arena: Theirs; what is found out of the lines between its points is kept there.
+        rows: [W] of the points.
+        first: [W] straight from the start, inf where barred.
+        rest: [W] to the target at least.
+        last: [1 + W] straight to the target from the start and from the points, inf where barred.
+
+    Returns:
+        The lengths. Those may be too long from where no way is shorter than the shortest found.
+    """
+    length, least, best = first.copy(), first + rest, last[0]
+    place = arena.outline.place[rows]
+    while least.size and least[here := int(np.argmin(least))] < best:
+        best = min(best, length[here] + last[1 + here])
+        least[here] = np.inf
+        by_here = length[here] + np.linalg.norm(place - place[here], axis=-1)
+        worth = np.flatnonzero((by_here < length) & (by_here + rest < best))
+        worth = worth[_are_free(arena, rows[here], rows[worth])]
+        length[worth] = by_here[worth]
+        least[worth] = by_here[worth] + rest[worth]
+    return length
+
+
+def _are_free(arena: _Arena, point: int, others: np.ndarray) -> np.ndarray:
+    """Whether the straight lines from a point of an arena to others [L] are free."""
+    new = others[np.isnan(arena.legs[point, others])]
+    if new.size:
+        one, some = _take(arena.outline, [point]), _take(arena.outline, new)
+        found = _legs(arena.boxes, _fan(one, some))
+        arena.legs[point, new] = arena.legs[new, point] = found
+    return np.isfinite(arena.legs[point, others])
 
 
 def _circle(target: np.ndarray, reach: float, inside: float) -> np.ndarray:
@@ -100,51 +271,43 @@ def _circle(target: np.ndarray, reach: float, inside: float) -> np.ndarray:
     return target + np.concatenate(around)
 
 
-def _search(
-    points: np.ndarray,
-    circle: np.ndarray,
-    target: np.ndarray,
-    boxes: np.ndarray,
-    sizes: tuple[float, float, float],
-) -> tuple[float, np.ndarray]:
-    """Shortest way from the first of the points [V, 2] past boxes: its length, and [W, 2] points.
-
-    Dijkstra 1959, "A note on two problems in connexion with graphs", on the visibility graph.
-    """
-    hull, reach, inside = sizes
-    steps = _legs(points, points, boxes, hull)
-    offset = target - points
-    apart = np.linalg.norm(offset, axis=-1, keepdims=True)
-    nearest = points + offset * np.maximum(1.0 - reach / np.maximum(apart, reach), 0.0)
-    straight = np.where(_within(nearest, inside), _leg(points, nearest, boxes, hull), np.inf)
-    last = np.concatenate([straight[:, None], _legs(points, circle, boxes, hull)], axis=-1)
-    length = np.where(np.arange(len(points)) == 0, 0.0, np.inf)
-    before, open_ = np.zeros(len(points), int), np.ones(len(points), bool)
-    while np.isfinite(length[open_]).any():
-        here = int(np.argmin(np.where(open_, length, np.inf)))
-        open_[here] = False
-        by_here = length[here] + steps[here]
-        before = np.where(by_here < length, here, before)
-        length = np.minimum(length, by_here)
-    total = length + last.min(axis=-1)
-    end = int(np.argmin(total))
-    choice = int(np.argmin(last[end]))
-    way = [nearest[end] if choice == 0 else circle[choice - 1], points[end]]
-    while end and math.isfinite(total.min()):
-        end = int(before[end])
-        way.append(points[end])
-    return float(total.min()), np.array(way)
+def _fan(one: _Points, others: _Points) -> _Lines:
+    """Lines from a single point [1] to others [L]."""
+    each = np.arange(len(others.place))
+    return _Lines(one, np.zeros_like(each), others, each)
 
 
-def _legs(first: np.ndarray, second: np.ndarray, boxes: np.ndarray, hull: float) -> np.ndarray:
-    """Lengths [V, W] of the straight lines between points [V, 2] and [W, 2], inf where barred."""
-    return _leg(first[:, None], second[None], boxes, hull)
+def _legs(boxes: _Boxes, lines: _Lines) -> np.ndarray:
+    """Lengths [L] of straight lines, m; inf where barred."""
+    first, begin, second, end = lines
+    length = np.linalg.norm(second.place[end] - first.place[begin], axis=-1)
+    near = (first.beyond[begin] & second.beyond[end]) == 0
+    if near.shape[1] > _NEAREST and np.count_nonzero(near) > _MANY:
+        soon = near & _nearest(boxes, first)[begin]
+        barred = _are_barred(boxes, lines, soon)
+        length[barred] = np.inf
+        near &= ~(soon | barred[:, None])
+    length[_are_barred(boxes, lines, near)] = np.inf
+    return length
 
 
-def _leg(first: np.ndarray, second: np.ndarray, boxes: np.ndarray, hull: float) -> np.ndarray:
-    """Lengths [...] of the straight lines between points [..., 2], inf where barred."""
-    barred = _barred(first[..., None, :], second[..., None, :], boxes, hull).any(axis=-1)
-    return np.where(barred, np.inf, np.linalg.norm(second - first, axis=-1))
+def _nearest(boxes: _Boxes, points: _Points) -> np.ndarray:
+    """Which boxes are the nearest to points, [V, M]."""
+    x, y = np.maximum(np.abs(points.local) - boxes.half[:, None], 0.0)
+    order = np.argpartition(x * x + y * y, _NEAREST, axis=-1)
+    found = np.zeros(order.shape, bool)
+    np.put_along_axis(found, order[:, :_NEAREST], True, axis=-1)
+    return found
+
+
+def _are_barred(boxes: _Boxes, lines: _Lines, pairs: np.ndarray) -> np.ndarray:
+    """Whether any of the boxes that each line is paired with [L, M] bars it, [L]."""
+    line, box = np.nonzero(pairs)
+    start = lines.first.local[:, lines.begin[line], box]
+    way = lines.second.local[:, lines.end[line], box] - start
+    barred = np.zeros(len(pairs), bool)
+    barred[line[_meets(start, way, boxes.half[:, box], boxes.radius)]] = True
+    return barred
 
 
 def _outlines(boxes: np.ndarray, hull: float) -> np.ndarray:
@@ -159,10 +322,29 @@ def _outlines(boxes: np.ndarray, hull: float) -> np.ndarray:
     return boxes[:, None, :2] + np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
-def _free(points: np.ndarray, boxes: np.ndarray, hull: float, inside: float) -> np.ndarray:
-    """Keeps those of points [V, 2] where the disc stands clear of boxes and walls."""
-    barred = _barred(points[:, None], points[:, None], boxes[None], hull).any(axis=-1)
-    return points[~barred & _within(points, inside)]
+def _see(place: np.ndarray, boxes: _Boxes) -> _Points:
+    """Finds where boxes have points [V, 2]."""
+    x, y = local = _into(place[:, None] - boxes.box[:, :2], boxes.box)
+    length, width = boxes.half + boxes.radius
+    sides = np.stack([x >= length, x <= -length, y >= width, y <= -width], axis=-1)
+    return _Points(place, local, np.packbits(sides, axis=-1)[..., 0])
+
+
+def _free(points: _Points, boxes: _Boxes, inside: float) -> _Points:
+    """Keeps the points where the disc stands clear of boxes and walls."""
+    x, y = np.maximum(np.abs(points.local) - boxes.half[:, None], 0.0)
+    free = (x * x + y * y >= boxes.radius**2).all(axis=-1) & _within(points.place, inside)
+    return _take(points, free)
+
+
+def _take(points: _Points, rows: np.ndarray | list[int]) -> _Points:
+    """Keeps some of the points."""
+    return _Points(points.place[rows], points.local[:, rows], points.beyond[rows])
+
+
+def _join(first: _Points, second: _Points) -> _Points:
+    """Puts points one after the other."""
+    return _Points(*(np.concatenate(pair, axis=-2) for pair in zip(first, second, strict=True)))
 
 
 def _within(points: np.ndarray, inside: float | np.ndarray) -> np.ndarray:
@@ -171,36 +353,32 @@ def _within(points: np.ndarray, inside: float | np.ndarray) -> np.ndarray:
 
 
 def _barred(first: np.ndarray, second: np.ndarray, box: np.ndarray, hull: float) -> np.ndarray:
-    """Whether [...] boxes [..., 5] bar the straight ways of a disc between points [..., 2].
+    """Whether [...] boxes [..., 5] bar the straight ways of a disc between points [..., 2]."""
+    start, way = _into(first - box[..., :2], box), _into(second - first, box)
+    return _meets(start, way, np.moveaxis(box[..., 3:], -1, 0), hull - _SLACK)
 
-    The disc meets a box where its centre enters the box widened by its radius: two boxes, each
+
+def _meets(start: np.ndarray, way: np.ndarray, half: np.ndarray, radius: float) -> np.ndarray:
+    """Whether lines from `start` by `way` [2, ...] come nearer than a radius to boxes about 0.
+
+    They do where they enter the box of half edges [2, ...] widened by the radius: two boxes, each
     longer by the radius at both ends of one axis, and a circle about each corner.
     """
-    radius = hull - _SLACK
-    start, way = _into(first - box[..., :2], box), _into(second - first, box)
-    half = np.broadcast_to(box[..., 3:], start.shape)
-    meets = _enters(start, way, half + np.array([radius, 0.0]))
-    meets |= _enters(start, way, half + np.array([0.0, radius]))
-    square = np.maximum((way * way).sum(axis=-1), 1e-30)
-    for sign in _SIGNS:
-        offset = sign * half - start
-        along = np.clip((offset * way).sum(axis=-1) / square, 0.0, 1.0)
-        beside = offset - along[..., None] * way
-        meets |= (beside * beside).sum(axis=-1) < radius * radius
-    return meets
+    wide = half[:, None] + radius * np.eye(2).reshape(2, 2, *[1] * (half.ndim - 1))
+    pace = np.where(np.abs(way) < 1e-12, 1e-12, way)[:, None]
+    one, other = (-wide - start[:, None]) / pace, (wide - start[:, None]) / pace
+    enter = np.maximum(np.minimum(one, other).max(axis=0), 0.0)
+    leave = np.minimum(np.maximum(one, other).min(axis=0), 1.0)
+    corner = _SIGNS.T.reshape(2, 4, *[1] * (half.ndim - 1)) * half[:, None] - start[:, None]
+    square = np.maximum((way * way).sum(axis=0), 1e-30)
+    along = np.minimum(np.maximum((corner * way[:, None]).sum(axis=0) / square, 0.0), 1.0)
+    beside = corner - along * way[:, None]
+    near = (beside * beside).sum(axis=0) < radius * radius
+    return (enter < leave).any(axis=0) | near.any(axis=0)
 
 
 def _into(vector: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """Turns vectors [..., 2] into the frames of boxes [..., 5]."""
+    """Turns vectors [..., 2] into the frames of boxes [..., 5]: [2, ...] x and y."""
     cos, sin = np.cos(box[..., 2]), np.sin(box[..., 2])
     x, y = vector[..., 0], vector[..., 1]
-    return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
-
-
-def _enters(start: np.ndarray, way: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Whether [...] lines from `start` by `way` [..., 2] enter boxes of these half edges."""
-    pace = np.where(np.abs(way) < 1e-12, 1e-12, way)
-    one, other = (-half - start) / pace, (half - start) / pace
-    enter = np.minimum(one, other).max(axis=-1)
-    leave = np.maximum(one, other).min(axis=-1)
-    return np.maximum(enter, 0.0) < np.minimum(leave, 1.0)
+    return np.stack([cos * x + sin * y, cos * y - sin * x])

@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -12,10 +14,16 @@ from swarmjax.evaluate import shortest_path
 HULL, REACH = 0.037, 0.05
 # One right angle around a corner, along points outside of it: 0.8 mm.
 SLACK = 1e-3
+# Four points for a right angle turn 22.5 degrees each; so much longer is what is around an arc.
+LONGER = math.tan(math.pi / 16) / (math.pi / 16)
 
 
 def _shortest(
-    start: list[float], target: list[float], boxes: list[list[float]], side: float = 2.0
+    start: list[float],
+    target: list[float],
+    boxes: list[list[float]],
+    side: float = 2.0,
+    reach: float = REACH,
 ) -> float:
     """Of one robot, m."""
     found = shortest_path.shortest(
@@ -24,7 +32,7 @@ def _shortest(
         np.array([[target]]),
         np.array(boxes, float).reshape(1, -1, 5),
         HULL,
-        REACH,
+        reach,
     )
     return float(found[0, 0])
 
@@ -49,6 +57,174 @@ def test_around_a_plate_by_hand() -> None:
     expected = 2 * tangent + HULL * arc
     # The last leg ends 0.05 m before the target, on the straight to it.
     assert expected - REACH - 1e-9 <= found <= expected - REACH + SLACK
+
+
+def _taut(start: list[float], corners: list[list[float]], target: list[float]) -> list[float]:
+    """Length of a string around discs about corners, all on its right: all, and along arcs, m."""
+    points = np.array([start, *corners, target])
+    legs = np.diff(points, axis=0)
+    length = np.hypot(*legs.T)
+    heading = np.unwrap(np.arctan2(legs[:, 1], legs[:, 0]))
+    # The tangents at both ends leave the lines to the centres by asin(radius / distance).
+    first, last = (math.asin(HULL / x) for x in (length[0], length[-1]))
+    arcs = HULL * float(heading[0] + first - (heading[-1] - last))
+    straight = float(length[1:-1].sum()) + sum(
+        math.sqrt(x**2 - HULL**2) for x in (length[0], length[-1])
+    )
+    return [straight + arcs, arcs]
+
+
+T = 0.005  # m, half the thickness of a wall
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7])
+@pytest.mark.parametrize(
+    ("start", "corners", "target", "walls"),
+    [
+        ([0.4, -0.7], [[0.0, -0.5]], [-0.2, 0.1], [[0.5, 0.0, 0.5, 0.5]]),
+        # A corridor of 0.2 m that bends to the right; its inner corner is that of two walls.
+        (
+            [0.1, -0.5],
+            [[0.2 - T, 0.0 + T]],
+            [0.6, 0.1],
+            [
+                [0.2, -0.4, T, 0.4 + T],
+                [0.5, 0.0, 0.3 + T, T],
+                [0.0, -0.3, T, 0.5 + T],
+                [0.4, 0.2, 0.4 + T, T],
+            ],
+        ),
+        # Out of a U, whose sides are of two walls each, and back to behind its bottom.
+        (
+            [0.1, 0.1],
+            [[0.2 - T, 0.4 + T], [0.2 + T, 0.4 + T], [0.2 + T, -T]],
+            [0.1, -0.3],
+            [
+                [0.2, 0.1, T, 0.1 + T],
+                [0.2, 0.3, T, 0.1 + T],
+                [-0.2, 0.2, T, 0.2 + T],
+                [0.0, 0.0, 0.2 + T, T],
+            ],
+        ),
+        # Past a corridor, although a way of 1.97 m zigzags through it, nearer to the straight line.
+        (
+            [-0.6, 0.0],
+            [[-0.35, 0.3 + T], [0.35, 0.3 + T]],
+            [0.6, 0.0],
+            [
+                [0.0, 0.3, 0.35, T],
+                [0.0, -0.3, 0.35, T],
+                [-0.2, -0.05, T, 0.25],
+                [0.0, 0.05, T, 0.25],
+                [0.2, -0.05, T, 0.25],
+            ],
+        ),
+    ],
+    ids=["corner", "bend", "U", "zigzag"],
+)
+def test_among_walls_by_hand(
+    start: list[float],
+    corners: list[list[float]],
+    target: list[float],
+    walls: list[list[float]],
+    yaw: float,
+) -> None:
+    turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+    boxes = [[*(turn @ [x, y]), yaw, *half] for x, y, *half in walls]
+    found = _shortest(list(turn @ start), list(turn @ target), boxes, side=4.0)
+    length, arcs = _taut(start, corners, target)
+    # The last leg ends 0.05 m before the target, on the straight to it. Around an arc the way is
+    # longer by that factor; at either end of one it may go to a point half a step beyond it.
+    most = (LONGER - 1) * (arcs + 2 * len(corners) * HULL * math.pi / 16)
+    assert length - REACH - 1e-9 <= found <= length - REACH + most
+
+
+def _maze(random: np.random.Generator, cells: int, edge: float) -> list[list[float]]:
+    """Unit walls of a maze, touching each other: one way joins any two of its cells."""
+    sides = [(i, j, k) for i in range(cells) for j in range(cells) for k in (0, 1)]
+    sides = [each for each in sides if each[each[2]] + 1 < cells]
+    part = np.arange(cells**2).reshape(cells, cells)
+    walls = []
+    for i, j, k in random.permutation(sides):
+        one, other = part[i, j], part[i + 1 - k, j + k]
+        if one != other:
+            part[part == other] = one
+            continue
+        x, y = ((i + (1 - k / 2), j + (k + 1) / 2) - np.full(2, cells / 2)) * edge
+        half = [T, edge / 2 + T]
+        walls.append([x, y, 0.0, *(half[::-1] if k else half)])
+    return walls
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_ways_through_a_maze_are_those_of_a_grid(seed: int) -> None:
+    cells, edge = 4, 0.25
+    random = np.random.default_rng(seed)
+    walls = _maze(random, cells, edge)
+    assert len(walls) == 9  # of 24 sides, all but the 15 of a tree
+    ends = (random.permutation(cells**2)[:10].reshape(5, 2)[..., None] // [cells, 1]) % cells
+    for start, target in (ends + 0.5 - cells / 2) * edge:
+        found = _shortest(list(start), list(target), walls, cells * edge)
+        expected = _by_grid(cells * edge, start, target, np.array(walls))
+        # As below; in these corridors of 0.24 m nothing is closed to the grid alone.
+        assert found <= expected + 2 * CELL + SLACK
+        assert expected <= 1.027 * found + 4 * CELL
+
+
+def test_robots_of_an_arena_do_not_change_each_others_ways() -> None:
+    """What one has found out is kept for the next."""
+    random = np.random.default_rng(5)
+    walls = _maze(random, 4, 0.25)
+    ends = (random.permutation(16).reshape(8, 2)[..., None] // [4, 1] % 4 - 1.5) * 0.25
+    together = shortest_path.shortest(
+        np.array([1.0]), ends[None, :, 0], ends[None, :, 1], np.array([walls]), HULL, REACH
+    )
+    alone = [_shortest(list(start), list(target), walls, 1.0) for start, target in ends]
+    # The same sums, of which legs may be those found from their other end: their last bits.
+    np.testing.assert_allclose(together[0], alone, rtol=1e-14)
+
+
+@pytest.mark.parametrize("shut_in", ["start", "target"])
+def test_no_way_leads_through_a_closed_cell_of_a_maze(shut_in: str) -> None:
+    walls = _maze(np.random.default_rng(1), 4, 0.25)
+    cell = [[0.125 + x, 0.125 + y, 0.0, *half] for x, y, half in (
+        (0.125, 0, (T, 0.13)), (-0.125, 0, (T, 0.13)),
+        (0, 0.125, (0.13, T)), (0, -0.125, (0.13, T)))]  # fmt: skip
+    ends = [[0.125, 0.125], [-0.375, -0.375]]
+    start, target = ends if shut_in == "start" else ends[::-1]
+    assert math.isfinite(_shortest(start, target, walls, 1.0))
+    assert _shortest(start, target, walls + cell, 1.0) == math.inf
+
+
+# Whole centimetres: no gap between axis-parallel boxes is then between 7.4 cm, the disc's diameter,
+# and 7.54 cm, that of its outline's points, where a way may be there that no points lead along.
+_CM = st.integers(-50, 50).map(lambda x: x / 100)
+_HALF = st.integers(1, 30).map(lambda x: x / 100)
+_BOX = st.tuples(_CM, _CM, st.just(0.0), _HALF, _HALF).map(list)
+_PLACE = st.tuples(_CM, _CM).map(list)
+
+
+def _is_clear(place: list[float], boxes: list[list[float]]) -> bool:
+    """Whether the disc stands at a place [2] with 1 mm to spare of boxes [M, 5], at any yaw."""
+    for x, y, yaw, *half in boxes:
+        dx, dy = place[0] - x, place[1] - y
+        u, v = math.cos(yaw) * dx + math.sin(yaw) * dy, math.cos(yaw) * dy - math.sin(yaw) * dx
+        if math.hypot(max(abs(u) - half[0], 0), max(abs(v) - half[1], 0)) < HULL + 1e-3:
+            return False
+    return True
+
+
+@given(start=_PLACE, target=_PLACE, boxes=st.lists(_BOX, max_size=5), more=_BOX)
+def test_what_holds_of_any_way(
+    start: list[float], target: list[float], boxes: list[list[float]], more: list[float]
+) -> None:
+    assume(_is_clear(start, [*boxes, more]) and _is_clear(target, [*boxes, more]))
+    near = 1e-5  # m, so that start and target may be exchanged
+    found = _shortest(start, target, boxes, 1.2, near)
+    assert found >= math.dist(start, target) - near - 1e-12
+    assert _shortest(target, start, boxes, 1.2, near) == pytest.approx(found, abs=2 * near)
+    # Another box may lend its points to a way around a corner, which is at most so much too long.
+    assert LONGER * (_shortest(start, target, [*boxes, more], 1.2, near) + near) >= found
 
 
 def test_no_way_leads_out_of_a_cage() -> None:
@@ -154,5 +330,5 @@ def _free_places(random: np.random.Generator, boxes: np.ndarray) -> tuple[np.nda
     """Two places of the arena that no box covers."""
     while True:
         place = random.uniform(-0.55, 0.55, (2, 2))
-        if len(shortest_path._free(place, boxes, HULL + 0.01, 0.55)) == 2:
+        if all(_is_clear(list(each), boxes.tolist()) for each in place):
             return place[0], place[1]
