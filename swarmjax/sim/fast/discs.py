@@ -178,7 +178,7 @@ def put(model: mujoco.MjModel) -> tuple[Model, Data]:
     fields = model.body_mass, model.body_inertia, model.body_invweight0
     still = jnp.zeros(model.nv)
     friction = jnp.asarray(model.pair_friction) if rubs(model) else None
-    placed = Model(*map(jnp.asarray, fields), friction)
+    placed = Model(*map(jnp.asarray, fields), pair_friction=friction)
     return placed, Data(jnp.zeros(model.nq), still, still, still)
 
 
@@ -249,11 +249,10 @@ def _robots(discs: Discs, model: Model, data: Data) -> DiscRobots:
     fields = data.qpos, data.qvel, data.qfrc_applied, data.qacc_warmstart
     place, rate, force, before = (field.reshape(-1, 3) for field in fields)
     free = force / jnp.stack([mass, mass, turn], axis=-1)
-    rubbing = None
-    if model.pair_friction is not None:
-        rubbing = Rubbing(1.0 / turn, model.pair_friction[0, 0])
-    weight = model.body_invweight0[discs.body, 0]
-    return DiscRobots(place, rate, free, before, 1.0 / mass, weight, rubbing)
+    robots = DiscRobots(place, rate, free, before, 1.0 / mass, model.body_invweight0[discs.body, 0])
+    if model.pair_friction is None:
+        return robots
+    return robots._replace(rubbing=Rubbing(1.0 / turn, model.pair_friction[0, 0]))
 
 
 def spring(discs: Discs) -> tuple[float, float]:

@@ -52,7 +52,7 @@ class Force(NamedTuple):
     rub: Array
 
 
-class Motion(NamedTuple):
+class PlaneMotion(NamedTuple):
     """Speeds or accelerations of robots, or of one against another (`turn`: both together)."""
 
     x: Array
@@ -73,16 +73,18 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
       [R, 3] of x and y, m/s^2, and of yaw, rad/s^2.
     """
     touch = _touches(discs, robots, sim_model.fixture_rectangles(side, obstacle, jnp))
-    free, before = (Motion(*move.T) for move in (robots.free, robots.before))
+    free, before = (PlaneMotion(*move.T) for move in (robots.free, robots.before))
     force = _first_force(touch, _against(discs, before, len(touch.rub.arm)), _friction(robots))
 
-    def sweep(carry: tuple[Array, Force, Motion, Array]) -> tuple[Array, Force, Motion, Array]:
+    def sweep(
+        carry: tuple[Array, Force, PlaneMotion, Array],
+    ) -> tuple[Array, Force, PlaneMotion, Array]:
         done, force, motion, _ = carry
         changed, motion = _sweep(discs, touch, robots, motion, force)
         change = jnp.max(jnp.stack([jnp.abs(a - b) for a, b in zip(changed, force, strict=True)]))
         return done + 1, changed, motion, change > RUBBING_TOLERANCE * jnp.max(changed.push)
 
-    def goes_on(carry: tuple[Array, Force, Motion, Array]) -> Array:
+    def goes_on(carry: tuple[Array, Force, PlaneMotion, Array]) -> Array:
         done, _, _, moves = carry
         return moves & (done < discs.sweeps)
 
@@ -112,45 +114,45 @@ def _touches(discs: Discs, robots: DiscRobots, fixture: Array) -> Touch:
     agility = _rubbing(robots).agility
     alone = jnp.broadcast_to(agility, (count, len(agility)))
     turns = jnp.concatenate([alone, agility + agility[discs.opponent]])
-    rate = _against(discs, Motion(*robots.rate.T), len(arm))
+    rate = _against(discs, PlaneMotion(*robots.rate.T), len(arm))
     demand = -spring(discs)[1] * _slide(push.gap, arm, rate)
     return Touch(push, Rub(arm, demand, push.stiffness + arm * arm * turns))
 
 
-def _against(discs: Discs, motion: Motion, contacts: int) -> Motion:
+def _against(discs: Discs, motion: PlaneMotion, contacts: int) -> PlaneMotion:
     """How robots [R] move against what they may touch, [K, R]; fixtures stand.
 
     Two that turn alike slide on each other at twice the speed: turns add up.
     """
     still = jnp.zeros((contacts - len(discs.opponent), len(motion.x)))
     x, y, turn = (jnp.concatenate([still, a[discs.opponent]]) for a in motion)
-    return Motion(motion.x - x, motion.y - y, motion.turn + turn)
+    return PlaneMotion(motion.x - x, motion.y - y, motion.turn + turn)
 
 
-def _slide(gap: DiscGap, arm: Array, motion: Motion) -> Array:
+def _slide(gap: DiscGap, arm: Array, motion: PlaneMotion) -> Array:
     """J a along the face: how fast the robot's rim slides on what it touches."""
     return gap.x * motion.y - gap.y * motion.x - arm * motion.turn
 
 
-def _kick(touch: Touch, robots: DiscRobots, force: Force) -> Motion:
+def _kick(touch: Touch, robots: DiscRobots, force: Force) -> PlaneMotion:
     """What forces of contacts bring about, each alone."""
     gap, mobility = touch.push.gap, robots.mobility
-    return Motion(
+    return PlaneMotion(
         mobility * (gap.x * force.push - gap.y * force.rub),
         mobility * (gap.y * force.push + gap.x * force.rub),
         -_rubbing(robots).agility * touch.rub.arm * force.rub,
     )
 
 
-def _moved(touch: Touch, robots: DiscRobots, free: Motion, force: Force) -> Motion:
+def _moved(touch: Touch, robots: DiscRobots, free: PlaneMotion, force: Force) -> PlaneMotion:
     """Adds what forces [K, R] bring about."""
     kick = _kick(touch, robots, force)
-    return Motion(*(a + jnp.sum(b, axis=0) for a, b in zip(free, kick, strict=True)))
+    return PlaneMotion(*(a + jnp.sum(b, axis=0) for a, b in zip(free, kick, strict=True)))
 
 
 def _sweep(
-    discs: Discs, touch: Touch, robots: DiscRobots, motion: Motion, force: Force
-) -> tuple[Force, Motion]:
+    discs: Discs, touch: Touch, robots: DiscRobots, motion: PlaneMotion, force: Force
+) -> tuple[Force, PlaneMotion]:
     """Sets the forces [K, R] one contact after the other, those of all robots at once."""
     found: list[Force] = []
     fixtures, friction = len(force.push) - len(discs.opponent), _friction(robots)
@@ -160,16 +162,16 @@ def _sweep(
         if k >= fixtures:
             other = discs.opponent[k - fixtures]
             x, y, turn = (a[other] for a in motion)
-            apart = Motion(motion.x - x, motion.y - y, motion.turn + turn)
+            apart = PlaneMotion(motion.x - x, motion.y - y, motion.turn + turn)
         best = _best_force(one, apart, now, friction)
         more = Force(best.push - now.push, best.rub - now.rub)
         kick = _kick(one, robots, more)
-        motion = Motion(*(a + b for a, b in zip(motion, kick, strict=True)))
+        motion = PlaneMotion(*(a + b for a, b in zip(motion, kick, strict=True)))
         found.append(best)
     return Force(*map(jnp.stack, zip(*found, strict=True))), motion
 
 
-def _first_force(touch: Touch, motion: Motion, friction: Array) -> Force:
+def _first_force(touch: Touch, motion: PlaneMotion, friction: Array) -> Force:
     """The forces that contacts would have if robots moved like this against the other."""
     push, rub = _short(touch, motion)
     give = touch.push.give
@@ -177,7 +179,7 @@ def _first_force(touch: Touch, motion: Motion, friction: Array) -> Force:
     return _where_closed(touch, force)
 
 
-def _best_force(touch: Touch, motion: Motion, force: Force, friction: Array) -> Force:
+def _best_force(touch: Touch, motion: PlaneMotion, force: Force, friction: Array) -> Force:
     """The forces that suit a contact best if the others push and rub as they do."""
     push, rub = _short(touch, motion)
     give, stiffness = touch.push.give, (touch.push.stiffness, touch.rub.stiffness)
@@ -186,7 +188,7 @@ def _best_force(touch: Touch, motion: Motion, force: Force, friction: Array) -> 
     return _where_closed(touch, project(Force(push, rub), *stiffness, friction))
 
 
-def _short(touch: Touch, motion: Motion) -> tuple[Array, Array]:
+def _short(touch: Touch, motion: PlaneMotion) -> tuple[Array, Array]:
     """By how much accelerations fall short of what contacts ask for, m/s^2."""
     gap = touch.push.gap
     push = touch.push.demand - planar_jax.along(gap, planar_jax.Motion(motion.x, motion.y))

@@ -47,23 +47,14 @@ def _solve(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Ar
     pairs = count * fixtures + count * (count - 1) // 2
     rows = min(pairs, ROWS_PER_ROBOT * count + fixtures), arenas
     numbers = np.array([discs.radius, *sim_discs.spring(discs), *discs.solimp], np.float32)
-    call = wp.jax_kernel(_push_apart, num_outputs=4, block_dim=planar_warp.BLOCK)
-    shapes = {"row": rows, "force": rows, "between": rows, "found": (arenas, count)}
+    call = wp.jax_kernel(_push_apart, num_outputs=5, block_dim=planar_warp.BLOCK)
+    shapes = dict.fromkeys(("row", "asked", "force", "between"), rows) | {"found": (arenas, count)}
     given = *robots[:-1], *robots.rubbing, side, obstacle, jnp.asarray(numbers), discs.sweeps
     return call(*given, launch_dims=arenas, output_dims=shapes)[-1]
 
 
-# Of a contact: x and y of the unit vector along which it pushes, its arm, m, aref of its push and of
-# its rub, R, and J M^-1 J' + R of both.
-_ROW = 8
-_X, _Y, _ARM, _PUSH_DEMAND, _RUB_DEMAND, _GIVE, _PUSH_STIFFNESS, _RUB_STIFFNESS = (
-    wp.constant(i) for i in range(_ROW)
-)
-WarpRow = wp.types.vector(length=_ROW, dtype=wp.float32)
-
-
 @wp.struct
-class WarpArena:
+class WarpRubbingArena:
     """What a thread reads and writes.
 
     Attributes:
@@ -75,7 +66,8 @@ class WarpArena:
       agility: [A, R] 1 / moment of inertia.
       friction: of hulls on what they touch.
       numbers: radius (m), stiffness (1/s^2), damping (1/s), and `solimp`.
-      row: [K, A] of each contact.
+      row: [K, A] of each contact x and y of the unit vector along which it pushes, its arm (m), R.
+      asked: [K, A] aref of its push and of its rub, and J M^-1 J' + R of both.
       force: [K, A] its push and its rub, N.
       between: [K, A] the robot that is pushed along, and the one that is pushed back; -1: none.
       found: [A, R] acceleration of x, y and yaw.
@@ -90,7 +82,8 @@ class WarpArena:
     agility: wp.array2d[float]
     friction: float
     numbers: wp.array[float]
-    row: wp.array2d[WarpRow]
+    row: wp.array2d[wp.vec4]
+    asked: wp.array2d[wp.vec4]
     force: wp.array2d[wp.vec2]
     between: wp.array2d[wp.vec2i]
     found: wp.array2d[wp.vec3]
@@ -111,13 +104,14 @@ def _push_apart(  # noqa: PLR0913  # JAX hands arrays over one by one
     obstacle: wp.array3d[float],
     numbers: wp.array[float],
     sweeps: int,
-    row: wp.array2d[WarpRow],
+    row: wp.array2d[wp.vec4],
+    asked: wp.array2d[wp.vec4],
     force: wp.array2d[wp.vec2],
     between: wp.array2d[wp.vec2i],
     found: wp.array2d[wp.vec3],
 ) -> None:
     """Finds the forces of an arena's contacts and what comes of them."""
-    arena = WarpArena()
+    arena = WarpRubbingArena()
     arena.place = place
     arena.rate = rate
     arena.before = before
@@ -126,6 +120,7 @@ def _push_apart(  # noqa: PLR0913  # JAX hands arrays over one by one
     arena.agility = agility
     arena.numbers = numbers
     arena.row = row
+    arena.asked = asked
     arena.force = force
     arena.between = between
     arena.found = found
@@ -149,14 +144,14 @@ def _push_apart(  # noqa: PLR0913  # JAX hands arrays over one by one
 
 
 @wp.func
-def _let_go(arena: WarpArena, free: wp.array2d[wp.vec3]) -> None:
+def _let_go(arena: WarpRubbingArena, free: wp.array2d[wp.vec3]) -> None:
     """Sets accelerations to those without contacts."""
     for i in range(free.shape[1]):
         arena.found[arena.index, i] = free[arena.index, i]
 
 
 @wp.func
-def _touch_box(arena: WarpArena, count: int, box: planar_warp.WarpBox) -> int:
+def _touch_box(arena: WarpRubbingArena, count: int, box: planar_warp.WarpBox) -> int:
     """Writes the contacts of all robots with a box down; returns how many there are by then."""
     known = count
     for i in range(arena.place.shape[1]):
@@ -166,7 +161,7 @@ def _touch_box(arena: WarpArena, count: int, box: planar_warp.WarpBox) -> int:
 
 
 @wp.func
-def _touch_robots(arena: WarpArena, count: int, i: int) -> int:
+def _touch_robots(arena: WarpRubbingArena, count: int, i: int) -> int:
     """Writes the contacts of a robot with those after it down; likewise."""
     known = count
     for j in range(i + 1, arena.place.shape[1]):
@@ -177,7 +172,7 @@ def _touch_robots(arena: WarpArena, count: int, i: int) -> int:
 
 
 @wp.func
-def _touch(arena: WarpArena, count: int, gap: wp.vec3, first: int, second: int) -> int:
+def _touch(arena: WarpRubbingArena, count: int, gap: wp.vec3, first: int, second: int) -> int:
     """Writes a contact down, if it is one, with first forces; returns how many there are then."""
     if not (gap[2] < 0.0) or count >= arena.row.shape[0]:
         return count
@@ -186,29 +181,26 @@ def _touch(arena: WarpArena, count: int, gap: wp.vec3, first: int, second: int) 
     mobility = _both(arena, arena.mobility, between)
     impedance = planar_warp.impedance_at(arena.numbers, -gap[2])
     give = wp.max(weight * (1.0 - impedance) / impedance, 1.0e-15)  # mjMINVAL
-    row = WarpRow()
-    row[_X] = gap[0]
-    row[_Y] = gap[1]
-    row[_ARM] = arena.numbers[0] + 0.5 * gap[2]  # MuJoCo's contact is midway between the surfaces
-    row[_GIVE] = give
-    row[_PUSH_STIFFNESS] = mobility + give
-    turns = row[_ARM] * row[_ARM] * _both(arena, arena.agility, between)
-    row[_RUB_STIFFNESS] = mobility + turns + give
+    arm = arena.numbers[0] + 0.5 * gap[2]  # MuJoCo's contact is midway between the surfaces
+    row = wp.vec4(gap[0], gap[1], arm, give)
     speed = _slide(arena, arena.rate, row, between)
-    row[_PUSH_DEMAND] = -arena.numbers[2] * speed[0] - arena.numbers[1] * impedance * gap[2]
-    row[_RUB_DEMAND] = -arena.numbers[2] * speed[1]
+    push = -arena.numbers[2] * speed[0] - arena.numbers[1] * impedance * gap[2]
+    rub = -arena.numbers[2] * speed[1]
+    turns = arm * arm * _both(arena, arena.agility, between)
     arena.row[count, arena.index] = row
+    arena.asked[count, arena.index] = wp.vec4(push, rub, mobility + give, mobility + turns + give)
     arena.between[count, arena.index] = between
     # The forces that the contact would have at the acceleration of the step before.
-    short = wp.vec2(row[_PUSH_DEMAND], row[_RUB_DEMAND]) - _slide(arena, arena.before, row, between)
-    force = _project(short / give, give, give, arena.friction)
+    speed = _slide(arena, arena.before, row, between)
+    short = wp.vec2((push - speed[0]) / give, (rub - speed[1]) / give)
+    force = _project(short, give, give, arena.friction)
     arena.force[count, arena.index] = force
     _push(arena, row, between, force)
     return count + 1
 
 
 @wp.func
-def _both(arena: WarpArena, of_robots: wp.array2d[float], between: wp.vec2i) -> float:
+def _both(arena: WarpRubbingArena, of_robots: wp.array2d[float], between: wp.vec2i) -> float:
     """Adds a number of both sides of a contact up."""
     total = of_robots[arena.index, between[0]]
     if between[1] >= 0:
@@ -218,30 +210,30 @@ def _both(arena: WarpArena, of_robots: wp.array2d[float], between: wp.vec2i) -> 
 
 @wp.func
 def _slide(
-    arena: WarpArena, motion: wp.array2d[wp.vec3], row: WarpRow, between: wp.vec2i
+    arena: WarpRubbingArena, motion: wp.array2d[wp.vec3], row: wp.vec4, between: wp.vec2i
 ) -> wp.vec2:
     """J a: how fast the two sides of a contact move apart, and along each other."""
     apart = motion[arena.index, between[0]]
     if between[1] >= 0:
         other = motion[arena.index, between[1]]
         apart = wp.vec3(apart[0] - other[0], apart[1] - other[1], apart[2] + other[2])
-    along = row[_X] * apart[1] - row[_Y] * apart[0] - row[_ARM] * apart[2]
-    return wp.vec2(row[_X] * apart[0] + row[_Y] * apart[1], along)
+    along = row[0] * apart[1] - row[1] * apart[0] - row[2] * apart[2]
+    return wp.vec2(row[0] * apart[0] + row[1] * apart[1], along)
 
 
 @wp.func
-def _push(arena: WarpArena, row: WarpRow, between: wp.vec2i, force: wp.vec2) -> None:
+def _push(arena: WarpRubbingArena, row: wp.vec4, between: wp.vec2i, force: wp.vec2) -> None:
     """Adds what forces bring about, a += M^-1 J' f."""
-    x = row[_X] * force[0] - row[_Y] * force[1]
-    y = row[_Y] * force[0] + row[_X] * force[1]
-    turn = -row[_ARM] * force[1]
+    x = row[0] * force[0] - row[1] * force[1]
+    y = row[1] * force[0] + row[0] * force[1]
+    turn = -row[2] * force[1]
     _push_robot(arena, between[0], wp.vec3(x, y, turn))
     if between[1] >= 0:
         _push_robot(arena, between[1], wp.vec3(-x, -y, turn))
 
 
 @wp.func
-def _push_robot(arena: WarpArena, robot: int, push: wp.vec3) -> None:
+def _push_robot(arena: WarpRubbingArena, robot: int, push: wp.vec3) -> None:
     """Adds what a push and a torque bring about."""
     mobility = arena.mobility[arena.index, robot]
     turn = arena.agility[arena.index, robot] * push[2]
@@ -261,22 +253,22 @@ def _project(force: wp.vec2, push: float, rub: float, friction: float) -> wp.vec
 
 
 @wp.func
-def _sweep(arena: WarpArena, count: int) -> bool:
+def _sweep(arena: WarpRubbingArena, count: int) -> bool:
     """Sets all forces to their best, the others given; says whether that changed any."""
     largest = wp.float32(0.0)
     change = wp.float32(0.0)
     for k in range(count):
         row = arena.row[k, arena.index]
+        asked = arena.asked[k, arena.index]
         force = arena.force[k, arena.index]
         between = arena.between[k, arena.index]
         speed = _slide(arena, arena.found, row, between)
-        give = row[_GIVE]
-        push = (row[_PUSH_DEMAND] - speed[0] - give * force[0]) / row[_PUSH_STIFFNESS]
-        rub = (row[_RUB_DEMAND] - speed[1] - give * force[1]) / row[_RUB_STIFFNESS]
-        wanted = force + wp.vec2(push, rub)
-        best = _project(wanted, row[_PUSH_STIFFNESS], row[_RUB_STIFFNESS], arena.friction)
+        push = (asked[0] - speed[0] - row[3] * force[0]) / asked[2]
+        rub = (asked[1] - speed[1] - row[3] * force[1]) / asked[3]
+        wanted = wp.vec2(force[0] + push, force[1] + rub)
+        best = _project(wanted, asked[2], asked[3], arena.friction)
         arena.force[k, arena.index] = best
-        more = best - force
+        more = wp.vec2(best[0] - force[0], best[1] - force[1])
         _push(arena, row, between, more)
         largest = wp.max(largest, best[0])
         change = wp.max(change, wp.max(wp.abs(more[0]), wp.abs(more[1])))
@@ -284,7 +276,7 @@ def _sweep(arena: WarpArena, count: int) -> bool:
 
 
 @wp.func
-def _finish(arena: WarpArena, free: wp.array2d[wp.vec3], count: int) -> None:
+def _finish(arena: WarpRubbingArena, free: wp.array2d[wp.vec3], count: int) -> None:
     """Works everything out once more from the forces, without the sweeps' rounding."""
     _let_go(arena, free)
     for k in range(count):
