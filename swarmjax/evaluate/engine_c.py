@@ -364,16 +364,31 @@ def _advance(
     pushes = []
     # The halves of mj_step, the other way round: the positions that the rays of this control
     # step need are those that the next one starts from. In between forces are those of the
-    # contacts that are listed. Contacts of hulls are without friction: their one row of the
-    # solver is the normal force.
+    # contacts that are listed.
     for _ in range(judge.substeps):
         mujoco.mj_step2(model, data)
-        # One at a distance of exactly 0 is listed, but not among those that are solved for.
-        solved = data.contact.efc_address >= 0
-        force = data.efc_force[data.contact.efc_address[solved]]
-        pushes.append(_Pushes(data.contact.geom[solved], force))
+        pushes.append(_push(model, data))
         mujoco.mj_step1(model, data)
     return pushes
+
+
+def _push(model: mujoco.MjModel, data: mujoco.MjData) -> _Pushes:
+    """Reads the normal forces of all contacts off the solver's rows.
+
+    Without friction a contact has one row, its normal force; of an elliptic cone that is the first.
+    The edges of a pyramid all push along the normal, and their sum is the force.
+    """
+    contact = data.contact
+    # One at a distance of exactly 0 is listed, but not among those that are solved for.
+    solved = contact.efc_address >= 0
+    address, edges = contact.efc_address[solved], 2 * (contact.dim[solved] - 1)
+    if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+        edges = np.zeros_like(edges)
+    force = data.efc_force[address]
+    for k in range(1, np.max(edges, initial=0)):
+        more = edges > k
+        force[more] += data.efc_force[address[more] + k]
+    return _Pushes(contact.geom[solved], force)
 
 
 def _impulses(judge: Judge, pushes: list[_Pushes], arenas: int) -> np.ndarray:

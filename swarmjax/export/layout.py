@@ -55,6 +55,8 @@ def trained_as(policy: Policy) -> str:
     """
     robot, sensors = policy.meta["robot"], policy.meta["sensors"]
     hull = f", hull {short(robot['hull_radius'])} m" if "hull_radius" in robot else ""
+    if robot.get("hull_friction"):
+        hull += f" of friction {short(robot['hull_friction'])}"
     return (
         f"robot {robot['preset']} (body {robot['body']}{hull}), sensors {sensors['preset']} "
         f"(response {sensors['response']}, range {short(sensors['range'])} m)"

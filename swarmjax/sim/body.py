@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from swarmjax.sim.config import RobotConfig
+from swarmjax.sim.geometry import hull_name
 
 Array = Any
 Changes = dict[str, tuple[Any, Array]]  # field of the model: rows, and their new numbers
@@ -25,12 +26,14 @@ class Chassis(NamedTuple):
       track: [R] between the points where the wheels grip the floor, m, or None.
       mass: [R] kg, or None.
       friction: [R] of wheel on floor, or None.
+      hull_friction: [] of all hulls on what they touch, or None.
     """
 
     wheel_radius: Array | None = None
     track: Array | None = None
     mass: Array | None = None
     friction: Array | None = None
+    hull_friction: Array | None = None
 
 
 AS_BUILT = Chassis()
@@ -46,6 +49,7 @@ class Rows(NamedTuple):
       wheel_geoms: [R, 2] left and right; [R, 0] of a body without wheels.
       wheel_bodies: [R, 2] likewise.
       grips: [R, 2] pairs of wheel and floor, likewise.
+      hulls: [P] pairs of a hull and what it may touch.
     """
 
     bodies: np.ndarray
@@ -54,6 +58,7 @@ class Rows(NamedTuple):
     wheel_geoms: np.ndarray
     wheel_bodies: np.ndarray
     grips: np.ndarray
+    hulls: np.ndarray
 
 
 class Servos(NamedTuple):
@@ -76,6 +81,7 @@ class Body:
 
     Attributes:
       gravity: whether gravity acts along any of its joints.
+      cone: of its contacts' friction.
       add: adds a robot of this name to a spec, for a physics step (s); returns its contact geom.
       qpos: positions of the joints [..., R * Q] of robots at rest at [..., R, 3] x (m), y (m),
         yaw (rad).
@@ -86,6 +92,7 @@ class Body:
     """
 
     gravity: bool
+    cone: mujoco.mjtCone
     add: Callable[[mujoco.MjSpec, str, RobotConfig, float], str]
     qpos: Callable[[Array, Any], Array]
     pose: Callable[[Array, Any], Array]
@@ -118,6 +125,7 @@ def find_rows(model: mujoco.MjModel, robots: int) -> Rows:
         wheel_geoms=np.array(geoms, np.int32),
         wheel_bodies=np.array(model.geom_bodyid)[np.array(geoms, np.int32)],
         grips=np.array([[_pair(model, geom) for geom in pair] for pair in geoms], np.int32),
+        hulls=_hull_pairs(model, robots),
     )
 
 
@@ -141,6 +149,26 @@ def scale_mass(ratio: Array, rows: Rows, model: mujoco.MjModel) -> Changes:
         "body_invweight0": (bodies, model.body_invweight0[bodies] / ratio[:, None, None]),
         "dof_invweight0": (dofs, model.dof_invweight0[dofs] / ratio[:, None]),
     }
+
+
+def rub(friction: Array, rows: Rows) -> tuple[Any, Array]:
+    """Changes the friction of hulls: rows of `pair_friction`, and their new numbers.
+
+    Args:
+      friction: [] of all hulls on what they touch.
+      rows: of the robots.
+
+    Returns:
+      As one of `Changes`.
+    """
+    return (rows.hulls[:, None], [0, 1]), friction * np.ones((len(rows.hulls), 2), np.float32)
+
+
+def _hull_pairs(model: mujoco.MjModel, robots: int) -> np.ndarray:
+    """The pairs [P] that hulls are in."""
+    hulls = [model.geom(hull_name(f"robot{i}")).id for i in range(robots)]
+    first, second = (np.isin(geom, hulls) for geom in (model.pair_geom1, model.pair_geom2))
+    return np.flatnonzero(first | second).astype(np.int32)
 
 
 def _pair(model: mujoco.MjModel, geom: int) -> int:

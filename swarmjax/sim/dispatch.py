@@ -3,6 +3,7 @@
 Everything else in this room is plain MJX and plain loops, and works without `fast/`, slower.
 """
 
+import importlib
 import importlib.util
 from collections.abc import Iterable
 from dataclasses import replace
@@ -28,6 +29,9 @@ _MOST_STEPS = (100, 50)  # MuJoCo's own
 # off where MJX's own step is 2.4e-5 off, with 200 it is 4e-6 off; on an H200 they cost 1.5 % of
 # training.
 _MOST_SWEEPS = 200
+# Where hulls rub, forces come to rest more slowly: a jam of friction 1.5 takes 400 sweeps to be
+# as near as one without friction, and MJX's Newton method by `jax` as many steps as wheels do.
+_MOST_RUBBING_SWEEPS = 400
 # In a jam of more wheeled robots the solver made for them leaves up to 7 mm/s (design.md, 38).
 MOST_WHEELED = 5
 
@@ -56,7 +60,7 @@ def resolve_impl(impl: str) -> str:
     return "warp" if installed and jax.default_backend() == "gpu" else "jax"
 
 
-def resolve_solver(solver: str, impl: str, body: str, robots: int) -> str:
+def resolve_solver(solver: str, impl: str, body: str, robots: int, *, rubs: bool = False) -> str:
     """Turns `auto` into `swarm` where that can be, `mjx` elsewhere.
 
     The tests hold `swarm` to MuJoCo C at least as closely as MJX's own step, wherever this chooses
@@ -67,6 +71,7 @@ def resolve_solver(solver: str, impl: str, body: str, robots: int) -> str:
       impl: `jax` or `warp`.
       body: `planar` or `wheeled`.
       robots: that are compiled in.
+      rubs: whether hulls have friction.
 
     Returns:
       `mjx` or `swarm`.
@@ -84,13 +89,18 @@ def resolve_solver(solver: str, impl: str, body: str, robots: int) -> str:
             f"sim.solver is swarm, but robot.body is wheeled and sim.max_robots is {robots}: give "
             f"mjx or auto, or {MOST_WHEELED} robots at most."
         )
+    if solver == "swarm" and body == "wheeled" and rubs:
+        raise ConfigError(
+            "sim.solver is swarm, but robot.body is wheeled and its hulls have friction "
+            "(robot.hull_friction or realism.hull_friction): give mjx or auto, or no such friction."
+        )
     if solver == "swarm" and _discs() is None:
         raise ConfigError(
             "sim.solver is swarm, but swarmjax.sim.fast cannot be imported: give mjx or auto."
         )
     if solver != "auto":
         return solver
-    possible = body == "planar" or (impl == "warp" and robots <= MOST_WHEELED)
+    possible = body == "planar" or (impl == "warp" and robots <= MOST_WHEELED and not rubs)
     return "swarm" if possible and _discs() is not None else "mjx"
 
 
@@ -110,12 +120,12 @@ class EngineChoice(NamedTuple):
     ls_iterations: int
 
 
-def choose(sim: "SimConfig", body: str) -> EngineChoice:
-    """Resolves the settings of the simulation for a robot's body.
+def choose(sim: "SimConfig", robot: "RobotConfig") -> EngineChoice:
+    """Resolves the settings of the simulation for a robot.
 
     Args:
       sim: the settings.
-      body: `planar` or `wheeled`.
+      robot: that the model is compiled for.
 
     Returns:
       What they come to on this device.
@@ -123,13 +133,14 @@ def choose(sim: "SimConfig", body: str) -> EngineChoice:
     Raises:
       ConfigError: if Warp is asked for and not installed, or a solver where it cannot be.
     """
-    impl = resolve_impl(sim.impl)
-    solver = resolve_solver(sim.solver, impl, body, sim.robots)
+    impl, body = resolve_impl(sim.impl), robot.body
+    rubs = robot.hull_friction > 0.0
+    solver = resolve_solver(sim.solver, impl, body, sim.robots, rubs=rubs)
     iterations, ls_iterations = _MOST_STEPS
     if (solver, body) == ("swarm", "planar"):
-        iterations = _MOST_SWEEPS
+        iterations = _MOST_RUBBING_SWEEPS if rubs else _MOST_SWEEPS
     elif (solver, impl) == ("mjx", "jax"):
-        iterations, ls_iterations = _NEWTON_STEPS[body]
+        iterations, ls_iterations = _NEWTON_STEPS["wheeled" if rubs else body]
     return EngineChoice(
         impl, solver, sim.iterations or iterations, sim.ls_iterations or ls_iterations
     )
@@ -160,7 +171,8 @@ def load_engine(
     if robot.body == "planar":
         from swarmjax.sim.fast import discs
 
-        found = discs.load_engine(model, ids, robot.hull_radius, _push_apart(choice.impl))
+        solve = _push_apart(choice.impl, rubs=discs.rubs(model))
+        found = discs.load_engine(model, ids, robot.hull_radius, solve)
     else:
         from swarmjax.sim.fast import warp_step  # needs Warp
 
@@ -168,15 +180,10 @@ def load_engine(
     return replace(found, impl=choice.impl, solver=choice.solver)
 
 
-def _push_apart(impl: str) -> Any:
-    """What solves for the contacts of discs."""
-    if impl == "jax":
-        from swarmjax.sim.fast import planar_jax
-
-        return planar_jax.push_apart
-    from swarmjax.sim.fast import planar_warp  # needs Warp
-
-    return planar_warp.push_apart
+def _push_apart(impl: str, *, rubs: bool) -> Any:
+    """What solves for the contacts of discs; those by Warp need it to be installed."""
+    name = f"{'rubbing' if rubs else 'planar'}_{impl}"
+    return importlib.import_module(f"swarmjax.sim.fast.{name}").push_apart
 
 
 def pieces(count: int, xp: Any) -> list[slice]:

@@ -92,10 +92,18 @@ def quiet_warp() -> None:
 def _limits(model: mujoco.MjModel, robots: int, arenas: int) -> dict[str, int]:
     """Room for contacts: of all arenas together, and for the solver's rows of each one."""
     on_floor = model.geom_type[model.pair_geom1] == mujoco.mjtGeom.mjGEOM_PLANE
-    rows = np.where(model.pair_dim[on_floor] == 1, 1, 2 * (model.pair_dim[on_floor] - 1))
+    rows = _rows(model)
     pairs, floor = int(np.sum(~on_floor)), int(np.sum(on_floor))
     hulls = max(arenas * CONTACTS_PER_ROBOT * robots, min(arenas, FEW_ARENAS) * pairs)
     return {
         "naconmax": hulls + arenas * floor,
-        "njmax": min(pairs, ROWS_PER_ROBOT * robots) + int(np.sum(rows)),
+        "njmax": min(pairs, ROWS_PER_ROBOT * robots) * int(np.max(rows[~on_floor], initial=1))
+        + int(np.sum(rows[on_floor])),
     }
+
+
+def _rows(model: mujoco.MjModel) -> np.ndarray:
+    """Rows of the solver [P] that a contact of each pair takes."""
+    if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+        return model.pair_dim
+    return np.where(model.pair_dim == 1, 1, 2 * (model.pair_dim - 1))

@@ -12,6 +12,7 @@ FLOOR_GROUP = 4  # wheels, skids and floor: likewise; wheels reach beyond the hu
 # the plane that is exactly a disc of the hull's radius, at one contact point a pair instead of a
 # capsule's two, and a push neither tips the robot nor loads a skid more than the push itself.
 CONTACT_HEIGHT = epuck.COM_HEIGHT
+SPIN = 5e-3, 1e-4, 1e-4  # MuJoCo's own torsional and rolling friction: unused by condim 3
 
 
 def add_geom(
@@ -54,7 +55,12 @@ def add_hull(body: mujoco.MjsBody, name: str, radius: float) -> str:
     """
     sphere = mujoco.mjtGeom.mjGEOM_SPHERE
     place = [0.0, 0.0, CONTACT_HEIGHT]
-    return add_geom(body, f"{name}_hull", sphere, [radius, 0, 0], place, HULL_GROUP)
+    return add_geom(body, hull_name(name), sphere, [radius, 0, 0], place, HULL_GROUP)
+
+
+def hull_name(robot: str) -> str:
+    """Names the hull of a robot of this name."""
+    return f"{robot}_hull"
 
 
 def add_ray_hull(body: mujoco.MjsBody, name: str, radius: float) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from swarmjax import epuck
 from swarmjax.sim.body import Body, Rows, find_rows
 from swarmjax.sim.config import RobotConfig
-from swarmjax.sim.geometry import add_geom, add_ray_hull
+from swarmjax.sim.geometry import SPIN, add_geom, add_ray_hull
 from swarmjax.sim.planar import PLANAR
 from swarmjax.sim.wheeled import WHEELED
 
@@ -85,7 +85,7 @@ def build(
       The spec, ready to compile: qpos, qvel and ctrl hold each robot in turn, as its body says.
     """
     spec = mujoco.MjSpec()
-    _set_options(spec, timestep, gravity=BODIES[robot.body].gravity)
+    _set_options(spec, timestep, BODIES[robot.body], rubs=robot.hull_friction > 0.0)
     names = [f"robot{i}" for i in range(size.robots)]
     hulls = [BODIES[robot.body].add(spec, name, robot, timestep) for name in names]
     servos = BODIES[robot.body].servos
@@ -98,8 +98,7 @@ def build(
     boxes = [_add_box(spec, name, half, fixtures) for name, half in named]
     solid = itertools.product(hulls, boxes)
     for first, second in itertools.chain(itertools.combinations(hulls, 2), solid):
-        # condim 1: the hull's plastic slides along what it touches, as the paper's robots do.
-        spec.add_pair(geomname1=first, geomname2=second, condim=1)
+        spec.add_pair(geomname1=first, geomname2=second, **_rubbing(robot.hull_friction))
     return spec
 
 
@@ -179,8 +178,17 @@ def _fixture_names(size: ArenaSize) -> list[str]:
     return [f"obstacle{i}" for i in range(size.obstacles)] + [f"wall{i}" for i in range(WALLS)]
 
 
-def _set_options(spec: mujoco.MjSpec, timestep: float, *, gravity: bool) -> None:
+def _rubbing(friction: float) -> dict[str, Any]:
+    """How a hull meets things: condim 1 slides, condim 3 has Coulomb friction along the face."""
+    if friction == 0.0:
+        return {"condim": 1}
+    return {"condim": 3, "friction": [friction, friction, *SPIN]}
+
+
+def _set_options(spec: mujoco.MjSpec, timestep: float, body: Body, *, rubs: bool) -> None:
     """Euler: the servos are discrete. What acts on nothing is switched off; MJX pays for asking."""
+    if rubs:
+        spec.option.cone = body.cone
     spec.option.timestep = timestep
     spec.option.gravity = [0.0, 0.0, -epuck.GRAVITY]
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
@@ -188,7 +196,7 @@ def _set_options(spec: mujoco.MjSpec, timestep: float, *, gravity: bool) -> None
     # No joint has damping (whose factorisation is a flag of its own), a spring, or dry friction.
     spec.option.disableflags |= int(off.mjDSBL_EULERDAMP | off.mjDSBL_DAMPER | off.mjDSBL_SPRING)
     spec.option.disableflags |= int(off.mjDSBL_FRICTIONLOSS)
-    if not gravity:
+    if not body.gravity:
         spec.option.disableflags |= int(off.mjDSBL_GRAVITY)
 
 

@@ -18,7 +18,7 @@ MOST = math.sqrt(48.0 * math.log(2.0))  # 5.77; `normal` goes no further from 0
 class Stream(enum.IntEnum):
     """What a random number is for; a value, once given out, stays, or old levels replay otherwise.
 
-    Those up to `LAYOUT` are drawn once an episode, at clock 0, the others at each
+    Those up to `HULL_FRICTION` are drawn once an episode, at clock 0, the others at each
     control step.
     """
 
@@ -42,6 +42,7 @@ class Stream(enum.IntEnum):
     OBSERVATION_LATENCY = 17
     ARENA_SIDE = 18
     LAYOUT = 19
+    HULL_FRICTION = 20
     INFRARED = 32
     SPEED_NOISE = 33
     STALL = 34

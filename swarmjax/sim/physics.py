@@ -226,7 +226,9 @@ def _change(physics: Physics, fields: Fields, chassis: Chassis) -> Model:
     model, rows_of = physics.engine.model, physics.ids.robots
     changes = physics.body.changes(chassis, rows_of, physics.robot, physics.host)
     if not physics.engine.is_mjx:  # then the model has only the fields that are read
-        changes = {name: changes[name] for name in changes if hasattr(model, name)}
+        changes = {
+            name: changes[name] for name in changes if getattr(model, name, None) is not None
+        }
     for name, (rows, values) in changes.items():
         now = jnp.asarray(fields.get(name, getattr(model, name)))
         fields = fields | {name: now.at[rows].set(values)}

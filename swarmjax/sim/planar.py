@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from swarmjax import epuck
-from swarmjax.sim.body import Body, Changes, Chassis, Rows, Servos, scale_mass
+from swarmjax.sim.body import Body, Changes, Chassis, Rows, Servos, rub, scale_mass
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.drive import body_velocity
 from swarmjax.sim.geometry import add_hull
@@ -170,10 +170,12 @@ def _ctrl(wheels: Array, chassis: Chassis, robot: RobotConfig, xp: Any) -> Array
 
 
 def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjModel) -> Changes:
-    """Mass and inertia, and where the servos are actuators, theirs."""
+    """Mass and inertia, friction of hulls, and where the servos are actuators, theirs."""
     changes: Changes = {}
     if chassis.mass is not None:
-        changes = scale_mass(chassis.mass / robot.mass, rows, model)
+        changes |= scale_mass(chassis.mass / robot.mass, rows, model)
+    if chassis.hull_friction is not None:
+        changes["pair_friction"] = rub(chassis.hull_friction, rows)
     acts = rows.actuators
     if acts.size == 0:
         return changes
@@ -187,6 +189,9 @@ def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjM
 
 PLANAR = Body(
     gravity=False,
+    # A hull's push and its friction are then two numbers, as soft as without friction; the cone of
+    # two edges in the plane is Coulomb's own (docs/design.md, "Hulls that rub").
+    cone=mujoco.mjtCone.mjCONE_ELLIPTIC,
     add=_add,
     qpos=_qpos,
     pose=_pose,

@@ -6,7 +6,16 @@ from typing import Literal
 
 from swarmjax import epuck
 from swarmjax.config import ConfigError, Section, about, show
-from swarmjax.sim.config import FASTEST_WHEEL, FRICTION_REASON, LARGEST_HULL, LEAST, MOST_FRICTION
+from swarmjax.sim.config import (
+    FASTEST_WHEEL,
+    FRICTION_REASON,
+    HULL_FRICTION_REASON,
+    LARGEST_HULL,
+    LEAST,
+    LEAST_HULL_FRICTION,
+    MOST_FRICTION,
+    MOST_HULL_FRICTION,
+)
 
 _LONGEST = 3600.0  # s; an episode of training takes 16 s, and no pause in it may be longer
 _MOST_LATENCY = 1000  # control steps; real robots have 1 to 10
@@ -103,6 +112,15 @@ class RealismConfig(Section):
         default=None,
         metadata=about(
             "of wheel on floor; a robot and episode", LEAST, MOST_FRICTION, reason=FRICTION_REASON
+        ),
+    )
+    hull_friction: tuple[float, float] | None = field(
+        default=None,
+        metadata=about(
+            "of all hulls on hulls, boxes and walls; an episode",
+            LEAST_HULL_FRICTION,
+            MOST_HULL_FRICTION,
+            reason=HULL_FRICTION_REASON,
         ),
     )
     speed_noise: float | None = field(

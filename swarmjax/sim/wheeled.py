@@ -19,9 +19,9 @@ import mujoco
 import numpy as np
 
 from swarmjax import epuck
-from swarmjax.sim.body import Body, Changes, Chassis, Rows, scale_mass
+from swarmjax.sim.body import Body, Changes, Chassis, Rows, rub, scale_mass
 from swarmjax.sim.config import RobotConfig
-from swarmjax.sim.geometry import FLOOR_GROUP, add_geom, add_hull
+from swarmjax.sim.geometry import FLOOR_GROUP, SPIN, add_geom, add_hull
 from swarmjax.sim.planar import servo_share
 
 Array = Any
@@ -36,7 +36,6 @@ _IMPEDANCE = 0.999  # of the grip: a thousandth of the weight's acceleration is 
 # geom that is compiled into its body's frame to stay there, whatever `geom_pos` says later.
 _INNER_EDGE = epuck.AXLE_Y - 0.0025
 _SIDES = np.array([1.0, -1.0], np.float32)  # left, right
-_SPIN = 5e-3, 1e-4, 1e-4  # MuJoCo's own torsional and rolling friction: unused by condim 3
 
 
 def _add(spec: mujoco.MjSpec, name: str, robot: RobotConfig, timestep: float) -> str:
@@ -96,7 +95,7 @@ def _add_wheel(
     place = [0.0, side * (0.5 * robot.effective_track - _INNER_EDGE), 0.0]
     sphere = mujoco.mjtGeom.mjGEOM_SPHERE
     add_geom(wheel, name, sphere, [robot.wheel_radius, 0, 0], place, FLOOR_GROUP)
-    friction = [robot.friction, robot.friction, *_SPIN]
+    friction = [robot.friction, robot.friction, *SPIN]
     spec.add_pair(geomname1=FLOOR, geomname2=name, condim=3, friction=friction, **_grip(timestep))
     motor = spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
     inertia = ROTOR_INERTIA + epuck.WHEEL_INERTIA[1]
@@ -151,9 +150,8 @@ def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjM
     changes: Changes = {}
     if chassis.mass is not None:
         changes |= scale_mass(chassis.mass / robot.mass, rows, model)
-    if chassis.friction is not None:
-        both = chassis.friction[:, None, None].repeat(2, axis=1).repeat(2, axis=2)
-        changes["pair_friction"] = ((rows.grips[..., None], [0, 1]), both)
+    if chassis.friction is not None or chassis.hull_friction is not None:
+        changes["pair_friction"] = _frictions(chassis, rows)
     if chassis.wheel_radius is not None:
         changes["geom_size"] = ((rows.wheel_geoms, 0), chassis.wheel_radius)
         changes["body_pos"] = ((rows.wheel_bodies, 2), chassis.wheel_radius)
@@ -163,4 +161,27 @@ def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjM
     return changes
 
 
-WHEELED = Body(gravity=True, add=_add, qpos=_qpos, pose=_pose, ctrl=_ctrl, changes=_changes)
+def _frictions(chassis: Chassis, rows: Rows) -> tuple[Any, Array]:
+    """Friction of the wheels on the floor, of hulls on what they touch, or of both."""
+    if chassis.friction is None:
+        return rub(chassis.hull_friction, rows)
+    grip = chassis.friction[:, None, None].repeat(2, axis=1).repeat(2, axis=2)
+    if chassis.hull_friction is None:
+        return (rows.grips[..., None], [0, 1]), grip
+    (hulls, both), hull = rub(chassis.hull_friction, rows)
+    xp = grip.__array_namespace__()
+    pairs = np.concatenate([rows.grips.reshape(-1, 1), hulls])
+    return (pairs, both), xp.concatenate([grip.reshape(-1, 2), hull])
+
+
+WHEELED = Body(
+    gravity=True,
+    # What MuJoCo has by default, and what the grip of the wheels was measured with: a model has one
+    # cone, and MJX has no elliptic one beside skids of condim 1.
+    cone=mujoco.mjtCone.mjCONE_PYRAMIDAL,
+    add=_add,
+    qpos=_qpos,
+    pose=_pose,
+    ctrl=_ctrl,
+    changes=_changes,
+)

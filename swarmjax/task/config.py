@@ -84,8 +84,9 @@ class TaskConfig(Section):
 
 def describe(robot: RobotConfig, task: TaskConfig, realism: RealismConfig) -> str:
     """Say in part of a sentence which robot does the task, with which sensors."""
+    rubs = f" of friction {robot.hull_friction:g}" if robot.hull_friction else ""
     return (
-        f"hull {robot.hull_radius:g} m, infrared to {task.sensor_range:g} m, at most "
+        f"hull {robot.hull_radius:g} m{rubs}, infrared to {task.sensor_range:g} m, at most "
         f"{robot.max_speed:g} m/s and {robot.max_turn_rate:g} rad/s, control step "
         f"{task.control_step:g} s, arrival {task.arrival}, realism "
         f"{files.preset_of('realism', realism)}"

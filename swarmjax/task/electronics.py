@@ -152,7 +152,9 @@ def load(
 
 def chassis(factors: Factors) -> Chassis:
     """What the robots' chassis are in an episode."""
-    return Chassis(factors.wheel_radius, factors.track, factors.mass, factors.friction)
+    return Chassis(
+        factors.wheel_radius, factors.track, factors.mass, factors.friction, factors.hull_friction
+    )
 
 
 def mount(factors: Factors) -> infrared.Mount | None:

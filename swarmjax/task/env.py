@@ -177,8 +177,8 @@ def _load_physics(
     arenas: int,
 ) -> physics.Physics:
     """Compiles the model of one arena, and loads what steps it."""
-    substeps, choice = physics_substeps(robot, sim.substeps), dispatch.choose(sim, robot.body)
     largest = task_factors.largest(robot, realism)
+    substeps, choice = physics_substeps(robot, sim.substeps), dispatch.choose(sim, largest)
     spec = model.build(largest, size, task.control_step / substeps, fixtures="world")
     spec.option.iterations, spec.option.ls_iterations = choice.iterations, choice.ls_iterations
     compiled = spec.compile()

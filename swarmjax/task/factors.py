@@ -29,6 +29,7 @@ class Factors(NamedTuple):
       max_wheel_speed: [..., R] rad/s.
       mass: [..., R] kg.
       friction: [..., R] of the wheels on the floor.
+      hull_friction: [...] of all hulls on what they touch.
       infrared_noise: [..., R, K] times the noise of the response.
       infrared_gain: [..., R, K] times what a reflection adds.
       infrared_offset: [..., R, K] counts.
@@ -49,6 +50,7 @@ class Factors(NamedTuple):
     max_wheel_speed: Array | None = None
     mass: Array | None = None
     friction: Array | None = None
+    hull_friction: Array | None = None
     infrared_noise: Array | None = None
     infrared_gain: Array | None = None
     infrared_offset: Array | None = None
@@ -112,7 +114,8 @@ def draw(
     robot and a small difference between its wheels on top. The track is the effective one: tyres
     grip somewhere across their width. Latency is that of one robot's link and stays, as does the
     rate at which its firmware samples. Gain, offset, yaw and place belong to a sensor, paint to a
-    thing: the arena's walls are of one piece.
+    thing: the arena's walls are of one piece. Friction is that of two surfaces on each other; all
+    hulls, boxes and walls of an episode are alike.
 
     Args:
       seed: [...] uint32, one an episode.
@@ -133,6 +136,7 @@ def draw(
         max_wheel_speed=uniform(realism.max_wheel_speed, Stream.MAX_WHEEL_SPEED, robots),
         mass=uniform(realism.mass, Stream.MASS, robots),
         friction=uniform(realism.friction, Stream.FRICTION, robots),
+        hull_friction=uniform(realism.hull_friction, Stream.HULL_FRICTION),
         infrared_noise=uniform(realism.infrared_noise, Stream.INFRARED_NOISE, *sensors),
         infrared_gain=uniform(realism.infrared_gain, Stream.INFRARED_GAIN, *sensors),
         infrared_offset=normal(realism.infrared_offset, Stream.INFRARED_OFFSET, *sensors),
@@ -175,15 +179,16 @@ def _is_random(found: Factors, realism: RealismConfig) -> bool:
 
 
 def largest(robot: RobotConfig, realism: RealismConfig) -> RobotConfig:
-    """The robot with the largest wheels of any episode: what the model is compiled for.
+    """The robot with the most of any episode: what the model is compiled for.
 
     Args:
       robot: the nominal robot.
       realism: what is drawn.
 
     Returns:
-      The same robot with wheels that no draw exceeds.
+      The same robot with wheels and a hull's friction that no draw exceeds.
     """
     most = realism.wheel_radius[1] if realism.wheel_radius else robot.wheel_radius
     half = 0.5 * (realism.wheel_mismatch or 0.0)
-    return replace(robot, wheel_radius=most * (1.0 + half * noise.MOST))
+    rubs = realism.hull_friction[1] if realism.hull_friction else robot.hull_friction
+    return replace(robot, wheel_radius=most * (1.0 + half * noise.MOST), hull_friction=rubs)

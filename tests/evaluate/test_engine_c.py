@@ -415,6 +415,7 @@ def _robots_apart(one: np.ndarray, other: np.ndarray, least: float = 0.0) -> lis
     [
         ("mass", (0.13, 0.20)),
         ("friction", (0.1, 0.1)),
+        ("hull_friction", (0.5, 0.5)),
         ("wheel_radius", (0.0198, 0.0198)),
         ("wheel_mismatch", 0.02),
         ("track", (0.057, 0.057)),
@@ -668,6 +669,42 @@ def test_contacts_last_and_push_as_servos_do(tmp_path: Path) -> None:
     np.testing.assert_allclose(pushed, expected, rtol=1e-3)
     touched = arenas.outcome.touched - before.touched
     np.testing.assert_array_equal(touched, 20 * (expected > 0))
+
+
+def test_friction_leaves_the_push_of_a_blocked_robot_as_it_is(tmp_path: Path) -> None:
+    """At an angle a to the wall's normal servos press with m v cos a / dt, however it slides.
+
+    That is for a robot that does not turn: along the wall it moves at s, which its servos feel
+    with s sin a along its heading and s cos a across, and towards the wall both cancel.
+    """
+    for friction in (0.0, 0.3, 1.0):
+        robot = RobotConfig(body="planar", hull_friction=friction, yaw_inertia=10.0)
+        judge = _judge(tmp_path, _stage(), AHEAD, robot=robot)
+        angle = math.atan(0.4)
+        arenas = _run(judge, _start(judge, [[0.5 - 0.038, 0.0, angle]]), 60)
+        before = arenas.outcome
+        arenas = _run(judge, arenas, 20)
+        impulse = (arenas.outcome.impulse - before.impulse)[0, 0, gaps.KINDS.index("wall")]
+        # Without friction it is flung no further than it sinks; 60 steps settle to 1e-3.
+        assert impulse == pytest.approx(20 * 0.16 * SPEED * math.cos(angle), rel=2e-3)
+
+
+@BODIES
+def test_impulses_are_of_normal_forces(tmp_path: Path, body: BodyName) -> None:
+    robot = RobotConfig(body=body, hull_friction=0.5)
+    judge = _judge(tmp_path, _stage(robots=4, obstacles=1), CURVE, robot=robot)
+    data = _run(judge, _start(judge, CROWD, obstacle=BOX), 3).data[0]
+    mujoco.mj_step2(judge.model, data)
+    rubs, force = 0.0, np.zeros(6)
+    found = engine_c._push(judge.model, data)
+    solved = np.flatnonzero(data.contact.efc_address >= 0)
+    assert len(solved) == len(found.force) > 0
+    for push, i in zip(found.force, solved, strict=True):
+        mujoco.mj_contactForce(judge.model, data, i, force)
+        assert push == pytest.approx(force[0], rel=1e-12)
+        if judge.geom_robot[data.contact.geom[i]].max() >= 0:
+            rubs = max(rubs, float(np.abs(force[1:3]).max()))
+    assert rubs > 0.01  # N; what hulls rub with is another number
 
 
 def test_a_stop_takes_the_momentum(tmp_path: Path) -> None:

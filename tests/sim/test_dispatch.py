@@ -1,6 +1,7 @@
 """Which way is taken, and that things go through in pieces to the same end."""
 
 import sys
+from functools import partial
 from types import ModuleType
 
 import jax.numpy as jnp
@@ -40,6 +41,14 @@ def test_the_solver_is_chosen() -> None:
         resolve("swarm", "jax", "wheeled", 5)
     with pytest.raises(ConfigError, match=r"sim\.max_robots is 6: give mjx or auto, or 5 robots"):
         resolve("swarm", "warp", "wheeled", 6)
+
+
+def test_hulls_that_rub_are_solved_where_the_solver_knows_friction() -> None:
+    resolve = partial(dispatch.resolve_solver, rubs=True)
+    assert resolve("auto", "warp", "planar", 5) == resolve("auto", "jax", "planar", 5) == "swarm"
+    assert resolve("auto", "warp", "wheeled", 5) == "mjx"
+    with pytest.raises(ConfigError, match=r"wheeled and its hulls have friction .*: give mjx or a"):
+        resolve("swarm", "warp", "wheeled", 5)
 
 
 def test_without_the_faster_ways_mjx_steps_and_all_is_one_piece(

@@ -106,6 +106,16 @@ def test_only_hulls_touch(compiled: mujoco.MjModel) -> None:
     assert (compiled.pair_dim == 1).all()
 
 
+def test_hulls_rub_on_all_that_they_touch() -> None:
+    compiled = model.build(RobotConfig(body="wheeled", hull_friction=0.5), SIZE, 0.016).compile()
+    hulls = model.ids(compiled, SIZE).robots.hulls
+    assert len(hulls) == 3 + 3 * 6
+    assert (compiled.pair_dim[hulls] == 3).all()
+    np.testing.assert_array_equal(compiled.pair_friction[hulls, :2], 0.5)
+    others = np.delete(compiled.pair_friction[:, 0], hulls)
+    np.testing.assert_array_equal(others, 1.0)  # wheels and skids on the floor
+
+
 def test_robot_has_the_numbers_of_the_config() -> None:
     robot = RobotConfig(
         mass=0.2, yaw_inertia=3e-4, hull_radius=0.04, effective_track=0.06, friction=0.5

@@ -125,3 +125,14 @@ def test_actuators_follow_the_chassis() -> None:
         for field in ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"):
             found = getattr(built, field)[3 * i : 3 * i + 3]
             np.testing.assert_allclose(found, getattr(alone, field), rtol=ROUNDING, err_msg=field)
+
+
+def test_the_friction_of_hulls_follows_the_chassis() -> None:
+    robot, size = RobotConfig(hull_friction=0.8), SIZE._replace(robots=ROBOTS)
+    built = model.build(robot, size, STEP).compile()
+    rows = model.ids(built, size).robots
+    drawn = Chassis(hull_friction=np.float32(0.25))  # exact in float32
+    place, values = PLANAR.changes(drawn, rows, robot, built)["pair_friction"]
+    built.pair_friction[place] = values
+    alone = model.build(dataclasses.replace(robot, hull_friction=0.25), size, STEP).compile()
+    np.testing.assert_allclose(built.pair_friction, alone.pair_friction, rtol=ROUNDING)

@@ -30,11 +30,12 @@ def _load(
     solver: Solver,
     obstacles: int = 1,
     stage: StageConfig | None = None,
+    friction: float = 0.0,
 ) -> physics.Physics:
     box = StageConfig(name="box", robots=ROBOTS, side=1.3, obstacles=obstacles, obstacle_size=0.1)
     stage = box if stage is None else stage
     sim = SimConfig(impl=impl, solver=solver, max_robots=ROBOTS, max_obstacles=obstacles)
-    robot = RobotConfig(body=body)
+    robot = RobotConfig(body=body, hull_friction=friction)
     settings = TrainConfig(stage=(stage,), robot=robot, sim=sim, arenas=ARENAS, budget=10_000)
     return programs.load_world(settings).physics
 
@@ -176,6 +177,46 @@ def test_crowds_push_each_other_apart_as_in_c(
     assert np.abs(expected).max(axis=1).min() > 1.0  # they do fly apart
     assert _off(found, expected) <= 2.0 * seen[0]
     assert _off(_places(found), _places(expected)) <= 2.0 * seen[1]
+
+
+# Likewise with friction; but for the tightest jam, where MJX's Newton method by Warp is nearer.
+RUBBING = {
+    ("jax", "swarm", 0.16): (6.8e-6, 5.5e-6),
+    ("warp", "swarm", 0.16): (9.0e-6, 6.3e-6),
+    ("jax", "swarm", 0.5): (4.3e-6, 2.5e-6),
+    ("warp", "swarm", 0.5): (6.9e-6, 3.0e-6),
+    ("jax", "mjx", 0.5): (2.4e-5, 1.7e-6),
+    ("warp", "mjx", 0.16): (6.6e-6, 8.1e-7),
+}
+
+
+@pytest.mark.parametrize(("impl", "solver", "side"), RUBBING)
+def test_crowds_that_rub_push_each_other_apart_as_in_c(
+    impl: Impl, solver: Solver, side: float
+) -> None:
+    (pose, wheels), seen = _crowds(side), RUBBING[impl, solver, side]
+    pose = _beside_the_box(pose)
+    found = _on_device(_load(impl, "planar", solver, friction=0.5), side, pose, wheels)
+    robot = RobotConfig(hull_friction=0.5)
+    expected = np.array([_in_c(robot, side, p, w)[0] for p, w in zip(pose, wheels, strict=True)])
+    assert _off(found, expected) <= 2.0 * seen[0]
+    assert _off(_places(found), _places(expected)) <= 2.0 * seen[1]
+
+
+def _beside_the_box(pose: np.ndarray) -> np.ndarray:
+    """Moves robots whose centre is deep within the box to 8 mm from a face of it.
+
+    There MuJoCo pushes them down, where no joint gives way, and brakes them by friction with that
+    push; discs leave them alone.
+    """
+    x, y, yaw, half = BOX[0, :4]
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    mine = (pose[..., :2] - [x, y]) @ turn
+    deep = np.abs(mine).max(axis=-1) < half - 0.013
+    out = np.stack([np.sign(mine[..., 0]) * (half - 0.008), 0.5 * mine[..., 1]], axis=-1)
+    moved = pose.copy()
+    moved[..., :2] = np.where(deep[..., None], [x, y] + out @ turn.T, pose[..., :2])
+    return moved
 
 
 @pytest.mark.parametrize("side", PAIRS)

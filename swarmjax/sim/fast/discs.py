@@ -35,6 +35,9 @@ from swarmjax.sim.geometry import CONTACT_HEIGHT
 
 # Share of the largest force by which any may still change; float32 rounds at 1e-7.
 TOLERANCE = 1e-6
+# Likewise where hulls rub, and forces come to rest more slowly: with 1e-6 the tightest jam of
+# tests/sim/test_solver.py was 9e-5 off, with 1e-7 it is 7e-6 off.
+RUBBING_TOLERANCE = 1e-7
 # A centre that is deeper within a box than it is below its top or above its bottom, m, is pushed
 # up or down by MuJoCo, where no joint gives way.
 DEEPEST = min(CONTACT_HEIGHT, 2.0 * sim_model.HALF_HEIGHT - CONTACT_HEIGHT)
@@ -73,11 +76,14 @@ class Model:
       body_mass: [B] kg.
       body_inertia: [B, 3] kg m^2.
       body_invweight0: [B, 2] 1 / kg, 1 / (kg m^2).
+      pair_friction: [P, 5] all alike, of which the first two are along the face; None where hulls
+        have none.
     """
 
     body_mass: Array
     body_inertia: Array
     body_invweight0: Array
+    pair_friction: Array | None = None
 
 
 @struct.dataclass
@@ -97,6 +103,18 @@ class Data:
     qfrc_applied: Array
 
 
+class Rubbing(NamedTuple):
+    """What friction needs to know besides, of an arena, or of many with a leading axis.
+
+    Attributes:
+      agility: [R] 1 / moment of inertia, 1 / (kg m^2).
+      friction: [] of hulls on what they touch.
+    """
+
+    agility: Array
+    friction: Array
+
+
 class DiscRobots(NamedTuple):
     """The robots of an arena, or of many with a leading axis.
 
@@ -107,6 +125,7 @@ class DiscRobots(NamedTuple):
       before: [R, 3] of the rate, 1/s^2, in the step before.
       mobility: [R] 1 / mass, 1 / kg.
       weight: [R] MuJoCo's inverse weight, 1 / kg.
+      rubbing: None where hulls have no friction.
     """
 
     place: Array
@@ -115,6 +134,7 @@ class DiscRobots(NamedTuple):
     before: Array
     mobility: Array
     weight: Array
+    rubbing: Rubbing | None = None
 
 
 Solve = Callable[[Discs, DiscRobots, Array, Array], Array]
@@ -127,7 +147,7 @@ def load(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve: Solve)
       model: compiled, one arena.
       ids: where things lie in it.
       radius: of the hulls, m.
-      solve: `push_apart` of `planar_warp` or `planar_jax`.
+      solve: `push_apart` of the solver for these hulls.
 
     Returns:
       What is fixed for a program.
@@ -137,7 +157,13 @@ def load(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve: Solve)
     assert solref.min() > 0.0  # otherwise it means stiffness and damping
     rounds = _rounds(len(ids.hull_body))
     of_model = model.opt.timestep, model.opt.iterations, ids.hull_body
+    assert model.opt.impratio == 1.0  # contacts are as soft along the face as along the normal
     return Discs(radius, *of_model, rounds, solref[0], solimp[0], solve)
+
+
+def rubs(model: mujoco.MjModel) -> bool:
+    """Tells whether the model's hulls have friction."""
+    return bool((model.pair_dim > 1).any())
 
 
 def put(model: mujoco.MjModel) -> tuple[Model, Data]:
@@ -151,7 +177,9 @@ def put(model: mujoco.MjModel) -> tuple[Model, Data]:
     """
     fields = model.body_mass, model.body_inertia, model.body_invweight0
     still = jnp.zeros(model.nv)
-    return Model(*map(jnp.asarray, fields)), Data(jnp.zeros(model.nq), still, still, still)
+    friction = jnp.asarray(model.pair_friction) if rubs(model) else None
+    placed = Model(*map(jnp.asarray, fields), pair_friction=friction)
+    return placed, Data(jnp.zeros(model.nq), still, still, still)
 
 
 def load_engine(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve: Solve) -> Engine:
@@ -161,7 +189,7 @@ def load_engine(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve:
       model: compiled, one arena.
       ids: where things lie in it.
       radius: of the hulls, m.
-      solve: `push_apart` of `planar_warp` or `planar_jax`.
+      solve: `push_apart` of the solver for these hulls.
 
     Returns:
       The engine.
@@ -221,7 +249,10 @@ def _robots(discs: Discs, model: Model, data: Data) -> DiscRobots:
     fields = data.qpos, data.qvel, data.qfrc_applied, data.qacc_warmstart
     place, rate, force, before = (field.reshape(-1, 3) for field in fields)
     free = force / jnp.stack([mass, mass, turn], axis=-1)
-    return DiscRobots(place, rate, free, before, 1.0 / mass, model.body_invweight0[discs.body, 0])
+    robots = DiscRobots(place, rate, free, before, 1.0 / mass, model.body_invweight0[discs.body, 0])
+    if model.pair_friction is None:
+        return robots
+    return robots._replace(rubbing=Rubbing(1.0 / turn, model.pair_friction[0, 0]))
 
 
 def spring(discs: Discs) -> tuple[float, float]:

@@ -67,7 +67,7 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
     Returns:
       [R, 3] of x and y, m/s^2, and of yaw, rad/s^2, which is `robots.free`'s.
     """
-    one = _contacts(discs, robots, sim_model.fixture_rectangles(side, obstacle, jnp))
+    one = contacts(discs, robots, sim_model.fixture_rectangles(side, obstacle, jnp))
     free, before = (Motion(m[:, 0], m[:, 1]) for m in (robots.free, robots.before))
     force = _first_force(one, _against(discs, before, len(one.give)))
 
@@ -89,7 +89,7 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
     return jnp.stack([moved.x, moved.y, robots.free[:, 2]], axis=-1)
 
 
-def _contacts(discs: Discs, robots: DiscRobots, fixture: Array) -> Contact:
+def contacts(discs: Discs, robots: DiscRobots, fixture: Array) -> Contact:
     """All contacts [K, R] of robots: with each fixture [F, 5], then those of each round."""
     x, y, other = robots.place[:, 0], robots.place[:, 1], discs.opponent
     to_fixture = _from_box(x, y, turned(fixture[:, None], jnp), discs.radius)
@@ -183,24 +183,24 @@ def _contact(discs: Discs, gap: DiscGap, rate: Motion, weight: Array, mobility: 
     """
     (stiffness, damping), impedance = spring(discs), _impedance(discs, gap.distance)
     give = jnp.maximum(weight * (1.0 - impedance) / impedance, mujoco.mjMINVAL)
-    demand = -damping * _along(gap, rate) - stiffness * impedance * gap.distance
+    demand = -damping * along(gap, rate) - stiffness * impedance * gap.distance
     return Contact(gap, give, demand, mobility + give)
 
 
-def _along(gap: DiscGap, motion: Motion) -> Array:
+def along(gap: DiscGap, motion: Motion) -> Array:
     """J a: how fast robots move away, by how they move against what they may touch."""
     return gap.x * motion.x + gap.y * motion.y
 
 
 def _first_force(one: Contact, motion: Motion) -> Array:
     """The force, N, that a contact would have if robots moved like this against the other."""
-    force = jnp.maximum((one.demand - _along(one.gap, motion)) / one.give, 0.0)
+    force = jnp.maximum((one.demand - along(one.gap, motion)) / one.give, 0.0)
     return jnp.where(one.gap.distance < 0.0, force, 0.0)
 
 
 def _best_force(one: Contact, motion: Motion, force: Array) -> Array:
     """The force, N, that suits a contact best if the others push as they do."""
-    short = one.demand - _along(one.gap, motion) - one.give * force
+    short = one.demand - along(one.gap, motion) - one.give * force
     best = jnp.maximum(force + short / one.stiffness, 0.0)
     return jnp.where(one.gap.distance < 0.0, best, 0.0)
 

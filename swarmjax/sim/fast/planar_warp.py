@@ -44,11 +44,11 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
     Returns:
       [R, 3] of x and y, m/s^2, and of yaw, rad/s^2, which is `robots.free`'s.
     """
-    many = _of_arenas(functools.partial(_solve, discs))
+    many = of_arenas(functools.partial(_solve, discs))
     return many(*jax.tree.map(lambda x: x[None], (robots, side, obstacle)))[0]
 
 
-def _of_arenas(solve: Any) -> Any:
+def of_arenas(solve: Any) -> Any:
     """Lets a function of arrays with a leading axis of arenas take further ones as more arenas."""
     many = custom_vmap(solve)
 
@@ -75,7 +75,7 @@ def _solve(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Ar
     numbers = np.array([discs.radius, *sim_discs.spring(discs), *discs.solimp], np.float32)
     call = wp.jax_kernel(_push_apart, num_outputs=4, block_dim=BLOCK)
     shapes = {"row": rows, "soft": rows, "between": rows, "found": (arenas, count)}
-    given = *robots, side, obstacle, jnp.asarray(numbers), discs.sweeps
+    given = *robots[:-1], side, obstacle, jnp.asarray(numbers), discs.sweeps
     return call(*given, launch_dims=arenas, output_dims=shapes)[-1]
 
 
@@ -144,9 +144,9 @@ def _push_apart(  # noqa: PLR0913  # JAX hands arrays over one by one
     _let_go(arena, free)
     count = wp.int32(0)
     for m in range(obstacle.shape[1]):
-        count = _touch_box(arena, count, _obstacle(obstacle, arena.index, m))
+        count = _touch_box(arena, count, obstacle_box(obstacle, arena.index, m))
     for k in range(_WALLS):
-        count = _touch_box(arena, count, _wall(side[arena.index], k))
+        count = _touch_box(arena, count, wall_box(side[arena.index], k))
     for i in range(place.shape[1]):
         count = _touch_robots(arena, count, i)
     done = wp.int32(0)
@@ -178,7 +178,7 @@ class WarpBox:
 
 
 @wp.func
-def _obstacle(obstacle: wp.array3d[float], arena: int, m: int) -> WarpBox:
+def obstacle_box(obstacle: wp.array3d[float], arena: int, m: int) -> WarpBox:
     """An obstacle of an arena."""
     box = WarpBox()
     box.x = obstacle[arena, m, 0]
@@ -191,7 +191,7 @@ def _obstacle(obstacle: wp.array3d[float], arena: int, m: int) -> WarpBox:
 
 
 @wp.func
-def _wall(side: float, k: int) -> WarpBox:
+def wall_box(side: float, k: int) -> WarpBox:
     """The wall east, north, west or south, as `model.fixture_rectangles` has it."""
     box = WarpBox()
     box.cos = wp.where(k % 2 == 1, 0.0, wp.where(k == 0, 1.0, -1.0))
@@ -209,7 +209,7 @@ def _touch_box(arena: WarpArena, count: int, box: WarpBox) -> int:
     """Writes the contacts of all robots with a box down; returns how many there are by then."""
     known = count
     for i in range(arena.place.shape[1]):
-        gap = _from_box(arena.place[arena.index, i], box, arena.numbers[0])
+        gap = from_box(arena.place[arena.index, i], box, arena.numbers[0])
         known = _touch(arena, known, gap, i, -1)
     return known
 
@@ -220,12 +220,12 @@ def _touch_robots(arena: WarpArena, count: int, i: int) -> int:
     known = count
     for j in range(i + 1, arena.place.shape[1]):
         apart = arena.place[arena.index, i] - arena.place[arena.index, j]
-        known = _touch(arena, known, _from_disc(apart[0], apart[1], arena.numbers[0]), i, j)
+        known = _touch(arena, known, from_disc(apart[0], apart[1], arena.numbers[0]), i, j)
     return known
 
 
 @wp.func
-def _from_box(place: wp.vec3, box: WarpBox, radius: float) -> wp.vec3:
+def from_box(place: wp.vec3, box: WarpBox, radius: float) -> wp.vec3:
     """The unit vector from a box to a robot, x and y, and the gap between them, m.
 
     From the nearest point of the box; of a centre within it, from the nearest face, unless that is
@@ -251,7 +251,7 @@ def _from_box(place: wp.vec3, box: WarpBox, radius: float) -> wp.vec3:
 
 
 @wp.func
-def _from_disc(x: float, y: float, radius: float) -> wp.vec3:
+def from_disc(x: float, y: float, radius: float) -> wp.vec3:
     """The unit vector from the second robot to the first, x and y away, m, and their gap, m.
 
     Two hulls in one place push each other along x, as MuJoCo's do, the first to the negative end.
@@ -274,7 +274,7 @@ def _touch(arena: WarpArena, count: int, gap: wp.vec3, first: int, second: int) 
     if second >= 0:
         weight += arena.weight[arena.index, second]
         mobility += arena.mobility[arena.index, second]
-    impedance = _impedance(arena.numbers, -gap[2])
+    impedance = impedance_at(arena.numbers, -gap[2])
     give = wp.max(weight * (1.0 - impedance) / impedance, 1.0e-15)  # mjMINVAL
     speed = _along(arena, arena.rate, gap[0], gap[1], first, second)
     demand = -arena.numbers[2] * speed - arena.numbers[1] * impedance * gap[2]
@@ -288,7 +288,7 @@ def _touch(arena: WarpArena, count: int, gap: wp.vec3, first: int, second: int) 
 
 
 @wp.func
-def _impedance(numbers: wp.array[float], depth: float) -> float:
+def impedance_at(numbers: wp.array[float], depth: float) -> float:
     """Impedance at a depth, m: MuJoCo's documentation, "Solver parameters", d(r) of `solimp`."""
     least, most, middle, power = numbers[3], numbers[4], numbers[6], numbers[7]
     share = wp.min(depth / numbers[5], 1.0)

@@ -1,0 +1,284 @@
+"""Contacts of planar robots that rub, by Warp: what `planar_warp` does, with friction.
+
+What is solved, says `rubbing_jax`; who lists the contacts, and how JAX calls it, `planar_warp`.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import warp as wp
+from jax import Array
+
+from swarmjax.sim import model as sim_model
+from swarmjax.sim.engine import ROWS_PER_ROBOT
+from swarmjax.sim.fast import discs as sim_discs
+from swarmjax.sim.fast import planar_warp
+from swarmjax.sim.fast.discs import RUBBING_TOLERANCE, DiscRobots, Discs
+
+_TOLERANCE = wp.constant(RUBBING_TOLERANCE)
+_WALLS = wp.constant(sim_model.WALLS)
+
+
+def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Array:
+    """Finds how the robots of one arena accelerate with their contacts.
+
+    Axes that `vmap` adds are arenas of one kernel, whichever they are.
+
+    Args:
+      discs: what is fixed.
+      robots: as they are and would move, with their `rubbing`.
+      side: [] of the arena, m.
+      obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
+
+    Returns:
+      [R, 3] of x and y, m/s^2, and of yaw, rad/s^2.
+    """
+    many = planar_warp.of_arenas(functools.partial(_solve, discs))
+    return many(*jax.tree.map(lambda x: x[None], (robots, side, obstacle)))[0]
+
+
+def _solve(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Array:
+    """The accelerations [A, R, 3] of arenas."""
+    assert robots.rubbing is not None
+    arenas, count = robots.mobility.shape
+    fixtures = obstacle.shape[1] + sim_model.WALLS
+    pairs = count * fixtures + count * (count - 1) // 2
+    rows = min(pairs, ROWS_PER_ROBOT * count + fixtures), arenas
+    numbers = np.array([discs.radius, *sim_discs.spring(discs), *discs.solimp], np.float32)
+    call = wp.jax_kernel(_push_apart, num_outputs=5, block_dim=planar_warp.BLOCK)
+    shapes = dict.fromkeys(("row", "asked", "force", "between"), rows) | {"found": (arenas, count)}
+    given = *robots[:-1], *robots.rubbing, side, obstacle, jnp.asarray(numbers), discs.sweeps
+    return call(*given, launch_dims=arenas, output_dims=shapes)[-1]
+
+
+@wp.struct
+class WarpRubbingArena:
+    """What a thread reads and writes.
+
+    Attributes:
+      place: [A, R] x, y (m), yaw (rad).
+      rate: [A, R] of it, 1/s.
+      before: [A, R] of the rate, 1/s^2, in the step before.
+      mobility: [A, R] 1 / mass.
+      weight: [A, R] inverse weight.
+      agility: [A, R] 1 / moment of inertia.
+      friction: of hulls on what they touch.
+      numbers: radius (m), stiffness (1/s^2), damping (1/s), and `solimp`.
+      row: [K, A] of each contact x and y of the unit vector along which it pushes, its arm (m), R.
+      asked: [K, A] aref of its push and of its rub, and J M^-1 J' + R of both.
+      force: [K, A] its push and its rub, N.
+      between: [K, A] the robot that is pushed along, and the one that is pushed back; -1: none.
+      found: [A, R] acceleration of x, y and yaw.
+      index: of the thread, [A].
+    """
+
+    place: wp.array2d[wp.vec3]
+    rate: wp.array2d[wp.vec3]
+    before: wp.array2d[wp.vec3]
+    mobility: wp.array2d[float]
+    weight: wp.array2d[float]
+    agility: wp.array2d[float]
+    friction: float
+    numbers: wp.array[float]
+    row: wp.array2d[wp.vec4]
+    asked: wp.array2d[wp.vec4]
+    force: wp.array2d[wp.vec2]
+    between: wp.array2d[wp.vec2i]
+    found: wp.array2d[wp.vec3]
+    index: int
+
+
+@wp.kernel(enable_backward=False)
+def _push_apart(  # noqa: PLR0913  # JAX hands arrays over one by one
+    place: wp.array2d[wp.vec3],
+    rate: wp.array2d[wp.vec3],
+    free: wp.array2d[wp.vec3],
+    before: wp.array2d[wp.vec3],
+    mobility: wp.array2d[float],
+    weight: wp.array2d[float],
+    agility: wp.array2d[float],
+    friction: wp.array[float],
+    side: wp.array[float],
+    obstacle: wp.array3d[float],
+    numbers: wp.array[float],
+    sweeps: int,
+    row: wp.array2d[wp.vec4],
+    asked: wp.array2d[wp.vec4],
+    force: wp.array2d[wp.vec2],
+    between: wp.array2d[wp.vec2i],
+    found: wp.array2d[wp.vec3],
+) -> None:
+    """Finds the forces of an arena's contacts and what comes of them."""
+    arena = WarpRubbingArena()
+    arena.place = place
+    arena.rate = rate
+    arena.before = before
+    arena.mobility = mobility
+    arena.weight = weight
+    arena.agility = agility
+    arena.numbers = numbers
+    arena.row = row
+    arena.asked = asked
+    arena.force = force
+    arena.between = between
+    arena.found = found
+    arena.index = wp.tid()
+    arena.friction = friction[arena.index]
+    _let_go(arena, free)
+    count = wp.int32(0)
+    for m in range(obstacle.shape[1]):
+        count = _touch_box(arena, count, planar_warp.obstacle_box(obstacle, arena.index, m))
+    for k in range(_WALLS):
+        count = _touch_box(arena, count, planar_warp.wall_box(side[arena.index], k))
+    for i in range(place.shape[1]):
+        count = _touch_robots(arena, count, i)
+    done = wp.int32(0)
+    moves = count > 0
+    while moves and done < sweeps:
+        moves = _sweep(arena, count)
+        done += 1
+    if count > 0:
+        _finish(arena, free, count)
+
+
+@wp.func
+def _let_go(arena: WarpRubbingArena, free: wp.array2d[wp.vec3]) -> None:
+    """Sets accelerations to those without contacts."""
+    for i in range(free.shape[1]):
+        arena.found[arena.index, i] = free[arena.index, i]
+
+
+@wp.func
+def _touch_box(arena: WarpRubbingArena, count: int, box: planar_warp.WarpBox) -> int:
+    """Writes the contacts of all robots with a box down; returns how many there are by then."""
+    known = count
+    for i in range(arena.place.shape[1]):
+        gap = planar_warp.from_box(arena.place[arena.index, i], box, arena.numbers[0])
+        known = _touch(arena, known, gap, i, -1)
+    return known
+
+
+@wp.func
+def _touch_robots(arena: WarpRubbingArena, count: int, i: int) -> int:
+    """Writes the contacts of a robot with those after it down; likewise."""
+    known = count
+    for j in range(i + 1, arena.place.shape[1]):
+        apart = arena.place[arena.index, i] - arena.place[arena.index, j]
+        gap = planar_warp.from_disc(apart[0], apart[1], arena.numbers[0])
+        known = _touch(arena, known, gap, i, j)
+    return known
+
+
+@wp.func
+def _touch(arena: WarpRubbingArena, count: int, gap: wp.vec3, first: int, second: int) -> int:
+    """Writes a contact down, if it is one, with first forces; returns how many there are then."""
+    if not (gap[2] < 0.0) or count >= arena.row.shape[0]:
+        return count
+    between = wp.vec2i(first, second)
+    weight = _both(arena, arena.weight, between)
+    mobility = _both(arena, arena.mobility, between)
+    impedance = planar_warp.impedance_at(arena.numbers, -gap[2])
+    give = wp.max(weight * (1.0 - impedance) / impedance, 1.0e-15)  # mjMINVAL
+    arm = arena.numbers[0] + 0.5 * gap[2]  # MuJoCo's contact is midway between the surfaces
+    row = wp.vec4(gap[0], gap[1], arm, give)
+    speed = _slide(arena, arena.rate, row, between)
+    push = -arena.numbers[2] * speed[0] - arena.numbers[1] * impedance * gap[2]
+    rub = -arena.numbers[2] * speed[1]
+    turns = arm * arm * _both(arena, arena.agility, between)
+    arena.row[count, arena.index] = row
+    arena.asked[count, arena.index] = wp.vec4(push, rub, mobility + give, mobility + turns + give)
+    arena.between[count, arena.index] = between
+    # The forces that the contact would have at the acceleration of the step before.
+    speed = _slide(arena, arena.before, row, between)
+    short = wp.vec2((push - speed[0]) / give, (rub - speed[1]) / give)
+    force = _project(short, give, give, arena.friction)
+    arena.force[count, arena.index] = force
+    _push(arena, row, between, force)
+    return count + 1
+
+
+@wp.func
+def _both(arena: WarpRubbingArena, of_robots: wp.array2d[float], between: wp.vec2i) -> float:
+    """Adds a number of both sides of a contact up."""
+    total = of_robots[arena.index, between[0]]
+    if between[1] >= 0:
+        total += of_robots[arena.index, between[1]]
+    return total
+
+
+@wp.func
+def _slide(
+    arena: WarpRubbingArena, motion: wp.array2d[wp.vec3], row: wp.vec4, between: wp.vec2i
+) -> wp.vec2:
+    """J a: how fast the two sides of a contact move apart, and along each other."""
+    apart = motion[arena.index, between[0]]
+    if between[1] >= 0:
+        other = motion[arena.index, between[1]]
+        apart = wp.vec3(apart[0] - other[0], apart[1] - other[1], apart[2] + other[2])
+    along = row[0] * apart[1] - row[1] * apart[0] - row[2] * apart[2]
+    return wp.vec2(row[0] * apart[0] + row[1] * apart[1], along)
+
+
+@wp.func
+def _push(arena: WarpRubbingArena, row: wp.vec4, between: wp.vec2i, force: wp.vec2) -> None:
+    """Adds what forces bring about, a += M^-1 J' f."""
+    x = row[0] * force[0] - row[1] * force[1]
+    y = row[1] * force[0] + row[0] * force[1]
+    turn = -row[2] * force[1]
+    _push_robot(arena, between[0], wp.vec3(x, y, turn))
+    if between[1] >= 0:
+        _push_robot(arena, between[1], wp.vec3(-x, -y, turn))
+
+
+@wp.func
+def _push_robot(arena: WarpRubbingArena, robot: int, push: wp.vec3) -> None:
+    """Adds what a push and a torque bring about."""
+    mobility = arena.mobility[arena.index, robot]
+    turn = arena.agility[arena.index, robot] * push[2]
+    kick = wp.vec3(mobility * push[0], mobility * push[1], turn)
+    arena.found[arena.index, robot] = arena.found[arena.index, robot] + kick
+
+
+@wp.func
+def _project(force: wp.vec2, push: float, rub: float, friction: float) -> wp.vec2:
+    """The point of the friction cone that is nearest to these forces (`rubbing_jax.project`)."""
+    size = wp.abs(force[1])
+    if size <= friction * force[0]:
+        return force
+    edge = (push * force[0] + friction * rub * size) / (push + friction * friction * rub)
+    edge = wp.max(edge, 0.0)
+    return wp.vec2(edge, wp.sign(force[1]) * friction * edge)
+
+
+@wp.func
+def _sweep(arena: WarpRubbingArena, count: int) -> bool:
+    """Sets all forces to their best, the others given; says whether that changed any."""
+    largest = wp.float32(0.0)
+    change = wp.float32(0.0)
+    for k in range(count):
+        row = arena.row[k, arena.index]
+        asked = arena.asked[k, arena.index]
+        force = arena.force[k, arena.index]
+        between = arena.between[k, arena.index]
+        speed = _slide(arena, arena.found, row, between)
+        push = (asked[0] - speed[0] - row[3] * force[0]) / asked[2]
+        rub = (asked[1] - speed[1] - row[3] * force[1]) / asked[3]
+        wanted = wp.vec2(force[0] + push, force[1] + rub)
+        best = _project(wanted, asked[2], asked[3], arena.friction)
+        arena.force[k, arena.index] = best
+        more = wp.vec2(best[0] - force[0], best[1] - force[1])
+        _push(arena, row, between, more)
+        largest = wp.max(largest, best[0])
+        change = wp.max(change, wp.max(wp.abs(more[0]), wp.abs(more[1])))
+    return change > _TOLERANCE * largest
+
+
+@wp.func
+def _finish(arena: WarpRubbingArena, free: wp.array2d[wp.vec3], count: int) -> None:
+    """Works everything out once more from the forces, without the sweeps' rounding."""
+    _let_go(arena, free)
+    for k in range(count):
+        between = arena.between[k, arena.index]
+        _push(arena, arena.row[k, arena.index], between, arena.force[k, arena.index])
