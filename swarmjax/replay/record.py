@@ -178,7 +178,7 @@ def record(
     arenas = engine_c.start(judge, levels)
     mount = electronics.mount(arenas.factors)
     frames = [_look(judge, arenas, np.zeros_like(arenas.pose[..., :2]))]
-    while len(frames) <= judge.config.steps and not frames[-1].arrived.all():
+    while len(frames) <= judge.config.step_limit and not frames[-1].arrived.all():
         action = np.clip(engine_c.act(judge, arenas), -1.0, 1.0)
         arenas = engine_c.step(judge, arenas)
         frames.append(_look(judge, arenas, action))
