@@ -67,7 +67,7 @@ def results(words: Sequence[str]) -> Iterator[dict[str, Any]]:
             "policies": c.result["policies"],
             **{key: value for key, value in about.items() if key != "measures"},
             "robot": settings.robot.body,
-            "steps": settings.steps,
+            "steps": settings.step_limit,
             "action": settings.action,
             "targets_reached": dict(zip(("c", "mjx"), targets, strict=True)),
             **compare(trial, same),

@@ -94,7 +94,7 @@ class MujocoArena:
         after = engine_c.step(replace(self.judge, policy=puppet), before)
         self.arenas = after
         arrived = after.outcome.arrived[0]
-        timeout = after.outcome.clock[0] >= self.judge.config.steps
+        timeout = after.outcome.clock[0] >= self.judge.config.step_limit
         return Moved(
             observation=after.observation[0],
             reward=rewards(self.judge, before, after)[0],

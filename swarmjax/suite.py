@@ -27,7 +27,7 @@ from swarmjax.config import ConfigError, about, files, reading
 from swarmjax.config.section import Section
 from swarmjax.evaluate import cells, trials
 from swarmjax.evaluate.cells import Cell, Suite
-from swarmjax.evaluate.config import MOST_STEPS, EvaluateConfig
+from swarmjax.evaluate.config import MOST_STEPS, STEPS, EvaluateConfig
 from swarmjax.evaluate.evaluation import list_files
 from swarmjax.evaluate.suite_config import CellConfig, read_suite
 from swarmjax.evaluate.table import PLAIN_WIDTH
@@ -53,7 +53,12 @@ class SuiteConfig(Section):
         metadata=about("choose the levels that these fail most: a.npz,b.npz or a pattern"),
     )
     pool: int = field(default=20_000, metadata=about("levels drawn to choose from", 1, 1_000_000))
-    steps: int = field(default=1500, metadata=about("control steps of an episode", 1, MOST_STEPS))
+    steps: int | None = field(
+        default=None,
+        metadata=about(
+            f"control steps of an episode; null: those of the cell, else {STEPS}", 1, MOST_STEPS
+        ),
+    )
     workers: int | None = field(
         default=None, metadata=about("processes; null: one a core", 1, 1024)
     )
@@ -192,7 +197,17 @@ def _flow(value: Any) -> str:
 def _show(console: Console, suite: Suite) -> None:
     """Prints a row for each cell."""
     table = Table(box=box.SIMPLE if console.is_terminal else None)
-    heads = ("cell", "robots", "obstacles", "side", "shape", "realism", "levels", "unreachable")
+    heads = (
+        "cell",
+        "robots",
+        "obstacles",
+        "side",
+        "shape",
+        "realism",
+        "steps",
+        "levels",
+        "unreachable",
+    )
     for i, head in enumerate((*heads, "digest")):
         table.add_column(head, justify="right" if 0 < i < len(heads) else "left")
     for cell in suite.cells:
@@ -204,8 +219,9 @@ def _row(cell: Cell) -> list[str]:
     stage = cell.stage
     lost = np.isinf(trials.ways(EvaluateConfig(policy="", stage=stage), cell.levels))
     numbers = (stage.robots, stage.obstacles, f"{'-'.join(f'{x:g}' for x in set(stage.sides))} m")
-    words = (cell.shape, cell.realism or "-", len(cell.episodes), int(lost.any(axis=-1).sum()))
-    return [str(each) for each in (cell.name, *numbers, *words, cell.digest[:12])]
+    words = (cell.shape, cell.realism or "-", cell.steps or "-")
+    counts = (len(cell.episodes), int(lost.any(axis=-1).sum()))
+    return [str(each) for each in (cell.name, *numbers, *words, *counts, cell.digest[:12])]
 
 
 if __name__ == "__main__":

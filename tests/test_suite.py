@@ -69,6 +69,17 @@ def test_digests_are_written_and_held_to(
     assert "cell two of suite tiny has the digest " in capsys.readouterr().err
 
 
+def test_step_limits_are_listed(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file.write_text(f"{TEXT}    steps: 2345\n")
+    assert _command(monkeypatch, f"suite={file}", "write=true") == 0
+    head, *rows = (line.split() for line in capsys.readouterr().out.splitlines())
+    # A side, such as 0.6 m, is two words in a row.
+    column = head.index("steps") + 1
+    assert [row[column] for row in rows] == ["-", "2345"]
+
+
 def test_the_levels_that_policies_fail_most_are_chosen() -> None:
     found: dict[str, Any] = {
         "targets_reached": [[1.0, 0.5, 0.5, 0.5, 0.0], [1.0, 0.5, 0.5, 0.5, 1.0]],

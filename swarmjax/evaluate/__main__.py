@@ -17,10 +17,11 @@ from rich.progress import Progress
 from swarmjax import command
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import table as evaluate_table
-from swarmjax.evaluate import witness
+from swarmjax.evaluate import unfinished, witness
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import Evaluation, evaluate
 from swarmjax.evaluate.table import PLAIN_WIDTH
+from swarmjax.evaluate.trials import specialise
 from swarmjax.exit_codes import INTERRUPTED
 
 
@@ -28,18 +29,21 @@ def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings, said = witness.load(EvaluateConfig, arguments)
     out = None if settings.out is None else Path(settings.out)
+    keep = None if out is None else unfinished.place(out)
     if out is not None:
         _check_out(out)
     progress = Progress(console=Console(stderr=True), transient=True)
     progress.disable = not progress.console.is_terminal
     try:
         with progress:
-            found = evaluate(settings, progress, partial(_say, said))
+            found = evaluate(settings, progress, partial(_say, said, keep), keep)
     except KeyboardInterrupt:
-        sys.stderr.write("swarmjax.evaluate: interrupted, nothing was written.\n")
+        sys.stderr.write(f"swarmjax.evaluate: interrupted, {_left(keep)}.\n")
         return INTERRUPTED
-    if out is not None:
-        _write(out, found, settings.steps * settings.task.control_step)
+    if out is not None and keep is not None:
+        limits = [specialise(settings, trial.cell).step_limit for trial in found.trials]
+        _write(out, found, max(limits) * settings.task.control_step)
+        unfinished.remove(keep)
     console = Console()
     if not console.is_terminal:
         console.width = PLAIN_WIDTH
@@ -47,10 +51,21 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _say(sentence: str) -> None:
+def _say(sentence: str, keep: Path | None, done: int, cells: int) -> None:
     """Says what was taken from the policies, before it takes a minute to judge them."""
     sys.stdout.write(f"swarmjax.evaluate: {sentence}\n")
+    if done:
+        sys.stdout.write(f"swarmjax.evaluate: {done} of {cells} cells were judged before, {keep}\n")
     sys.stdout.flush()
+
+
+def _left(keep: Path | None) -> str:
+    """Says what is there of an evaluation that was interrupted."""
+    done = 0 if keep is None else unfinished.count(keep)
+    if not done:
+        return "nothing was written"
+    are = "1 cell is" if done == 1 else f"{done} cells are"
+    return f"{are} in {keep}, and the same command goes on"
 
 
 def _check_out(path: Path) -> None:

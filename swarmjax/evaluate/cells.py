@@ -45,6 +45,7 @@ class Cell(NamedTuple):
         seed: That the levels were drawn with.
         episodes: [E] their numbers.
         levels: [E], obstacles as the boxes that they are put together of.
+        steps: Control steps of an episode, or None for those of the command.
     """
 
     name: str
@@ -54,6 +55,7 @@ class Cell(NamedTuple):
     seed: int
     episodes: np.ndarray
     levels: Level
+    steps: int | None = None
 
     @property
     def digest(self) -> str:
@@ -163,7 +165,8 @@ def draw_cell(cell: CellConfig) -> Cell:
     numbers, radii = cell.episodes or range(cell.levels), (epuck.HULL_RADIUS, _TARGET_RADIUS)
     levels = _draw(cell.stage, cell.shape, cell.seed, numbers, radii)
     episodes = np.array(numbers)
-    return Cell(cell.name, cell.stage, cell.shape, cell.realism, cell.seed, episodes, levels)
+    about = (cell.name, cell.stage, cell.shape, cell.realism, cell.seed)
+    return Cell(*about, episodes, levels, cell.steps)
 
 
 def _draw(
@@ -216,6 +219,8 @@ def write(path: Path, suite: Suite) -> None:
     keys = ("name", "shape", "realism", "seed", "digest")
     about = [
         {"stage": to_dict(cell.stage), **{key: getattr(cell, key) for key in keys}}
+        # A file that needs no steps is one that older versions read.
+        | ({} if cell.steps is None else {"steps": cell.steps})
         for cell in suite.cells
     ]
     meta = json.dumps({"format": FORMAT, "suite": suite.name, "cells": about})
@@ -321,7 +326,8 @@ def _parse_cell(about: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Cell
     episodes = fields.pop("episode")
     levels = Level(**fields)
     _check_levels(name, levels, cell.stage)
-    found = Cell(name, cell.stage, cell.shape, cell.realism, cell.seed, episodes, levels)
+    about_it = (name, cell.stage, cell.shape, cell.realism, cell.seed)
+    found = Cell(*about_it, episodes, levels, cell.steps)
     _check_digest(found, cell.digest, "the file")
     return found
 

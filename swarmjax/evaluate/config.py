@@ -13,6 +13,7 @@ from swarmjax.task.shapes import Shape
 from swarmjax.task.stage_config import StageConfig
 
 MOST_STEPS = 1_000_000  # control steps of an episode; nine hours
+STEPS = 1500  # of an episode where nobody says otherwise; Table 1
 MOST_EPISODES = 1_000_000  # whose levels fill some gigabytes
 # What `witness.load` takes from the policies.
 AS_TRAINED = {
@@ -57,8 +58,13 @@ class EvaluateConfig(Section):
     engine: Literal["c", "mjx"] = field(
         default="c", metadata=about("c: MuJoCo's C engine; mjx: the one that trains")
     )
-    steps: int = field(
-        default=1500, metadata=about("control steps of an episode; Table 1", 1, MOST_STEPS)
+    steps: int | None = field(
+        default=None,
+        metadata=about(
+            f"control steps of an episode; null: those of the suite's cell, else {STEPS} (Table 1)",
+            1,
+            MOST_STEPS,
+        ),
     )
     episodes: int = field(default=1000, metadata=about("episodes", 1, MOST_EPISODES))
     seed: int = field(default=1, metadata=about("random seed of the levels", 0, MAX_COUNT))
@@ -78,6 +84,11 @@ class EvaluateConfig(Section):
         metadata=about("folder for result.json, levels.csv and plots, or a file .json alone"),
     )
 
+    @property
+    def step_limit(self) -> int:
+        """Control steps of an episode, where no cell of a suite has its own."""
+        return STEPS if self.steps is None else self.steps
+
     def _check(self) -> None:
         if (self.policy is None) == (self.compare is None):
             raise ConfigError(
@@ -89,4 +100,4 @@ class EvaluateConfig(Section):
                 f"shape is {self.shape}, but stage.level is fixed, with obstacles of its own: "
                 "give shape=box."
             )
-        check_realism(self.realism, self.robot, self.task, self.steps)
+        check_realism(self.realism, self.robot, self.task, self.step_limit)

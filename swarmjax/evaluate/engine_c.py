@@ -85,7 +85,7 @@ def simulate(judge: Judge, levels: Sequence[level.Level]) -> Outcome:
     """
     rows, arenas = np.arange(len(levels)), start(judge, levels)
     total = Outcome(*(np.zeros_like(field) for field in arenas.outcome))
-    for _ in range(judge.config.steps):
+    for _ in range(judge.config.step_limit):
         arenas = step(judge, arenas)
         for whole, part in zip(total, arenas.outcome, strict=True):
             whole[rows] = part

@@ -1,17 +1,18 @@
 """Judges policies on the levels of a suite or a stage: who, on which, and what came of it."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from glob import glob
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.progress import Progress
 
 from swarmjax.config import ConfigError, show
-from swarmjax.evaluate import cells, judge, summary
+from swarmjax.evaluate import cells, judge, summary, unfinished
 from swarmjax.evaluate import trials as evaluate_trials
-from swarmjax.evaluate.cells import Suite
+from swarmjax.evaluate.cells import Cell, Suite
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.trials import Entrant, Trial
 
@@ -33,25 +34,30 @@ class Evaluation(NamedTuple):
 def evaluate(
     settings: EvaluateConfig,
     progress: Progress | None = None,
-    announce: Callable[[], object] = lambda: None,
+    announce: Callable[[int, int], object] = lambda *_: None,
+    keep: Path | None = None,
 ) -> Evaluation:
     """Judges policies.
 
     Args:
         settings: Of the evaluation.
         progress: To show how far it is; None shows nothing.
-        announce: Is called when all that was given is sound, before the first episode.
+        announce: Is called when all that was given is sound, before the first episode, with the
+            number of cells that were judged before, and of all.
+        keep: Folder for each cell that is over, from which the same evaluation goes on; None keeps
+            nothing.
 
     Returns:
         What it found.
 
     Raises:
         PolicyError: If a policy is unsound, or does not fit the levels.
-        ConfigError: If a file is missing, a suite unsound, or the physics breaks down.
+        ConfigError: If a file is missing, a suite unsound, the physics breaks down, or what is kept
+            is of another evaluation.
     """
     files = _sides(settings)
     sides = [evaluate_trials.read_policies(each, settings.extensions) for each in files]
-    return _judge(settings, sides, progress or Progress(disable=True), announce)
+    return _judge(settings, sides, progress or Progress(disable=True), announce, keep)
 
 
 def judge_entrants(settings: EvaluateConfig, entrants: list[Entrant]) -> Evaluation:
@@ -68,14 +74,15 @@ def judge_entrants(settings: EvaluateConfig, entrants: list[Entrant]) -> Evaluat
         PolicyError: If a policy does not fit the levels.
         ConfigError: If a suite is unsound, or the physics breaks down.
     """
-    return _judge(settings, [entrants], Progress(disable=True), lambda: None)
+    return _judge(settings, [entrants], Progress(disable=True), lambda *_: None, None)
 
 
 def _judge(
     settings: EvaluateConfig,
     sides: list[list[Entrant]],
     progress: Progress,
-    announce: Callable[[], object],
+    announce: Callable[[int, int], object],
+    keep: Path | None,
 ) -> Evaluation:
     """Judges the policies of one side, or of the two that are compared."""
     entrants = [each for side in sides for each in side]
@@ -83,12 +90,34 @@ def _judge(
         for path, trained in entrants:
             judge.check_policy(settings, stage, path, trained)
     suite = cells.load(settings)
-    announce()
-    total = len(entrants) * sum(len(cell.episodes) for cell in suite.cells)
-    bar = progress.add_task("episodes", total=total)
-    report = partial(progress.advance, bar)
-    trials = evaluate_trials.run(settings, suite.cells, entrants, report)
+    judged = unfinished.about(settings, suite.cells, entrants) if keep else {}
+    found = unfinished.read(keep, judged, suite.cells) if keep else {}
+    announce(len(found), len(suite.cells))
+    report, report_cell = _show_bars(progress, suite.cells, found, len(entrants))
+    missing = [row for row in range(len(suite.cells)) if row not in found]
+    left = [suite.cells[row] for row in missing]
+    for number, trial in evaluate_trials.run_each(settings, left, entrants, report):
+        row = missing[number]
+        found[row] = trial
+        if keep:
+            unfinished.write(keep, judged, row, trial)
+        report_cell(1)
+    trials = [found[row] for row in range(len(suite.cells))]
     return Evaluation(_sum_up(settings, suite, sides, trials), entrants, trials)
+
+
+def _show_bars(
+    progress: Progress, all_cells: Sequence[Cell], done: Collection[int], policies: int
+) -> tuple[Callable[[int], None], Callable[[int], None]]:
+    """Shows how far an evaluation is; returns what moves on its episodes, and its cells."""
+    episodes = [policies * len(cell.episodes) for cell in all_cells]
+    before = sum(episodes[row] for row in done)
+    bars = (
+        progress.add_task("episodes", total=sum(episodes), completed=before),
+        progress.add_task("cells", total=len(all_cells), completed=len(done)),
+    )
+    first, second = (partial(progress.advance, bar) for bar in bars)
+    return first, second
 
 
 def _sum_up(

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from swarmjax.config import ConfigError, Section, about, build, files, show
 from swarmjax.config.section import MAX_COUNT
+from swarmjax.evaluate.config import MOST_STEPS
 from swarmjax.task import stage_files
 from swarmjax.task.shapes import Shape
 from swarmjax.task.stage_config import StageConfig, complete
@@ -30,6 +31,10 @@ class CellConfig(Section):
     )
     realism: Literal["ideal", "webots", "real"] | None = field(
         default=None, metadata=about("preset; null: that of the command")
+    )
+    steps: int | None = field(
+        default=None,
+        metadata=about("control steps of an episode; null: those of the command", 1, MOST_STEPS),
     )
     shape: Shape = field(default="box", metadata=about("of the obstacles"))
     digest: str | None = field(

@@ -83,7 +83,7 @@ def _about(config: EvaluateConfig, suite: str | None) -> dict[str, Any]:
         "action": config.action,
         "robot": to_dict(config.robot),
         "task": to_dict(config.task),
-        "steps": config.steps,
+        "steps": config.step_limit,
         "substeps": judge.substeps(config),
         "versions": provenance.versions(),
     }
@@ -99,13 +99,14 @@ def about_cell(config: EvaluateConfig, trial: Trial) -> dict[str, Any]:
     Returns:
         Plain data for JSON.
     """
-    cell = trial.cell
+    cell, mine = trial.cell, specialise(config, trial.cell)
     return {
         "cell": cell.name,
         "stage": to_dict(cell.stage),
         "shape": cell.shape,
-        "realism": to_dict(specialise(config, cell).realism),
+        "realism": to_dict(mine.realism),
         "episodes": len(cell.episodes),
+        "steps": mine.step_limit,
         "seed": cell.seed,
         "digest": cell.digest,
         "unreachable": int(np.isinf(trial.shortest).any(axis=-1).sum()),

@@ -4,8 +4,9 @@ import math
 import os
 import signal
 import threading
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from multiprocessing import get_context, parent_process
 from typing import NamedTuple
@@ -17,7 +18,7 @@ from swarmjax.config import build, files
 from swarmjax.evaluate import engine_c, measures, shortest_path
 from swarmjax.evaluate import judge as evaluate_judge
 from swarmjax.evaluate.cells import Cell, split
-from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.evaluate.config import STEPS, EvaluateConfig
 from swarmjax.evaluate.measures import Outcome
 from swarmjax.policy import Policy
 from swarmjax.sim.realism_config import RealismConfig
@@ -59,6 +60,10 @@ class _Job(NamedTuple):
     find_ways: bool
 
 
+# The row of a cell, what each policy came to on it, and the lengths of its shortest ways.
+type _Result = tuple[int, list[Outcome], np.ndarray]
+
+
 def read_policies(files: Sequence[str], extensions: str | None = None) -> list[Entrant]:
     """Reads policy files.
 
@@ -93,12 +98,38 @@ def run(
         PolicyError: If a policy does not fit a cell.
         ConfigError: If the physics breaks down.
     """
+    found = dict(run_each(config, cells, entrants, report))
+    return [found[row] for row in range(len(cells))]
+
+
+def run_each(
+    config: EvaluateConfig,
+    cells: Sequence[Cell],
+    entrants: Sequence[Entrant],
+    report: Callable[[int], None] = lambda _: None,
+) -> Iterator[tuple[int, Trial]]:
+    """Judges policies on cells, as `run`, and yields each trial as soon as it is over.
+
+    Args:
+        config: Of the evaluation.
+        cells: Whose levels they are.
+        entrants: The policies.
+        report: Told how many more episodes are over, now and then.
+
+    Yields:
+        The row of a cell, and what became of the policies on it.
+
+    Raises:
+        PolicyError: If a policy does not fit a cell.
+        ConfigError: If the physics breaks down.
+    """
     for cell in cells:
         for each in entrants:
             evaluate_judge.check_policy(config, cell.stage, *each)
+    configs = [specialise(config, cell) for cell in cells]  # all are sound before the first runs
     play = _by_mjx if config.engine == "mjx" else _by_c
-    results = play(config, cells, entrants, report)
-    return [_try(config, cell, *result) for cell, result in zip(cells, results, strict=True)]
+    for row, outcomes, shortest in play(config, cells, entrants, report):
+        yield row, _try(configs[row], cells[row], outcomes, shortest)
 
 
 def specialise(config: EvaluateConfig, cell: Cell, path: str | None = None) -> EvaluateConfig:
@@ -106,7 +137,8 @@ def specialise(config: EvaluateConfig, cell: Cell, path: str | None = None) -> E
 
     Args:
         config: Of the evaluation.
-        cell: Its stage, shape, seed and realism are taken, the last if it has one.
+        cell: Its stage, shape and seed are taken, its realism if it has one, and its step limit if
+            it has one and the configuration has none.
         path: Of the policy.
 
     Returns:
@@ -123,6 +155,7 @@ def specialise(config: EvaluateConfig, cell: Cell, path: str | None = None) -> E
         stage=cell.stage,
         shape=cell.shape,
         realism=realism,
+        steps=(cell.steps or STEPS) if config.steps is None else config.steps,
         seed=cell.seed,
         episodes=len(cell.episodes),
     )
@@ -133,7 +166,7 @@ def _try(
 ) -> Trial:
     """Puts what policies came to on a cell together."""
     second = config.task.control_step
-    rows = [measures.per_level(each, second, config.steps, shortest) for each in outcomes]
+    rows = [measures.per_level(each, second, config.step_limit, shortest) for each in outcomes]
     arrival = [np.where(each.arrived, each.arrival * second, np.inf) for each in outcomes]
     found = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
     return Trial(cell, shortest, found, np.stack(arrival))
@@ -144,12 +177,12 @@ def _by_mjx(
     cells: Sequence[Cell],
     entrants: Sequence[Entrant],
     report: Callable[[int], None],
-) -> Iterator[tuple[list[Outcome], np.ndarray]]:
+) -> Iterator[_Result]:
     """Runs each cell at once by the engine that trains."""
     from swarmjax.evaluate import engine_mjx
     from swarmjax.run import compile_cache  # those that need JAX
 
-    for cell in cells:
+    for row, cell in enumerate(cells):
         mine, outcomes = specialise(config, cell, entrants[0].path), []
         with compile_cache.use(compile_cache.AUTO):
             world = engine_mjx.load(mine, cell.largest_half, len(cell.episodes))
@@ -158,12 +191,12 @@ def _by_mjx(
                     world,
                     cell.levels,
                     each.policy,
-                    config.steps,
+                    mine.step_limit,
                     sampled=config.action == "sampled",
                 )
                 outcomes.append(found)
                 report(len(cell.episodes))
-        yield outcomes, ways(mine, cell.levels)
+        yield row, outcomes, ways(mine, cell.levels)
 
 
 def _by_c(
@@ -171,26 +204,37 @@ def _by_c(
     cells: Sequence[Cell],
     entrants: Sequence[Entrant],
     report: Callable[[int], None],
-) -> Iterator[tuple[list[Outcome], np.ndarray]]:
+) -> Iterator[_Result]:
     """Runs all episodes in batches, by as many processes as are useful."""
     workers = config.workers or provenance.cores()
     jobs = [
-        [_jobs(config, cell, each, workers, find_ways=not i) for i, each in enumerate(entrants)]
-        for cell in cells
+        (row, job)
+        for row, cell in enumerate(cells)
+        for i, each in enumerate(entrants)
+        for job in _jobs(config, cell, each, workers, find_ways=not i)
     ]
-    flat = [job for by_policy in jobs for mine in by_policy for job in mine]
-    done = work(_simulate, flat, min(workers, len(flat)))
-    for by_policy in jobs:
-        outcomes, lengths = [], []
-        for mine in by_policy:
-            parts = []
-            for _ in mine:
-                outcome, found = next(done)
-                parts.append(outcome)
-                lengths += [] if found is None else [found]
-                report(len(outcome.clock))
-            outcomes.append(Outcome(*map(np.concatenate, zip(*parts, strict=True))))
-        yield outcomes, np.concatenate(lengths)
+    left = Counter(row for row, _ in jobs)
+    parts: dict[int, dict[int, tuple[Outcome, np.ndarray | None]]] = defaultdict(dict)
+    for number, part in work_each(_simulate, [job for _, job in jobs], min(workers, len(jobs))):
+        row = jobs[number][0]
+        parts[row][number] = part
+        left[row] -= 1
+        report(len(part[0].clock))
+        if not left[row]:
+            mine = parts.pop(row)
+            yield row, *_put_together([mine[each] for each in sorted(mine)], len(entrants))
+
+
+def _put_together(
+    parts: Sequence[tuple[Outcome, np.ndarray | None]], policies: int
+) -> tuple[list[Outcome], np.ndarray]:
+    """Puts the batches of a cell together, those of the first policy first."""
+    size = len(parts) // policies
+    outcomes = [outcome for outcome, _ in parts]
+    found = [outcomes[first : first + size] for first in range(0, len(parts), size)]
+    lengths = [lengths for _, lengths in parts if lengths is not None]
+    whole = [Outcome(*map(np.concatenate, zip(*mine, strict=True))) for mine in found]
+    return whole, np.concatenate(lengths)
 
 
 def _jobs(
@@ -219,6 +263,28 @@ def work[Job, Result](
         return
     with ProcessPoolExecutor(workers, get_context("spawn"), _begin_worker) as pool:
         yield from pool.map(function, jobs)
+
+
+def work_each[Job, Result](
+    function: Callable[[Job], Result], jobs: Sequence[Job], workers: int
+) -> Iterator[tuple[int, Result]]:
+    """Does jobs, yielding the number of each with what came of it as soon as it is done.
+
+    Args:
+        function: Of a module, so that other processes find it.
+        jobs: What it takes; they are begun in their order.
+        workers: Processes; with one there is no other than this.
+    """
+    if workers <= 1:
+        yield from enumerate(map(function, jobs))
+        return
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin_worker)
+    try:
+        numbers = {pool.submit(function, job): number for number, job in enumerate(jobs)}
+        for each in as_completed(numbers):
+            yield numbers.pop(each), each.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _begin_worker() -> None:

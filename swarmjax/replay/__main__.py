@@ -67,8 +67,9 @@ def replay(
         report = partial(progress.advance, bar)
         trials = evaluate_trials.run(settings.evaluation, chosen, entrants[:1], report)
         picks = worst(trials, settings.worst)
-    used = len({pick.cell for pick in picks})
-    bar = progress.add_task("steps", total=settings.steps * len(entrants) * used)
+    used = [chosen[row] for row in {pick.cell for pick in picks}]
+    limits = [evaluate_trials.specialise(settings.evaluation, cell).step_limit for cell in used]
+    bar = progress.add_task("steps", total=sum(limits) * len(entrants))
     return _record(settings, entrants, chosen, picks, partial(progress.advance, bar))
 
 

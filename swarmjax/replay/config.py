@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.config.section import MAX_COUNT
-from swarmjax.evaluate.config import AS_TRAINED, MOST_EPISODES, MOST_STEPS, EvaluateConfig
+from swarmjax.evaluate.config import AS_TRAINED, MOST_EPISODES, MOST_STEPS, STEPS, EvaluateConfig
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig, check_realism
@@ -52,7 +52,14 @@ class ReplayConfig(Section):
         default=None,
         metadata=about("replay this many of the episodes, those that went worst", 1, 100),
     )
-    steps: int = field(default=1500, metadata=about("control steps of an episode", 1, MOST_STEPS))
+    steps: int | None = field(
+        default=None,
+        metadata=about(
+            f"control steps of an episode; null: those of the suite's cell, else {STEPS}",
+            1,
+            MOST_STEPS,
+        ),
+    )
     episodes: int = field(
         default=1000, metadata=about("how many levels there are to choose from", 1, MOST_EPISODES)
     )
@@ -76,7 +83,7 @@ class ReplayConfig(Section):
     )
 
     def _check(self) -> None:
-        check_realism(self.realism, self.robot, self.task, self.steps)
+        check_realism(self.realism, self.robot, self.task, self.steps or STEPS)
         if not 1 <= len(self.policies) <= 2 or not all(self.policies):
             raise ConfigError(
                 f"policy is {show(self.policy)}: give one file, or two with a comma between them."

@@ -110,7 +110,7 @@ def _facts(settings: ReplayConfig, policies: Sequence[Policy], words: str) -> li
     return [
         *((f"policy {name}", f"SHA-256 {trained.digest}") for name, trained in names),
         ("levels", _choice(settings)),
-        ("time", f"control steps of {settings.task.control_step:g} s, {settings.steps} at most"),
+        ("time", f"control steps of {settings.task.control_step:g} s, {_most_steps(settings)}"),
         ("reward", f"by the weights that the policy was trained with{earned}"),
         (
             "exactness",
@@ -121,6 +121,13 @@ def _facts(settings: ReplayConfig, policies: Sequence[Policy], words: str) -> li
         ("versions", ", ".join(f"{name} {found}" for name, found in _versions().items())),
         ("made by", words),
     ]
+
+
+def _most_steps(settings: ReplayConfig) -> str:
+    """Says how long an episode may be; cells of a suite may have a step limit of their own."""
+    limit = f"{settings.evaluation.step_limit} at most"
+    is_given = settings.suite is None or settings.steps is not None
+    return limit if is_given else f"{limit} unless the cell has a step limit of its own"
 
 
 def _choice(settings: ReplayConfig) -> str:

@@ -185,7 +185,7 @@ def record(
     mount = electronics.mount(arenas.factors)
     frames = [_look(judge, arenas, np.zeros_like(arenas.pose[..., :2]))]
     over = np.zeros(len(levels), bool)  # by `hold` robots may leave again, and it stays over
-    while len(frames) <= judge.config.steps and not over.all():
+    while len(frames) <= judge.config.step_limit and not over.all():
         action = np.clip(engine_c.act(judge, arenas), -1.0, 1.0)
         arenas = engine_c.step(judge, arenas)
         frames.append(_look(judge, arenas, action))

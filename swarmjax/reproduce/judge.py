@@ -117,7 +117,7 @@ def play(judge: Judge, levels: Sequence[Level]) -> tuple[Outcome, np.ndarray]:
     """
     arenas = engine_c.start(judge, levels)
     total, nearer = arenas.outcome, np.zeros(arenas.outcome.arrived.shape)
-    for _ in range(judge.config.steps):
+    for _ in range(judge.config.step_limit):
         running = ~total.arrived.all(axis=-1)
         if not running.any():
             break

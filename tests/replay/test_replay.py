@@ -216,7 +216,8 @@ def test_defaults():
     stage = load_levels(EvaluateConfig, ["policy=a"]).stage
     assert settings == ReplayConfig(policy="a.npz,b.npz", stage=stage)
     assert settings.policies == ("a.npz", "b.npz")
-    assert (settings.levels, settings.robot.body, settings.steps) == ((0,), "wheeled", 1500)
+    assert (settings.levels, settings.robot.body) == ((0,), "wheeled")
+    assert settings.evaluation.step_limit == 1500
     assert settings.evaluation.episodes == 1
     assert load_levels(ReplayConfig, ["policy=a", "worst=5"]).evaluation.episodes == 1000
 
