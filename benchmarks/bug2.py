@@ -219,7 +219,7 @@ def _choose(memory: BugMemory, senses: Senses, place: np.ndarray) -> BugMemory:
     aside = np.minimum(senses.diagonal, senses.other_diagonal) < ASIDE
     hits = ~memory.following & (ahead | aside) & (np.abs(senses.bearing) < math.pi / 4)
     beside = place[..., 1]
-    meets = (beside * memory.beyond <= 0.0) & (place[..., 0] < 0.0)
+    meets = beside * memory.beyond <= 0.0
     leaves = memory.following & meets & (senses.distance < memory.hit - NEARER)
     way = np.where(hits, 0.0, memory.way)
     # The mark moves on each time that the way has doubled (Brent 1980): whatever the robot comes
