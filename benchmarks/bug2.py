@@ -20,12 +20,13 @@ still, are three rules, each marked where it is applied:
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from swarmjax import epuck
 from swarmjax.evaluate.engine_c import Arenas
+from swarmjax.evaluate.judge import Judge
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim.drive import Drive
 from swarmjax.task import observation
@@ -33,8 +34,7 @@ from swarmjax.task import observation
 # Columns of an observation whose wall is on the left, and on the right: near the nose, diagonal,
 # beside, behind on that side; then the first three of the other side.
 _LEFT, _RIGHT = (7, 6, 5, 4, 0, 1, 2), (0, 1, 2, 3, 7, 6, 5)
-_DISTANCE = observation.NAMES.index("target_distance")
-_BEARING = observation.NAMES.index("target_bearing")
+_TARGET = tuple(observation.NAMES.index(name) for name in ("target_distance", "target_bearing"))
 
 
 class Senses(NamedTuple):
@@ -90,7 +90,7 @@ class BugMemory(NamedTuple):
     waited: np.ndarray
 
 
-class Body(NamedTuple):
+class BugBody(NamedTuple):
     """What a robot knows of itself.
 
     Attributes:
@@ -130,7 +130,7 @@ def start(seen: np.ndarray) -> BugMemory:
     Returns:
       The memory.
     """
-    distance, bearing = (seen[..., i].astype(float) for i in (_DISTANCE, _BEARING))
+    distance, bearing = (seen[..., i].astype(float) for i in _TARGET)
     zero = np.zeros_like(distance)
     here = np.stack([-distance, zero], axis=-1)
     return BugMemory(
@@ -162,7 +162,7 @@ def sense(seen: np.ndarray, side: np.ndarray) -> Senses:
     seen = seen.astype(float)
     left, right = seen[..., _LEFT], seen[..., _RIGHT]
     rays = np.where(side[..., None] > 0.0, left, right)
-    return Senses(*np.moveaxis(rays, -1, 0), seen[..., _DISTANCE], seen[..., _BEARING])
+    return Senses(*np.moveaxis(rays, -1, 0), *np.moveaxis(seen[..., _TARGET], -1, 0))
 
 
 def locate(heading: np.ndarray, senses: Senses) -> np.ndarray:
@@ -171,7 +171,7 @@ def locate(heading: np.ndarray, senses: Senses) -> np.ndarray:
     return -senses.distance[..., None] * np.stack([np.cos(toward), np.sin(toward)], axis=-1)
 
 
-def act(memory: BugMemory, seen: np.ndarray, body: Body) -> tuple[BugMemory, np.ndarray]:
+def act(memory: BugMemory, seen: np.ndarray, body: BugBody) -> tuple[BugMemory, np.ndarray]:
     """Takes one control step.
 
     Args:
@@ -193,7 +193,7 @@ def act(memory: BugMemory, seen: np.ndarray, body: Body) -> tuple[BugMemory, np.
     return _remember(memory, senses, gap, twist, body), _action(twist, body.drive)
 
 
-def _begin_anew(memory: BugMemory, senses: Senses, body: Body) -> BugMemory:
+def _begin_anew(memory: BugMemory, senses: Senses, body: BugBody) -> BugMemory:
     """Rules 2 and 3: where the outline makes no sense, the line starts here."""
     place = locate(memory.heading, senses)
     near = np.linalg.norm(place - memory.mark[..., :2], axis=-1) < ROUND
@@ -238,7 +238,7 @@ def _choose(memory: BugMemory, senses: Senses, place: np.ndarray) -> BugMemory:
     )
 
 
-def _head_for_target(senses: Senses, body: Body) -> np.ndarray:
+def _head_for_target(senses: Senses, body: BugBody) -> np.ndarray:
     """Twists [..., 2] straight to the target, as the baseline that does nothing else."""
     off = np.abs(senses.bearing)
     speed = body.drive.max_speed * np.clip(1.0 - off, 0.0, 1.0)
@@ -246,14 +246,14 @@ def _head_for_target(senses: Senses, body: Body) -> np.ndarray:
     return np.stack([speed, np.clip(2.0 * limit * senses.bearing, -limit, limit)], axis=-1)
 
 
-def _follow(memory: BugMemory, senses: Senses, gap: np.ndarray, body: Body) -> np.ndarray:
+def _follow(memory: BugMemory, senses: Senses, gap: np.ndarray, body: BugBody) -> np.ndarray:
     """Twists [..., 2] along the outline: m/s, and rad/s with left positive."""
     near = 0.99 * body.sensor_range
     other = senses.other_beside - (senses.beside - gap)
     wanted = np.minimum(GAP, 0.5 * (gap + other))
     turn = BY_ANGLE * _angle(memory, senses, gap, body) + BY_GAP * (gap - wanted)
     # Only the diagonal ray: where it would end along a wall at the wanted gap.
-    x, y, yaw = epuck.SENSOR_POSES[6]
+    _, y, yaw = epuck.SENSOR_POSES[6]
     expected = (body.hull_radius + GAP - y) / math.sin(yaw)
     turn = np.where(senses.beside < near, turn, BY_GAP * (senses.diagonal - expected))
     speed = np.full_like(turn, SPEED)
@@ -270,7 +270,7 @@ def _follow(memory: BugMemory, senses: Senses, gap: np.ndarray, body: Body) -> n
     return np.stack([np.minimum(speed, most), memory.side * turn], axis=-1)
 
 
-def _angle(memory: BugMemory, senses: Senses, gap: np.ndarray, body: Body) -> np.ndarray:
+def _angle(memory: BugMemory, senses: Senses, gap: np.ndarray, body: BugBody) -> np.ndarray:
     """Direction of the outline from the nose, rad; away from the robot is positive.
 
     From the ends of two rays where both are sensed, else from how fast the gap grows.
@@ -284,7 +284,7 @@ def _angle(memory: BugMemory, senses: Senses, gap: np.ndarray, body: Body) -> np
 
 
 def _remember(
-    memory: BugMemory, senses: Senses, gap: np.ndarray, twist: np.ndarray, body: Body
+    memory: BugMemory, senses: Senses, gap: np.ndarray, twist: np.ndarray, body: BugBody
 ) -> BugMemory:
     """Integrates what the wheels make of the twist, over this control step."""
     drive, step = body.drive, body.control_step
@@ -316,7 +316,7 @@ def _action(twist: np.ndarray, drive: Drive) -> np.ndarray:
 class Bug2:
     """The controller of `engine_c.simulate`."""
 
-    body: Body
+    body: BugBody
 
     def init(self, arenas: Arenas) -> BugMemory:
         """Returns the memory [A, R] of robots that start."""
@@ -325,3 +325,16 @@ class Bug2:
     def act(self, memory: BugMemory, arenas: Arenas) -> tuple[BugMemory, np.ndarray]:
         """Takes one control step; of the arenas it reads the observations alone."""
         return act(memory, arenas.observation, self.body)
+
+
+def load(judge: Judge) -> Bug2:
+    """Makes the controller of a judge's robots, which know their own numbers."""
+    task, robot = judge.config.task, judge.config.robot
+    body = BugBody(
+        drive=judge.drive,
+        hull_radius=robot.hull_radius,
+        target_radius=task.target_radius,
+        sensor_range=task.sensor_range,
+        control_step=task.control_step,
+    )
+    return Bug2(body)

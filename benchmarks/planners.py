@@ -16,12 +16,13 @@ from benchmarks import way_points
 from benchmarks.way_points import Plan
 from swarmjax.config import ConfigError
 from swarmjax.evaluate.engine_c import Arenas
+from swarmjax.evaluate.judge import Judge
 from swarmjax.sim.drive import Drive
 
 # What differs from the package's defaults, which are those of pedestrians or of robots some times
-# as large and fast: chosen on levels of s6, crowd_dense and fence2 with seed 7. Lengths in m, times in s.
+# as large and fast; m and s. Chosen on levels of s6 and crowd_dense with seed 7.
 SETTINGS: dict[str, tuple[str, dict[str, Any]]] = {
-    "orca": ("ORCA", {"time_horizon": 2.0, "static_time_horizon": 0.5, "effective_center": True}),
+    "orca": ("ORCA", {"time_horizon": 2.0, "static_time_horizon": 0.5}),
     "hrvo": ("HRVO", {}),
     "hl": ("HL", {}),
     "social_force": ("SocialForce", {"u_a": 0.012, "u_r": 0.012, "v_a": 0.05, "v_r": 0.03}),
@@ -177,6 +178,22 @@ def navground() -> Any:
         return importlib.import_module("navground.core")
     except ImportError as error:
         raise ConfigError(f"navground is missing ({error}): install the extra navground.") from None
+
+
+def check_packages() -> None:
+    """Imports what the extra brings.
+
+    Raises:
+      ConfigError: if a package of it is missing.
+    """
+    navground()
+    way_points.scipy()
+
+
+def load(name: str, judge: Judge) -> Planners:
+    """Makes the controller of a judge's robots."""
+    task, robot = judge.config.task, judge.config.robot
+    return Planners(name, judge.drive, robot.hull_radius, task.target_radius, task.control_step)
 
 
 def _walls(side: float) -> np.ndarray:

@@ -6,7 +6,8 @@ off its way has one from where it is. Steps close to an obstacle count longer: w
 touch every corner.
 """
 
-from typing import NamedTuple
+import importlib
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -48,7 +49,7 @@ def plan(side: float, target: np.ndarray, obstacle: np.ndarray, hull_radius: flo
     Returns:
       The plan.
     """
-    sparse, ndimage = _scipy()
+    sparse, ndimage = scipy()
     cell = COARSE_CELL if side > LARGE else CELL
     count = max(round(side / cell), 1)
     middle = (np.arange(count) + 0.5) * cell - 0.5 * count * cell
@@ -56,22 +57,26 @@ def plan(side: float, target: np.ndarray, obstacle: np.ndarray, hull_radius: flo
     room = clearance(point, side, obstacle) - hull_radius
     free = room > 0.0
     number = np.arange(count * count).reshape(count, count)
-    away, index = ndimage.distance_transform_edt(~free, return_indices=True)
+    _, index = ndimage.distance_transform_edt(~free, return_indices=True)
     nearest = number[tuple(index)].ravel() if free.any() else number.ravel()
     graph = _graph(sparse, free, room, cell)
     goal = nearest[_cell_of(target, cell, count)]
     before = sparse.csgraph.dijkstra(graph, indices=goal, return_predecessors=True)[1]
-    return Plan(cell, free, nearest, np.where(before < 0, number.ravel(), before))
+    following = np.where(before < 0, number.ravel(), before).astype(np.int32)
+    return Plan(cell, free, nearest, following)
 
 
-def _scipy():  # noqa: ANN202
-    """Imports what the extra brings."""
+def scipy() -> tuple[Any, Any]:
+    """Imports `scipy.sparse` with its graphs, and `scipy.ndimage`.
+
+    Raises:
+      ConfigError: if it is not installed.
+    """
     try:
-        from scipy import ndimage, sparse
-        from scipy.sparse import csgraph as _  # noqa: F401, of `sparse` from then on
+        importlib.import_module("scipy.sparse.csgraph")
+        return importlib.import_module("scipy.sparse"), importlib.import_module("scipy.ndimage")
     except ImportError as error:
         raise ConfigError(f"scipy is missing ({error}): install the extra navground.") from None
-    return sparse, ndimage
 
 
 def clearance(point: np.ndarray, side: float, obstacle: np.ndarray) -> np.ndarray:
@@ -88,7 +93,7 @@ def clearance(point: np.ndarray, side: float, obstacle: np.ndarray) -> np.ndarra
     return found
 
 
-def _graph(sparse, free, room, cell):  # noqa: ANN001, ANN202
+def _graph(sparse: Any, free: np.ndarray, room: np.ndarray, cell: float) -> Any:
     """Joins free cells, as a symmetric matrix of lengths in m."""
     count = len(free)
     number = np.arange(free.size).reshape(free.shape)
