@@ -6,16 +6,21 @@ obstacle follow its outline on one side until the line is met nearer to the targ
 was left, and go on along it. A point automaton knows where it is; here a robot integrates its own
 commands to a heading, and has its place from that and from distance and bearing of the target.
 
-Robots are obstacles whose outlines move. What the paper does not need, since its obstacles stand
-still, are three rules, each marked where it is applied:
+The line is the whole one through start and target, not the part between them alone: an outline
+that is left beyond the target is left nearer to it as well.
+
+Robots are obstacles whose outlines move. The paper's obstacles stand still; three rules are added:
 
 1. All turn right where they meet something, so that it is on their left: two that meet head on
-   pass each other.
-2. An outline that is not sensed for `LOST` metres, or that has been followed all the way round
-   without a way out, was another robot's, or has changed: the line starts anew here, and after a
-   full round on the other side.
-3. A robot that has come nowhere for `STUCK` seconds turns to the other side, and its line starts
-   anew. Which way two that block each other go is told apart by the number of the robot.
+   pass each other. A robot that stands, arrived or not, is followed round like any outline.
+2. An outline that is not sensed for `LOST` metres was a robot's that has gone: the line starts anew
+   from here. One that has been followed all the way round without meeting the line nearer was not
+   that which barred it: the line starts anew, and the next outline is followed on the other side.
+3. A robot that has come nowhere for `STUCK` seconds, in front of another one or between two, does
+   as after a full round. That ends most deadlocks, not all.
+
+A contact turns a robot in a way that its commands do not tell; its line is then off by as much
+until it starts anew.
 """
 
 import math
@@ -113,7 +118,7 @@ GAP = 0.012  # between hull and outline
 AHEAD = 0.025  # ray near the nose that bars the way; a wall is then 0.017 m before the hull
 ASIDE = 0.0167  # diagonal ray whose end the hull would meet: 0.025 + 0.717 * 0.0167 = 0.037
 NEARER = 0.03  # than where the line was left, for going on along it
-ROUND = 0.03  # from the mark, and within a right angle of its heading, counts as there again
+ROUND = 0.03  # from the mark, and within a right angle of its heading, is there again
 LOST = 0.33  # a full circle of the arc that seeks the outline, 2 pi (0.037 + 0.012) = 0.31
 STILL, STUCK = 0.02, 3.0  # m, s: has come nowhere
 SPEED, CORNER_SPEED = 0.11, 0.08  # m/s, along an outline and round its corners
@@ -262,7 +267,8 @@ def _follow(memory: BugMemory, senses: Senses, gap: np.ndarray, body: BugBody) -
     speed = np.where(unseen, CORNER_SPEED, speed)
     nose = np.minimum(senses.nose, senses.other_nose)
     turn, speed = (np.where(unseen & (nose < near), x, y) for x, y in ((-1.5, turn), (0.04, speed)))
-    barred = (nose < AHEAD) | (senses.diagonal < ASIDE)
+    aside = np.minimum(senses.diagonal, senses.other_diagonal)
+    barred = (nose < AHEAD) | (aside < ASIDE)
     turn, speed = np.where(barred, -TURN, turn), np.where(barred, 0.0, speed)
     most = body.drive.max_wheel_speed * body.drive.wheel_radius - 0.5 * body.drive.track * np.abs(
         turn

@@ -25,7 +25,7 @@ SETTINGS: dict[str, tuple[str, dict[str, Any]]] = {
     "orca": ("ORCA", {"time_horizon": 2.0, "static_time_horizon": 0.5}),
     "hrvo": ("HRVO", {}),
     "hl": ("HL", {}),
-    "social_force": ("SocialForce", {"u_a": 0.012, "u_r": 0.012, "v_a": 0.05, "v_r": 0.03}),
+    "social_force": ("SocialForce", {"u_a": 0.1, "u_r": 0.012, "v_a": 0.3, "v_r": 0.02}),
 }
 SAFETY = 0.004  # m that a planner adds to the hull
 ROTATION = 0.2  # s in which it turns to where it wants to go
