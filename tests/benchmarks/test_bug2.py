@@ -53,7 +53,7 @@ def test_what_bars_the_line_is_passed_with_it_on_the_left(ray: int) -> None:
 def test_it_keeps_to_its_side(side: float, near: tuple[int, ...]) -> None:
     """Along a wall at the wanted gap it drives on; too close it turns away, too far it turns to it.
 
-    The ray beside begins 0.031 m off the middle, the diagonal one at 0.025 m and at 0.8 rad (0.79920,
+    The ray beside begins 0.031 m off the middle, the diagonal one at 0.025 m, at 0.8 rad (0.79920,
     on the right 0.80081): a wall at 0.037 + 0.012 m leaves 0.018 m and 0.024 / sin 0.8 = 0.0335 m.
     """
     turns = {}

@@ -37,7 +37,7 @@ def test_a_target_in_sight_is_its_own_way_point() -> None:
 def test_the_way_leads_round_the_plate_and_never_through_it() -> None:
     """From (-0.2, 0) to (0.2, 0): round an end at y = 0.3, two legs of 0.361 m.
 
-    sqrt(0.2^2 + 0.3^2) = 0.361. At best 0.72 m, and a detour for the hull of 0.037 m: less than 0.85 m.
+    sqrt(0.2^2 + 0.3^2) = 0.361: at best 0.72 m, and with a detour for the hull less than 0.85 m.
     """
     target, place = np.array([[0.2, 0.0]]), np.array([[-0.2, 0.0]])
     plan = way_points.plan(1.2, target, PLATE, HULL)
