@@ -1,31 +1,80 @@
-"""How good is a policy that never learned? Two of them, judged by `swarmjax.evaluate`.
+"""What others reach on the same levels in the same engine: controllers that never learned.
 
-`python -m benchmarks.baselines [evaluate keys]` prints a JSON line for `blind`, which drives
-straight at its target and ignores the infrared, and for `still`, which never moves. What a
-trained policy must beat is `blind`: it reaches most targets of an open arena, by pushing through
-whatever is there.
+`python -m benchmarks.baselines suite=NAME [who=straight,bug2,orca] [evaluate keys]`, or
+`stage=NAME`, judges each in MuJoCo C and prints a JSON line for each cell:
+
+- `straight` drives straight at its target and ignores the infrared; `still` never moves;
+- `bug2` follows outlines, from a robot's ten observations and a memory (`benchmarks.bug2`);
+- `orca`, `hrvo`, `hl`, `social_force` know all positions and the map (`benchmarks.planners`), and
+  need the extra `navground`.
 """
 
-import json
+import math
+import platform
 import sys
 import tempfile
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from swarmjax import command, epuck, policy_file, provenance
+from benchmarks import bug2, key_value, peers, planners
+from swarmjax import command, epuck, policy_file, provenance, words
+from swarmjax.config import ConfigError, Section, about, show, to_dict
+from swarmjax.evaluate import cells, engine_c, measures, summary, trials
+from swarmjax.evaluate import judge as evaluate_judge
+from swarmjax.evaluate.cells import Cell
 from swarmjax.evaluate.config import EvaluateConfig
-from swarmjax.evaluate.evaluation import evaluate
+from swarmjax.evaluate.engine_c import Controller
+from swarmjax.evaluate.judge import Judge
+from swarmjax.evaluate.measures import Outcome
+from swarmjax.policy import Policy
 from swarmjax.task import observation
+from swarmjax.task.level import Level
 from swarmjax.task.stage_files import load_levels
 
 # Action (speed, turn rate; -1..1) at bearing 0, and what each radian to the left or right adds:
 # full speed and twice the bearing as a turn, slower the further the target is off the nose.
 POLICIES = {
-    "blind": ((1.0, 0.0), (-2.0, 2.0), (-2.0, -2.0)),
+    "straight": ((1.0, 0.0), (-2.0, 2.0), (-2.0, -2.0)),
     "still": ((-1.0, 0.0), (0.0, 0.0), (0.0, 0.0)),
 }
+NAMES = (*POLICIES, "bug2", *planners.SETTINGS)
+BATCH = 32  # arenas of a process at once; of 40 robots on 4 by 4 m they fill 0.2 GB with ways
+_FIXED = (
+    "policy",
+    "compare",
+    "engine",
+    "action",
+    "out",
+)  # keys of `evaluate` that say nothing here
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaselinesConfig(Section):
+    """Who is judged."""
+
+    who: tuple[str, ...] = field(
+        default=("straight", "still", "bug2"), metadata=about("baselines, one after the other")
+    )
+
+    def _check(self) -> None:
+        for name in self.who:
+            if name not in NAMES:
+                raise ConfigError(f"who is {show(name)}: give some of {', '.join(NAMES)}.")
+
+
+class _Batch(NamedTuple):
+    """Levels that one process runs by one baseline."""
+
+    config: EvaluateConfig
+    policy: Policy
+    who: str
+    half: np.ndarray
+    levels: Level
 
 
 def write(path: Path, ahead: Sequence[float], *sides: Sequence[float]) -> None:
@@ -77,18 +126,112 @@ def write(path: Path, ahead: Sequence[float], *sides: Sequence[float]) -> None:
     policy_file.write(path, arrays, meta)
 
 
+def results(who: Sequence[str], arguments: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Judges baselines.
+
+    Args:
+      who: of `NAMES`.
+      arguments: keys of `evaluate`.
+
+    Yields:
+      A line for each of them and each cell.
+
+    Raises:
+      ConfigError: if a key is unsound, or a package is missing.
+    """
+    for word in arguments:
+        if word.partition("=")[0] in _FIXED:
+            key = word.partition("=")[0]
+            raise ConfigError(f"{key} cannot be given for baselines: leave it out.")
+    if set(who) & set(planners.SETTINGS):
+        planners.check_packages()
+    settings, policies = _read(who, arguments)
+    suite = cells.load(settings)
+    pairs = [(name, cell) for name in who for cell in suite.cells]
+    workers = settings.workers or provenance.cores()
+    jobs = [_split(settings, policies[name], name, cell, workers) for name, cell in pairs]
+    flat = [job for mine in jobs for job in mine]
+    done = trials.work(_simulate, flat, min(workers, len(flat)))
+    for (name, cell), mine in zip(pairs, jobs, strict=True):
+        parts, seconds = zip(*(next(done) for _ in mine), strict=True)
+        outcome = Outcome(*map(np.concatenate, zip(*parts, strict=True)))
+        yield _line(settings, suite.name, name, cell, outcome) | {"cpu_s": sum(seconds)}
+
+
+def _read(who: Sequence[str], arguments: Sequence[str]) -> tuple[EvaluateConfig, dict[str, Policy]]:
+    """Reads the settings, and the policy by which each baseline is judged.
+
+    The policy of those that have none says no more than the range of commands.
+    """
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "policy.npz"
+        settings = load_levels(EvaluateConfig, [*arguments, f"policy={path}"])
+        for name in who:
+            write(path, *POLICIES.get(name, POLICIES["still"]))
+            found[name] = policy_file.read(str(path))
+    return settings, found
+
+
+def _split(
+    settings: EvaluateConfig, policy: Policy, who: str, cell: Cell, workers: int
+) -> list[_Batch]:
+    """Splits the levels of a cell into batches."""
+    count, mine = len(cell.episodes), trials.specialise(settings, cell, settings.policy)
+    size = min(BATCH, math.ceil(count / workers))
+    rows = [slice(first, first + size) for first in range(0, count, size)]
+    parts = [Level(*(each[part] for each in cell.levels)) for part in rows]
+    return [_Batch(mine, policy, who, cell.half, part) for part in parts]
+
+
+def _simulate(job: _Batch) -> tuple[Outcome, float]:
+    """Runs a batch; returns what it came to, and the processor's seconds."""
+    began = time.process_time()
+    judge = evaluate_judge.load(job.config, job.policy, job.half)
+    outcome = engine_c.simulate(judge, cells.split(job.levels), controller(job.who, judge))
+    return outcome, time.process_time() - began
+
+
+def controller(who: str, judge: Judge) -> Controller | None:
+    """Makes the controller of a baseline; None where the judge's policy is all of it."""
+    if who in POLICIES:
+        return None
+    return bug2.load(judge) if who == "bug2" else planners.load(who, judge)
+
+
+def _line(
+    settings: EvaluateConfig, suite: str | None, who: str, cell: Cell, outcome: Outcome
+) -> dict[str, Any]:
+    """Puts what a baseline came to on a cell into plain data for JSON."""
+    step, mine = settings.task.control_step, trials.specialise(settings, cell, settings.policy)
+    found = measures.per_level(outcome, step, settings.steps)
+    packages = ("navground", "scipy") if who in planners.SETTINGS else ()
+    return {
+        "benchmark": "baselines",
+        "who": who,
+        "suite": suite,
+        "cell": cell.name,
+        "stage": to_dict(cell.stage),
+        "shape": cell.shape,
+        "realism": to_dict(mine.realism),
+        "episodes": len(cell.episodes),
+        "seed": cell.seed,
+        "digest": cell.digest,
+        "measures": summary.summarize({name: table[None] for name, table in found.items()}),
+        "robot": to_dict(settings.robot),
+        "task": to_dict(settings.task),
+        "steps": settings.steps,
+        "substeps": evaluate_judge.substeps(settings),
+        "device": f"CPU {platform.machine()}, {words.count(provenance.cores(), 'core')}",
+        "versions": peers.versions(*packages),
+        "commit": provenance.commit(),
+    }
+
+
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    for name, actions in POLICIES.items():
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"{name}.npz"
-            write(path, *actions)
-            settings = load_levels(EvaluateConfig, [*arguments, f"policy={path}"])
-            result = evaluate(settings).result
-        del result["policies"]  # written a moment ago, to a folder that is gone
-        line = {"benchmark": "baselines", "policy": name, **result, "commit": provenance.commit()}
-        sys.stdout.write(json.dumps(line) + "\n")
-        sys.stdout.flush()
+    mine, others = key_value.parse(BaselinesConfig, arguments)
+    peers.write(results(mine.who, others))
     return 0
 
 

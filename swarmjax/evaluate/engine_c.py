@@ -11,7 +11,7 @@ computed on its own, so that a result does not depend on how the work is split u
 import copy
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import mujoco
 import numpy as np
@@ -68,7 +68,33 @@ class Arenas(NamedTuple):
     outcome: Outcome
 
 
-def simulate(judge: Judge, levels: Sequence[level.Level]) -> Outcome:
+class Controller(Protocol):
+    """Drives robots in a policy's place, with a memory that is passed in and returned."""
+
+    def init(self, arenas: Arenas) -> Any:
+        """Returns the memory of arenas that start: tuples, however deep, of arrays [A, ...]."""
+        ...
+
+    def act(self, memory: Any, arenas: Arenas) -> tuple[Any, np.ndarray]:
+        """Returns the memory after this control step, and actions [A, R, U], -1..1."""
+        ...
+
+
+class _ByPolicy(NamedTuple):
+    """The controller that a judge has unless it is told another: its policy, without memory."""
+
+    judge: Judge
+
+    def init(self, arenas: Arenas) -> None:
+        del arenas
+
+    def act(self, memory: None, arenas: Arenas) -> tuple[None, np.ndarray]:
+        return memory, act(self.judge, arenas)
+
+
+def simulate(
+    judge: Judge, levels: Sequence[level.Level], controller: Controller | None = None
+) -> Outcome:
     """Runs episodes side by side, each until all its robots have arrived or the time is out.
 
     By `task.arrival=hold` they have arrived once all are within their targets.
@@ -76,6 +102,7 @@ def simulate(judge: Judge, levels: Sequence[level.Level]) -> Outcome:
     Args:
         judge: What the arenas share.
         levels: What they start from.
+        controller: Who drives; None: the judge's policy.
 
     Returns:
         What they came to, in their order.
@@ -84,14 +111,17 @@ def simulate(judge: Judge, levels: Sequence[level.Level]) -> Outcome:
         ConfigError: If the physics of an episode breaks down.
     """
     rows, arenas = np.arange(len(levels)), start(judge, levels)
+    driver = _ByPolicy(judge) if controller is None else controller
+    memory = driver.init(arenas)
     total = Outcome(*(np.zeros_like(field) for field in arenas.outcome))
     for _ in range(judge.config.step_limit):
-        arenas = step(judge, arenas)
+        memory, action = driver.act(memory, arenas)
+        arenas = step(judge, arenas, action)
         for whole, part in zip(total, arenas.outcome, strict=True):
             whole[rows] = part
         running = ~arenas.outcome.arrived.all(axis=-1)
         if not running.all():
-            rows, arenas = rows[running], _select(arenas, running)
+            rows, arenas, memory = rows[running], *(_select(x, running) for x in (arenas, memory))
         if not len(rows):
             break
     return total
@@ -221,12 +251,13 @@ def place(
     return data
 
 
-def step(judge: Judge, arenas: Arenas) -> Arenas:
+def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Arenas:
     """Moves arenas on by one control step; what happens in it is what `task.env.step` says.
 
     Args:
         judge: What the arenas share.
         arenas: Their state before.
+        action: [A, R, U] of the robots, -1..1; None: the policy's.
 
     Returns:
         Their state after.
@@ -235,7 +266,8 @@ def step(judge: Judge, arenas: Arenas) -> Arenas:
         ConfigError: If a position is not finite.
     """
     task, before = judge.config.task, arenas.outcome.arrived
-    memory, pose, impulse = _drive(judge, arenas, arrival.drives(task.arrival, before))
+    action = act(judge, arenas) if action is None else action
+    memory, pose, impulse = _drive(judge, arenas, action, arrival.drives(task.arrival, before))
     sight = look(judge, arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)
     arrived = arrival.arrived(task.arrival, before, sight.distance <= task.target_radius)
     touches = touching(judge, arenas.data)
@@ -300,14 +332,14 @@ def _tally(arenas: Arenas, pose: np.ndarray, step: _Step) -> tuple[np.ndarray, O
 
 
 def _drive(
-    judge: Judge, arenas: Arenas, active: np.ndarray
+    judge: Judge, arenas: Arenas, action: np.ndarray, active: np.ndarray
 ) -> tuple[Memory, np.ndarray, np.ndarray]:
     """Lets the robots that are active drive.
 
     Returns:
         Memory, new poses [A, R, 3], and impulses [A, R, 3] (N s) by kind of contact.
     """
-    wanted = sim_drive.command(act(judge, arenas), judge.drive, np)
+    wanted = sim_drive.command(action, judge.drive, np)
     memory, wheels = electronics.drive(
         judge.electronics,
         arenas.memory,

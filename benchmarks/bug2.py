@@ -1,0 +1,346 @@
+"""Bug2 (Lumelsky & Stepanov 1987) from a robot's own ten observations and its own commands.
+
+"Path-planning strategies for a point mobile automaton moving amidst unknown obstacles of arbitrary
+shape", Algorithmica 2, section 4: drive along the line from the start to the target; on an
+obstacle follow its outline on one side until the line is met nearer to the target than where it
+was left, and go on along it. A point automaton knows where it is; here a robot integrates its own
+commands to a heading, and has its place from that and from distance and bearing of the target.
+
+The line is the whole one through start and target, not the part between them alone: an outline
+that is left beyond the target is left nearer to it as well.
+
+Robots are obstacles whose outlines move. The paper's obstacles stand still; three rules are added:
+
+1. All turn right where they meet something, so that it is on their left: two that meet head on
+   pass each other. A robot that stands, arrived or not, is followed round like any outline.
+2. An outline that is not sensed for `LOST` metres was a robot's that has gone: the line starts anew
+   from here. One that has been followed all the way round without meeting the line nearer was not
+   that which barred it: the line starts anew, and the next outline is followed on the other side.
+3. A robot that has come nowhere for `STUCK` seconds, in front of another one or between two, does
+   as after a full round. That ends most deadlocks, not all.
+
+A contact turns a robot in a way that its commands do not tell; its line is then off by as much
+until it starts anew.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from swarmjax import epuck
+from swarmjax.evaluate.engine_c import Arenas
+from swarmjax.evaluate.judge import Judge
+from swarmjax.sim import drive as sim_drive
+from swarmjax.sim.drive import Drive
+from swarmjax.task import observation
+
+# Columns of an observation whose wall is on the left, and on the right: near the nose, diagonal,
+# beside, behind on that side; then the first three of the other side.
+_LEFT, _RIGHT = (7, 6, 5, 4, 0, 1, 2), (0, 1, 2, 3, 7, 6, 5)
+_TARGET = tuple(observation.NAMES.index(name) for name in ("target_distance", "target_bearing"))
+
+
+class Senses(NamedTuple):
+    """What a robot observes, [...] each, lengths of rays in m.
+
+    Attributes:
+      nose, diagonal, beside, behind: rays on the side of the wall, from ahead to behind.
+      other_nose, other_diagonal, other_beside: rays of the other side.
+      distance: to the target, m.
+      bearing: of the target, rad; left is positive.
+    """
+
+    nose: np.ndarray
+    diagonal: np.ndarray
+    beside: np.ndarray
+    behind: np.ndarray
+    other_nose: np.ndarray
+    other_diagonal: np.ndarray
+    other_beside: np.ndarray
+    distance: np.ndarray
+    bearing: np.ndarray
+
+
+class BugMemory(NamedTuple):
+    """What a robot remembers, [...] each.
+
+    Attributes:
+      heading: from the direction in which the line leads, rad.
+      following: whether it follows an outline.
+      side: 1.0 with the outline on the left, -1.0 on the right.
+      hit: distance to the target where the line was left, m.
+      beyond: place beside the line a control step ago, m; left is positive.
+      gap: to what was beside it a control step ago, m.
+      lost: way since the outline was last sensed, m.
+      way: since the line was left, m.
+      mark: [..., 3] a pose on the outline (m, m, rad), to know by that it has been round.
+      marked: way at which that was.
+      anchor: [..., 2] place near which it has been of late, m.
+      waited: for how long, s.
+    """
+
+    heading: np.ndarray
+    following: np.ndarray
+    side: np.ndarray
+    hit: np.ndarray
+    beyond: np.ndarray
+    gap: np.ndarray
+    lost: np.ndarray
+    way: np.ndarray
+    mark: np.ndarray
+    marked: np.ndarray
+    anchor: np.ndarray
+    waited: np.ndarray
+
+
+class BugBody(NamedTuple):
+    """What a robot knows of itself.
+
+    Attributes:
+      drive: its drive.
+      hull_radius: m.
+      target_radius: distance that counts as arrival, m.
+      sensor_range: of its rays, m.
+      control_step: s.
+    """
+
+    drive: Drive
+    hull_radius: float
+    target_radius: float
+    sensor_range: float
+    control_step: float
+
+
+# Lengths in m, chosen on the maps of benchmarks/maps and on levels of stage s6 with seed 7.
+GAP = 0.012  # between hull and outline
+AHEAD = 0.025  # ray near the nose that bars the way; a wall is then 0.017 m before the hull
+ASIDE = 0.0167  # diagonal ray whose end the hull would meet: 0.025 + 0.717 * 0.0167 = 0.037
+NEARER = 0.03  # than where the line was left, for going on along it
+ROUND = 0.03  # from the mark, and within a right angle of its heading, is there again
+LOST = 0.33  # a full circle of the arc that seeks the outline, 2 pi (0.037 + 0.012) = 0.31
+STILL, STUCK = 0.02, 3.0  # m, s: has come nowhere
+SPEED, CORNER_SPEED = 0.11, 0.08  # m/s, along an outline and round its corners
+TURN = 2.5  # rad/s, on the spot
+BY_ANGLE, BY_GAP = 4.0, 60.0  # rad/s for each rad, and for each m
+
+
+def start(seen: np.ndarray) -> BugMemory:
+    """Lets robots begin: the line leads from here to the target.
+
+    Args:
+      seen: [..., O] observations.
+
+    Returns:
+      The memory.
+    """
+    distance, bearing = (seen[..., i].astype(float) for i in _TARGET)
+    zero = np.zeros_like(distance)
+    here = np.stack([-distance, zero], axis=-1)
+    return BugMemory(
+        heading=-bearing,
+        following=zero.astype(bool),
+        side=zero + 1.0,
+        hit=distance,
+        beyond=zero,
+        gap=zero + GAP,
+        lost=zero,
+        way=zero,
+        mark=np.concatenate([here, zero[..., None]], axis=-1),
+        marked=zero,
+        anchor=here,
+        waited=zero,
+    )
+
+
+def sense(seen: np.ndarray, side: np.ndarray) -> Senses:
+    """Names what is observed, seen from the side of the outline.
+
+    Args:
+      seen: [..., O] observations, metric.
+      side: [...] 1.0 with the outline on the left, -1.0 on the right.
+
+    Returns:
+      The senses; the bearing stays as observed.
+    """
+    seen = seen.astype(float)
+    left, right = seen[..., _LEFT], seen[..., _RIGHT]
+    rays = np.where(side[..., None] > 0.0, left, right)
+    return Senses(*np.moveaxis(rays, -1, 0), *np.moveaxis(seen[..., _TARGET], -1, 0))
+
+
+def locate(heading: np.ndarray, senses: Senses) -> np.ndarray:
+    """Returns places [..., 2], m: along the line, where the target is 0, and to its left."""
+    toward = heading + senses.bearing
+    return -senses.distance[..., None] * np.stack([np.cos(toward), np.sin(toward)], axis=-1)
+
+
+def act(memory: BugMemory, seen: np.ndarray, body: BugBody) -> tuple[BugMemory, np.ndarray]:
+    """Takes one control step.
+
+    Args:
+      memory: [...] of the robots.
+      seen: [..., O] what they observe, metric.
+      body: what they know of themselves.
+
+    Returns:
+      The memory, and actions [..., 2] in -1..1.
+    """
+    memory = _begin_anew(memory, sense(seen, memory.side), body)
+    senses = sense(seen, memory.side)
+    memory = _choose(memory, senses, locate(memory.heading, senses))
+    gap = senses.beside - (body.hull_radius + epuck.SENSOR_POSES[2][1])
+    along = _follow(memory, senses, gap, body)
+    twist = np.where(memory.following[..., None], along, _head_for_target(senses, body))
+    there = senses.distance <= body.target_radius
+    twist = np.where(there[..., None], 0.0, twist)
+    return _remember(memory, senses, gap, twist, body), _action(twist, body.drive)
+
+
+def _begin_anew(memory: BugMemory, senses: Senses, body: BugBody) -> BugMemory:
+    """Rules 2 and 3: where the outline makes no sense, the line starts here."""
+    place = locate(memory.heading, senses)
+    near = np.linalg.norm(place - memory.mark[..., :2], axis=-1) < ROUND
+    back = near & (np.cos(memory.heading - memory.mark[..., 2]) > 0.0)
+    is_round = memory.following & back & (memory.way - memory.marked > LOST)
+    is_lost = memory.following & (memory.lost > LOST)
+    stuck = memory.waited > STUCK
+    anew = is_round | is_lost | stuck
+    here = np.stack([-senses.distance, np.zeros_like(senses.distance)], axis=-1)
+    return memory._replace(
+        heading=np.where(anew, -senses.bearing, memory.heading),
+        following=memory.following & ~anew,
+        side=np.where(is_round | stuck, -memory.side, np.where(is_lost, 1.0, memory.side)),
+        beyond=np.where(anew, 0.0, memory.beyond),
+        anchor=np.where(anew[..., None], here, memory.anchor),
+        waited=np.where(anew, 0.0, memory.waited),
+    )
+
+
+def _choose(memory: BugMemory, senses: Senses, place: np.ndarray) -> BugMemory:
+    """Leaves the line where something bars it, and the outline where it meets the line again."""
+    ahead = np.minimum(senses.nose, senses.other_nose) < AHEAD
+    aside = np.minimum(senses.diagonal, senses.other_diagonal) < ASIDE
+    hits = ~memory.following & (ahead | aside) & (np.abs(senses.bearing) < math.pi / 4)
+    beside = place[..., 1]
+    meets = beside * memory.beyond <= 0.0
+    leaves = memory.following & meets & (senses.distance < memory.hit - NEARER)
+    way = np.where(hits, 0.0, memory.way)
+    # The mark moves on each time that the way has doubled (Brent 1980): whatever the robot comes
+    # to go round, be it not what it met on the line, it then knows.
+    marks = hits | (way > 2.0 * np.maximum(memory.marked, LOST))
+    pose = np.concatenate([place, memory.heading[..., None]], axis=-1)
+    return memory._replace(
+        following=(memory.following | hits) & ~leaves,
+        side=np.where(leaves, 1.0, memory.side),
+        hit=np.where(hits, senses.distance, memory.hit),
+        beyond=beside,
+        lost=np.where(hits, 0.0, memory.lost),
+        way=way,
+        mark=np.where(marks[..., None], pose, memory.mark),
+        marked=np.where(marks, way, memory.marked),
+    )
+
+
+def _head_for_target(senses: Senses, body: BugBody) -> np.ndarray:
+    """Twists [..., 2] straight to the target, as the baseline that does nothing else."""
+    off = np.abs(senses.bearing)
+    speed = body.drive.max_speed * np.clip(1.0 - off, 0.0, 1.0)
+    limit = body.drive.max_turn_rate
+    return np.stack([speed, np.clip(2.0 * limit * senses.bearing, -limit, limit)], axis=-1)
+
+
+def _follow(memory: BugMemory, senses: Senses, gap: np.ndarray, body: BugBody) -> np.ndarray:
+    """Twists [..., 2] along the outline: m/s, and rad/s with left positive."""
+    near = 0.99 * body.sensor_range
+    other = senses.other_beside - (senses.beside - gap)
+    wanted = np.minimum(GAP, 0.5 * (gap + other))
+    turn = BY_ANGLE * _angle(memory, senses, gap, body) + BY_GAP * (gap - wanted)
+    # Only the diagonal ray: where it would end along a wall at the wanted gap.
+    _, y, yaw = epuck.SENSOR_POSES[6]
+    expected = (body.hull_radius + GAP - y) / math.sin(yaw)
+    turn = np.where(senses.beside < near, turn, BY_GAP * (senses.diagonal - expected))
+    speed = np.full_like(turn, SPEED)
+    unseen = np.minimum(senses.beside, senses.diagonal) >= near
+    turn = np.where(unseen, CORNER_SPEED / (body.hull_radius + GAP), np.clip(turn, -TURN, TURN))
+    speed = np.where(unseen, CORNER_SPEED, speed)
+    nose = np.minimum(senses.nose, senses.other_nose)
+    turn, speed = (np.where(unseen & (nose < near), x, y) for x, y in ((-1.5, turn), (0.04, speed)))
+    aside = np.minimum(senses.diagonal, senses.other_diagonal)
+    barred = (nose < AHEAD) | (aside < ASIDE)
+    turn, speed = np.where(barred, -TURN, turn), np.where(barred, 0.0, speed)
+    most = body.drive.max_wheel_speed * body.drive.wheel_radius - 0.5 * body.drive.track * np.abs(
+        turn
+    )
+    return np.stack([np.minimum(speed, most), memory.side * turn], axis=-1)
+
+
+def _angle(memory: BugMemory, senses: Senses, gap: np.ndarray, body: BugBody) -> np.ndarray:
+    """Direction of the outline from the nose, rad; away from the robot is positive.
+
+    From the ends of two rays where both are sensed, else from how fast the gap grows.
+    """
+    x, y, yaw = epuck.SENSOR_POSES[6]
+    ahead = x + senses.diagonal * math.cos(yaw)
+    rise = y + senses.diagonal * math.sin(yaw) - (gap + body.hull_radius)
+    both = senses.diagonal < 0.99 * body.sensor_range
+    grows = (gap - memory.gap) / (SPEED * body.control_step)
+    return np.where(both, np.arctan2(rise, ahead), np.arcsin(np.clip(grows, -0.7, 0.7)))
+
+
+def _remember(
+    memory: BugMemory, senses: Senses, gap: np.ndarray, twist: np.ndarray, body: BugBody
+) -> BugMemory:
+    """Integrates what the wheels make of the twist, over this control step."""
+    drive, step = body.drive, body.control_step
+    wheels = sim_drive.wheel_speeds(twist, drive, np)
+    moved = sim_drive.body_velocity(wheels, drive.wheel_radius, drive.track, np) * step
+    near = 0.99 * body.sensor_range
+    rays = (senses.nose, senses.diagonal, senses.beside, senses.behind)
+    sensed = np.minimum.reduce(rays) < near
+    place = locate(memory.heading, senses)
+    away = np.linalg.norm(place - memory.anchor, axis=-1) > STILL
+    rests = away | (senses.distance <= body.target_radius)
+    return memory._replace(
+        heading=memory.heading + moved[..., 1],
+        gap=gap,
+        lost=np.where(sensed, 0.0, memory.lost + moved[..., 0]),
+        way=memory.way + moved[..., 0],
+        anchor=np.where(away[..., None], place, memory.anchor),
+        waited=np.where(rests, 0.0, memory.waited + step),
+    )
+
+
+def _action(twist: np.ndarray, drive: Drive) -> np.ndarray:
+    """Actions [..., 2] in -1..1 that command twists [..., 2]."""
+    speed = 2.0 * twist[..., 0] / drive.max_speed - 1.0
+    return np.stack([speed, twist[..., 1] / drive.max_turn_rate], axis=-1)
+
+
+@dataclass(frozen=True)
+class Bug2:
+    """The controller of `engine_c.simulate`."""
+
+    body: BugBody
+
+    def init(self, arenas: Arenas) -> BugMemory:
+        """Returns the memory [A, R] of robots that start."""
+        return start(arenas.observation)
+
+    def act(self, memory: BugMemory, arenas: Arenas) -> tuple[BugMemory, np.ndarray]:
+        """Takes one control step; of the arenas it reads the observations alone."""
+        return act(memory, arenas.observation, self.body)
+
+
+def load(judge: Judge) -> Bug2:
+    """Makes the controller of a judge's robots, which know their own numbers."""
+    task, robot = judge.config.task, judge.config.robot
+    body = BugBody(
+        drive=judge.drive,
+        hull_radius=robot.hull_radius,
+        target_radius=task.target_radius,
+        sensor_range=task.sensor_range,
+        control_step=task.control_step,
+    )
+    return Bug2(body)

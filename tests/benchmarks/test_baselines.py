@@ -1,0 +1,76 @@
+"""What the command of the baselines takes, refuses and prints."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import baselines
+from swarmjax import exit_codes, policy, policy_file
+from swarmjax.command import run
+from swarmjax.config import ConfigError
+from swarmjax.evaluate.config import EvaluateConfig
+
+
+def test_a_line_says_who_where_and_what_came_of_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert baselines.main(["stage=s1", "episodes=3", "who=still,straight", "workers=1"]) == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [(line["who"], line["cell"], line["episodes"]) for line in lines] == [
+        ("still", "s1", 3),
+        ("straight", "s1", 3),
+    ]
+    reached = [line["measures"]["targets_reached"] for line in lines]
+    assert [each["mean"] for each in reached] == [0.0, 1.0]
+    assert {"cvar", "iqm"} <= reached[0].keys()
+    assert {"device", "versions", "commit", "digest"} <= lines[0].keys()
+
+
+@pytest.mark.parametrize(
+    ("bearing", "action"), [(0.0, [1.0, 0.0]), (0.3, [0.4, 0.6]), (-0.25, [0.5, -0.5])]
+)
+def test_straight_steers_at_its_target_whatever_the_infrared_says(
+    tmp_path: Path, bearing: float, action: list[float]
+) -> None:
+    """Full speed and twice the bearing as a turn, slower the further the target is off the nose."""
+    baselines.write(tmp_path / "policy.npz", *baselines.POLICIES["straight"])
+    straight = policy_file.read(str(tmp_path / "policy.npz"))
+    for ray in (0.0, 0.04):
+        seen = np.array([[*[ray] * 8, 0.5, bearing]], np.float32)
+        assert policy.act(straight, seen)[0] == pytest.approx(action)
+
+
+def test_whatever_it_is_split_into_a_cell_comes_to_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    words = ["stage=s2", "episodes=3", "workers=1"]
+    (whole,) = baselines.results(["bug2"], words)
+    monkeypatch.setattr(baselines, "BATCH", 1)
+    (parts,) = baselines.results(["bug2"], words)
+    assert parts["measures"] == whole["measures"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["who=straight,bug3"], "who is 'bug3': give some of straight, still, bug2, orca"),
+        (["engine=mjx"], "engine cannot be given for baselines"),
+        (["policy=a.npz"], "policy cannot be given for baselines"),
+        (["stage=nowhere"], "nowhere"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_a_sentence(words: list[str], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        baselines.main(words)
+
+
+def test_a_missing_package_ends_the_command_with_code_2(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "navground.core", None)
+    monkeypatch.setattr("sys.argv", ["baselines", "stage=s1", "who=hl"])
+    assert run("baselines", baselines.main, EvaluateConfig) == exit_codes.USER_ERROR
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "install the extra navground" in said
