@@ -204,7 +204,7 @@ def _line(
 ) -> dict[str, Any]:
     """Puts what a baseline came to on a cell into plain data for JSON."""
     step, mine = settings.task.control_step, trials.specialise(settings, cell, settings.policy)
-    found = measures.per_level(outcome, step, settings.steps)
+    found = measures.per_level(outcome, step, mine.step_limit)
     packages = ("navground", "scipy") if who in planners.SETTINGS else ()
     return {
         "benchmark": "baselines",
@@ -220,7 +220,7 @@ def _line(
         "measures": summary.summarize({name: table[None] for name, table in found.items()}),
         "robot": to_dict(settings.robot),
         "task": to_dict(settings.task),
-        "steps": settings.steps,
+        "steps": mine.step_limit,
         "substeps": evaluate_judge.substeps(settings),
         "device": f"CPU {platform.machine()}, {words.count(provenance.cores(), 'core')}",
         "versions": peers.versions(*packages),
