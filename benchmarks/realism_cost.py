@@ -26,7 +26,8 @@ PAIRS = 10
 CALL_SECONDS = 0.5  # of the ideal program, about
 THREADS = 8  # programs that are compiled side by side
 PRESETS = ("real", "webots")
-_NO_FACTOR = ("name", "infrared", "stall_time")
+# `real` leaves hulls smooth: friction is another program, not a number that is drawn.
+_NO_FACTOR = ("name", "infrared", "stall_time", "hull_friction")
 
 
 def arms() -> dict[str, RealismConfig]:

@@ -96,7 +96,10 @@ class LevelDrawing(Piece):
     """A way of drawing levels: `(swarmjax.task.level.Level, key) -> Level`, of one arena."""
 
     kind: ClassVar[str] = "level"
-    taken: ClassVar[tuple[str, ...]] = ("random", "fixed", "map")
+    taken: ClassVar[tuple[str, ...]] = (
+        *("random", "fixed", "map"),
+        *("trap", "fence", "bay", "row", "door", "maze", "circle", "crowd"),
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

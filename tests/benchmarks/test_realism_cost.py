@@ -8,7 +8,8 @@ from benchmarks import realism_cost
 from swarmjax.config import ConfigError
 from swarmjax.sim.realism_config import COUNTED, RealismConfig
 
-NAMES = {item.name for item in dataclasses.fields(RealismConfig)} - {"name", "stall_time"}
+NO_FACTOR = {"name", "stall_time", "hull_friction"}  # of `real`
+NAMES = {item.name for item in dataclasses.fields(RealismConfig)} - NO_FACTOR
 
 
 def test_arms_are_the_presets_and_each_factor_alone() -> None:

@@ -22,13 +22,14 @@ from swarmjax.exit_codes import INTERRUPTED, USER_ERROR
 
 # Judges, and sends itself a signal when the first cell has been written.
 STOPPED = """
-import os, sys
+import os, signal, sys
 from swarmjax.evaluate import __main__, unfinished
 write = unfinished.write
 def write_and_stop(*arguments):
     write(*arguments)
     os.kill(os.getpid(), int(sys.argv[1]))
 unfinished.write = write_and_stop
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's `&` has it ignored
 sys.exit(__main__.main(sys.argv[2:]))
 """
 

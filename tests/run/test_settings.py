@@ -85,7 +85,7 @@ def test_independent_policies_have_one_learner_a_robot():
 def test_evaluate_defaults():
     evaluate = load_levels(EvaluateConfig, ["policy=p.npz"])
     assert evaluate == EvaluateConfig(policy="p.npz", stage=load_train(["stage=s6"]).stage[0])
-    assert (evaluate.steps, evaluate.episodes, evaluate.seed) == (1500, 1000, 1)
+    assert (evaluate.step_limit, evaluate.episodes, evaluate.seed) == (1500, 1000, 1)
 
 
 def test_export_defaults():
@@ -160,7 +160,8 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage.sequence=[curriculum]"], "stage.sequence names curriculum, a curriculum itself: "
          "give single stages."),
         (["stage=s3", "stage.sequence=[s1]"], "stage.sequence is not a key: give one of name, "
-         "robots, side, obstacles, obstacle_size, level, layout, map, cell."),
+         "robots, side, obstacles, obstacle_size, level, layout, map, cell, breadth, gap, width, "
+         "depth, length, radius, apart, cells."),
         (["stage=s3", "stage.name=s4"], "stage.name is 's4' in s3.yaml: give the file's name."),
         (["stage=s3", "stage.layout=fence"], "stage.layout is fence, but level is random: give "
          "level=fixed."),

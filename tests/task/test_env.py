@@ -512,7 +512,9 @@ def test_a_restarted_arena_has_the_robots_of_its_new_episode(real: Drawn) -> Non
     np.testing.assert_array_equal(after.cohort, new)  # that of the waiting ones is 1
     seeds, world = np.asarray(after.level.seed), real.world
     expected = task_factors.draw(seeds, world.realism, world.robot, 3, 1, np)
-    for found, mine in zip(after.factors, expected, strict=True):
+    for name, found, mine in zip(expected._fields, after.factors, expected, strict=True):
+        if name == "hull_friction":  # `real` leaves hulls smooth
+            continue
         assert found is not None
         assert mine is not None
         # The rounding of low + u * (high - low), and of log and cos.

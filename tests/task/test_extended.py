@@ -21,7 +21,7 @@ from swarmjax.task import stage as task_stage
 from swarmjax.task.arrival import Arrival
 from swarmjax.task.config import RewardConfig, TaskConfig
 from swarmjax.task.env import World
-from swarmjax.task.stage_config import StageConfig
+from swarmjax.task.stage_config import BUILT_IN, StageConfig
 
 RING = StageConfig(name="ring", robots=3, side=1.0, level="ring")
 SIM = SimConfig(impl="jax", max_robots=4, max_obstacles=1)
@@ -155,8 +155,8 @@ def test_what_the_task_names_and_nobody_defines_is_refused() -> None:
 
 def test_a_way_of_drawing_that_is_missing_is_refused() -> None:
     assert refusal(partial(env.load, sim=SIM), (RING,)) == (
-        "stage ring: level is 'ring': give one of random, fixed, map, or extensions=FILE, a file "
-        "that defines it."
+        f"stage ring: level is 'ring': give one of {', '.join(BUILT_IN)}, or extensions=FILE, a "
+        "file that defines it."
     )
 
 
