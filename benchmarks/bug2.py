@@ -113,7 +113,7 @@ class BugBody(NamedTuple):
     control_step: float
 
 
-# Lengths in m, chosen on the maps of benchmarks/maps and on levels of stage s6 with seed 7.
+# Lengths in m, chosen on benchmarks/maps, fence2, and levels of s6 and crowd_dense with seed 7.
 GAP = 0.012  # between hull and outline
 AHEAD = 0.025  # ray near the nose that bars the way; a wall is then 0.017 m before the hull
 ASIDE = 0.0167  # diagonal ray whose end the hull would meet: 0.025 + 0.717 * 0.0167 = 0.037
