@@ -121,8 +121,8 @@ def test_crowds_push_each_other_apart_as_in_c(
     assert _off(_places(found), _places(expected)) <= 2.0 * seen[1]
 
 
-# Likewise with friction. In the tightest jam sweeps come to rest more slowly, and MJX's Newton method
-# by Warp is nearer: to be as near would take a tolerance of 1e-7, which float32 seldom meets.
+# Likewise with friction. In the tightest jam sweeps come to rest more slowly, and MJX's Newton
+# method by Warp is nearer: to be as near would take a tolerance of 1e-7, seldom met in float32.
 RUBBING = {
     ("jax", "swarm", 0.16): (8.9e-5, 3.0e-5),
     ("warp", "swarm", 0.16): (1.2e-4, 2.8e-5),
