@@ -690,6 +690,19 @@ def test_friction_leaves_the_push_of_a_blocked_robot_as_it_is(tmp_path: Path) ->
 
 
 @BODIES
+def test_each_episode_has_the_friction_that_was_drawn(tmp_path: Path, body: BodyName) -> None:
+    robot, realism = RobotConfig(body=body), RealismConfig(hull_friction=(0.2, 0.6))
+    judge = _judge(tmp_path, _stage(), AHEAD, robot=robot, realism=realism)
+    levels = [engine_c.draw_level(judge.stage, judge.spacing, 3, episode) for episode in range(2)]
+    arenas = engine_c.start(judge, levels)
+    drawn = arenas.factors.hull_friction
+    assert drawn is not None
+    assert drawn[0] != drawn[1]
+    for mine, expected in zip(arenas.model, drawn, strict=True):
+        np.testing.assert_array_equal(mine.pair_friction[judge.ids.robots.hulls, :2], expected)
+
+
+@BODIES
 def test_impulses_are_of_normal_forces(tmp_path: Path, body: BodyName) -> None:
     robot = RobotConfig(body=body, hull_friction=0.5)
     judge = _judge(tmp_path, _stage(robots=4, obstacles=1), CURVE, robot=robot)

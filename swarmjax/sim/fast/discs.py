@@ -35,9 +35,6 @@ from swarmjax.sim.geometry import CONTACT_HEIGHT
 
 # Share of the largest force by which any may still change; float32 rounds at 1e-7.
 TOLERANCE = 1e-6
-# Likewise where hulls rub, and forces come to rest more slowly: with 1e-6 the tightest jam of
-# tests/sim/test_solver.py was 9e-5 off, with 1e-7 it is 7e-6 off.
-RUBBING_TOLERANCE = 1e-7
 # A centre that is deeper within a box than it is below its top or above its bottom, m, is pushed
 # up or down by MuJoCo, where no joint gives way.
 DEEPEST = min(CONTACT_HEIGHT, 2.0 * sim_model.HALF_HEIGHT - CONTACT_HEIGHT)

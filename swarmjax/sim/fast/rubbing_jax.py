@@ -20,7 +20,7 @@ from jax import Array
 
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.fast import planar_jax
-from swarmjax.sim.fast.discs import RUBBING_TOLERANCE, DiscRobots, Discs, Rubbing, spring
+from swarmjax.sim.fast.discs import TOLERANCE, DiscRobots, Discs, Rubbing, spring
 from swarmjax.sim.fast.planar_jax import Contact, DiscGap
 
 
@@ -82,7 +82,7 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
         done, force, motion, _ = carry
         changed, motion = _sweep(discs, touch, robots, motion, force)
         change = jnp.max(jnp.stack([jnp.abs(a - b) for a, b in zip(changed, force, strict=True)]))
-        return done + 1, changed, motion, change > RUBBING_TOLERANCE * jnp.max(changed.push)
+        return done + 1, changed, motion, change > TOLERANCE * jnp.max(changed.push)
 
     def goes_on(carry: tuple[Array, Force, PlaneMotion, Array]) -> Array:
         done, _, _, moves = carry
@@ -167,6 +167,8 @@ def _sweep(
         more = Force(best.push - now.push, best.rub - now.rub)
         kick = _kick(one, robots, more)
         motion = PlaneMotion(*(a + b for a, b in zip(motion, kick, strict=True)))
+        # Or XLA works what both forces come from out anew for each number that they change.
+        best, motion = jax.lax.optimization_barrier((best, motion))
         found.append(best)
     return Force(*map(jnp.stack, zip(*found, strict=True))), motion
 

@@ -15,9 +15,9 @@ from swarmjax.sim import model as sim_model
 from swarmjax.sim.engine import ROWS_PER_ROBOT
 from swarmjax.sim.fast import discs as sim_discs
 from swarmjax.sim.fast import planar_warp
-from swarmjax.sim.fast.discs import RUBBING_TOLERANCE, DiscRobots, Discs
+from swarmjax.sim.fast.discs import TOLERANCE, DiscRobots, Discs
 
-_TOLERANCE = wp.constant(RUBBING_TOLERANCE)
+_TOLERANCE = wp.constant(TOLERANCE)
 _WALLS = wp.constant(sim_model.WALLS)
 
 
