@@ -118,7 +118,7 @@ def _is_beyond(trained: object, far: object) -> bool:
     return not low <= far <= high
 
 
-def test_a_level_of_a_suite_is_judged_by_the_device_too(tmp_path: Path) -> None:
+def test_the_largest_half_edges_of_a_cell_bound_those_of_its_first_level() -> None:
     (cell,) = [each for each in read_suite("worlds").cells if each.name == "door"]
     drawn = cells.draw_cell(cell)
     assert drawn.largest_half.shape == (cell.stage.obstacles, 2)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax.task.layouts.site import MARGIN_UNITS, ArenaLayout, Demand, Drawn, Site, split
+from swarmjax.task.layouts.site import MARGIN_UNITS, ArenaLayout, Demand, Drawn, Site, points, split
 from swarmjax.task.placement import Gap, place, score_things
 
 Array = Any
@@ -30,26 +30,16 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     """
     count = site.present.shape[0]
     shifts, targets, starts = split(uniforms, [4, count, count])
-    area = _points(site, shifts[:2], xp)
+    low, high = site.clear - site.half, site.half - site.clear
+    area = points(low, high, shifts[:2], xp, _LATTICE)
     touching = 2 * site.hull + MARGIN_UNITS // 2
     apart = Gap(touching, site.numbers.apart)
     target, _ = place(area, 0 * area[:, 0], targets, site.present, apart, xp)
-    area = _points(site, shifts[2:], xp)
+    area = points(low, high, shifts[2:], xp, _LATTICE)
     outside = site.reach + MARGIN_UNITS // 4
     score = score_things(area, target, site.present, Gap(outside, outside), xp)
     start, _ = place(area, score, starts, site.present, Gap(touching, touching), xp)
     return Drawn(xp.zeros((0, 4), xp.int32), np.zeros(0, bool), start, target)
-
-
-def _points(site: Site, shift: Array, xp: Any) -> Array:
-    """Points [P, 2] that cover where robots have room, units."""
-    extent = 2 * (site.half - site.clear)
-    offset = xp.floor(shift * extent.astype(xp.float32)).astype(xp.int32)
-    steps = np.arange(_LATTICE, dtype=np.int32)[:, None]
-    axes = site.clear - site.half + (steps * extent + offset) // _LATTICE
-    x = xp.broadcast_to(axes[:, None, 0], (_LATTICE, _LATTICE))
-    y = xp.broadcast_to(axes[None, :, 1], (_LATTICE, _LATTICE))
-    return xp.stack([x.reshape(-1), y.reshape(-1)], axis=-1)
 
 
 def _least(demand: Demand) -> tuple[float, float]:

@@ -25,15 +25,6 @@ _ASIDE = 0.1  # of half the arena, by which the door stands off its middle
 _JAMB = 0.10  # m, of wall on either side of the door
 
 
-class _Flow:
-    """Which robots go right, and which left."""
-
-    def __init__(self, present: Array) -> None:
-        """Lets every other robot go right."""
-        right = np.arange(present.shape[0]) % 2 == 0
-        self.right, self.left = present & right, present & ~right
-
-
 def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     """Draws a wall across the arena with a door in it.
 
@@ -56,8 +47,8 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     halls = [_hall(site, where, side, shifts, xp) for side in (-1, 1)]
     away = beyond(site.numbers.apart)
     middle = xp.stack([where, door])[None]
-    flow = _Flow(site.present)
-    going = (flow.right, flow.left)
+    right = np.arange(count) % 2 == 0
+    going = (site.present & right, site.present & ~right)
     target = 0
     for hall, there in zip(reversed(halls), going, strict=True):
         score = score_things(hall[0], middle, np.ones(1, bool), away, xp)

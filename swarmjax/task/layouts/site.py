@@ -137,7 +137,9 @@ def between(low: Array, high: Array) -> tuple[Array, Array]:
     return (low + high) // 2, (high - low + 1) // 2
 
 
-def points(low: Sequence[Array], high: Sequence[Array], shift: Array, xp: Any) -> Array:
+def points(
+    low: Sequence[Array], high: Sequence[Array], shift: Array, xp: Any, count: int = LATTICE
+) -> Array:
     """Spreads points evenly over a rectangle, shifted by a part of their spacing.
 
     Args:
@@ -145,18 +147,19 @@ def points(low: Sequence[Array], high: Sequence[Array], shift: Array, xp: Any) -
       high: its corner with the largest.
       shift: [2] in [0, 1), of the spacing.
       xp: `numpy` or `jax.numpy`.
+      count: points along either edge.
 
     Returns:
-      [LATTICE**2, 2] int32, units.
+      [count**2, 2] int32, units.
     """
-    steps = np.arange(LATTICE, dtype=np.int32)
+    steps = np.arange(count, dtype=np.int32)
     axes = []
     for axis in range(2):
         extent = xp.maximum(xp.asarray(high[axis] - low[axis], xp.int32), 0)
         offset = xp.floor(shift[axis] * extent.astype(xp.float32)).astype(xp.int32)
-        axes.append(low[axis] + (steps * extent + offset) // LATTICE)
-    x = xp.broadcast_to(axes[0][:, None], (LATTICE, LATTICE))
-    y = xp.broadcast_to(axes[1][None, :], (LATTICE, LATTICE))
+        axes.append(low[axis] + (steps * extent + offset) // count)
+    x = xp.broadcast_to(axes[0][:, None], (count, count))
+    y = xp.broadcast_to(axes[1][None, :], (count, count))
     return xp.stack([x.reshape(-1), y.reshape(-1)], axis=-1)
 
 
