@@ -218,7 +218,7 @@ def _line(
         "seed": cell.seed,
         "digest": cell.digest,
         "measures": summary.summarize({name: table[None] for name, table in found.items()}),
-        "robot": to_dict(settings.robot),
+        "robot": to_dict(mine.robot),
         "task": to_dict(settings.task),
         "steps": mine.step_limit,
         "substeps": evaluate_judge.substeps(settings),

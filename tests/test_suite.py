@@ -80,6 +80,19 @@ def test_step_limits_are_listed(
     assert [row[column] for row in rows] == ["-", "2345"]
 
 
+def test_a_friction_of_hulls_is_listed_and_refused_as_that_of_a_robot(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file.write_text(f"{TEXT}    hull_friction: 0.7\n")
+    assert _command(monkeypatch, f"suite={file}", "write=true") == 0
+    head, *rows = (line.split() for line in capsys.readouterr().out.splitlines())
+    column = head.index("friction") + 1
+    assert [row[column] for row in rows] == ["-", "0.7"]
+    file.write_text(f"{TEXT}    hull_friction: 0.01\n")
+    assert _command(monkeypatch, f"suite={file}") == 2
+    assert "hull_friction is 0.01" in capsys.readouterr().err
+
+
 def test_the_levels_that_policies_fail_most_are_chosen() -> None:
     found: dict[str, Any] = {
         "targets_reached": [[1.0, 0.5, 0.5, 0.5, 0.0], [1.0, 0.5, 0.5, 0.5, 1.0]],

@@ -27,6 +27,7 @@ from swarmjax.task.shapes import Shape
 from swarmjax.task.stage_config import StageConfig
 
 FORMAT = 1
+_NEWER = ("steps", "hull_friction")  # keys of a cell that files of the first version lack
 _TARGET_RADIUS = TaskConfig().target_radius
 _LARGEST_HALF = 2.5  # m, of a box: longer than half the largest arena
 MAX_BYTES = 2**30  # of all levels of a file; those of a thousand of s6 take 0.2 MB
@@ -46,6 +47,7 @@ class Cell(NamedTuple):
         episodes: [E] their numbers.
         levels: [E], obstacles as the boxes that they are put together of.
         steps: Control steps of an episode, or None for those of the command.
+        hull_friction: Of the robots, or None for that of the command.
     """
 
     name: str
@@ -56,6 +58,7 @@ class Cell(NamedTuple):
     episodes: np.ndarray
     levels: Level
     steps: int | None = None
+    hull_friction: float | None = None
 
     @property
     def digest(self) -> str:
@@ -166,7 +169,7 @@ def draw_cell(cell: CellConfig) -> Cell:
     levels = _draw(cell.stage, cell.shape, cell.seed, numbers, radii)
     episodes = np.array(numbers)
     about = (cell.name, cell.stage, cell.shape, cell.realism, cell.seed)
-    return Cell(*about, episodes, levels, cell.steps)
+    return Cell(*about, episodes, levels, cell.steps, cell.hull_friction)
 
 
 def _draw(
@@ -219,8 +222,8 @@ def write(path: Path, suite: Suite) -> None:
     keys = ("name", "shape", "realism", "seed", "digest")
     about = [
         {"stage": to_dict(cell.stage), **{key: getattr(cell, key) for key in keys}}
-        # A file that needs no steps is one that older versions read.
-        | ({} if cell.steps is None else {"steps": cell.steps})
+        # A file that needs none of these is one that older versions read.
+        | {key: value for key in _NEWER if (value := getattr(cell, key)) is not None}
         for cell in suite.cells
     ]
     meta = json.dumps({"format": FORMAT, "suite": suite.name, "cells": about})
@@ -327,7 +330,7 @@ def _parse_cell(about: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Cell
     levels = Level(**fields)
     _check_levels(name, levels, cell.stage)
     about_it = (name, cell.stage, cell.shape, cell.realism, cell.seed)
-    found = Cell(*about_it, episodes, levels, cell.steps)
+    found = Cell(*about_it, episodes, levels, cell.steps, cell.hull_friction)
     _check_digest(found, cell.digest, "the file")
     return found
 

@@ -8,6 +8,7 @@ from typing import Any, Literal
 from swarmjax.config import ConfigError, Section, about, build, files, show
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate.config import MOST_STEPS
+from swarmjax.sim.config import MOST_HULL_FRICTION, RobotConfig
 from swarmjax.task import stage_files
 from swarmjax.task.shapes import Shape
 from swarmjax.task.stage_config import StageConfig, complete
@@ -36,6 +37,10 @@ class CellConfig(Section):
         default=None,
         metadata=about("control steps of an episode; null: those of the command", 1, MOST_STEPS),
     )
+    hull_friction: float | None = field(
+        default=None,
+        metadata=about("of the robots; null: that of the command", 0.0, MOST_HULL_FRICTION),
+    )
     shape: Shape = field(default="box", metadata=about("of the obstacles"))
     digest: str | None = field(
         default=None, metadata=about("SHA-256 of the levels; null: not drawn yet")
@@ -50,6 +55,8 @@ class CellConfig(Section):
             )
         if len(set(self.episodes)) != len(self.episodes):
             raise ConfigError("episodes holds a number twice: give each once.")
+        if self.hull_friction is not None:
+            build(RobotConfig, {"hull_friction": self.hull_friction})  # has a least one, too
         if self.digest is not None and not re.fullmatch(r"[0-9a-f]{64}", self.digest):
             raise ConfigError(f"digest is {show(self.digest)}: give 64 hexadecimal digits.")
         if self.shape != "box" and self.stage.level == "fixed":

@@ -105,6 +105,7 @@ def about_cell(config: EvaluateConfig, trial: Trial) -> dict[str, Any]:
         "stage": to_dict(cell.stage),
         "shape": cell.shape,
         "realism": to_dict(mine.realism),
+        "hull_friction": mine.robot.hull_friction,
         "episodes": len(cell.episodes),
         "steps": mine.step_limit,
         "seed": cell.seed,

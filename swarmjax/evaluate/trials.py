@@ -137,8 +137,8 @@ def specialise(config: EvaluateConfig, cell: Cell, path: str | None = None) -> E
 
     Args:
         config: Of the evaluation.
-        cell: Its stage, shape and seed are taken, its realism if it has one, and its step limit if
-            it has one and the configuration has none.
+        cell: Its stage, shape and seed are taken, its realism and friction of hulls if it has them,
+            and its step limit if it has one and the configuration has none.
         path: Of the policy.
 
     Returns:
@@ -147,8 +147,12 @@ def specialise(config: EvaluateConfig, cell: Cell, path: str | None = None) -> E
     realism = config.realism
     if cell.realism is not None:
         realism = build(RealismConfig, files.read_preset("realism", cell.realism))
+    robot = config.robot
+    if cell.hull_friction is not None:
+        robot = replace(robot, hull_friction=cell.hull_friction)
     return replace(
         config,
+        robot=robot,
         policy=path or config.policy,
         compare=None if path else config.compare,
         suite=None,
