@@ -16,6 +16,7 @@ _MODE_OPTIONS: dict[str, tuple[tuple[str, ...], float | str | None]] = {
     "earlier_share": (("mixed",), 0.2),
     "score": (("adaptive",), "learnability"),
     "floor": (("adaptive",), 0.1),
+    "shares": (("adaptive",), "arenas"),
     "optimizer": (_STEPWISE, "keep"),
     "normalizer": (_STEPWISE, "keep"),
     "exploration": (_STEPWISE, "keep"),
@@ -82,6 +83,13 @@ class CurriculumConfig(Section):
             "share of the arenas spread evenly over all stages; null: 0.1 [adaptive]",
             above=0.0,
             high=1.0,
+        ),
+    )
+    shares: Literal["arenas", "robots"] | None = field(
+        default=None,
+        metadata=about(
+            "what is shared out; robots: a stage of many robots gets fewer arenas, so that samples "
+            "are shared as the weights say; null: arenas [adaptive]"
         ),
     )
     optimizer: Literal["keep", "reset"] = field(

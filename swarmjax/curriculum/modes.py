@@ -116,6 +116,8 @@ def adaptive(
     share = jnp.where(total > 0.0, found / jnp.where(total > 0.0, total, 1.0), 1.0 / stages)
     floor = jnp.asarray(schedule.floor)
     weights = floor / stages + (1.0 - floor) * share
+    if options.shares == "robots":
+        weights = _per_robot(weights, jnp.asarray(schedule.stages.robots))
     reason = jnp.where(verdict.over & jnp.any(verdict.judged), REWEIGHED, STAYED)
     return StageChoice(
         stage=jnp.full_like(curriculum.stage, stages - 1),
@@ -146,6 +148,12 @@ def _step(
         jnp.where(expired, BY_BUDGET, jnp.where(failed, BY_DEMOTION, STAYED)),
     ).astype(jnp.int32)
     return stage + (passed | expired) - (reason == BY_DEMOTION), reason
+
+
+def _per_robot(weights: Array, robots: Array) -> Array:
+    """Turns shares of robots [S] into the shares of arenas that give them."""
+    arenas = weights / robots.astype(jnp.float32)
+    return arenas / jnp.sum(arenas)
 
 
 def _learnability(record: Record) -> Array:

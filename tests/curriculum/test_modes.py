@@ -200,6 +200,16 @@ def test_adaptive_weighs_by_its_score(
     assert (int(found.stage), int(found.reason)) == (3, REWEIGHED)
 
 
+def test_shares_of_robots_give_stages_of_many_robots_fewer_arenas() -> None:
+    options = CurriculumConfig(mode="adaptive", shares="robots")
+    state = _known(_state(2, 3), [0.5, 0.5, 1.0], [0.5, 0.5, 1.0])
+    found = _choose(options, state, _schedule(3), _verdict([0.5] * 3), 3)
+    samples = np.array(found.weights) * [1, 2, 3]  # robots of the stages
+    expected = 0.1 / 3 + 0.9 * np.array([0.5, 0.5, 0.0])
+    np.testing.assert_allclose(samples / samples.sum(), expected, rtol=1e-6)
+    assert float(jnp.sum(found.weights)) == pytest.approx(1.0, abs=1e-6)
+
+
 def test_adaptive_waits_for_the_end_of_a_cohort() -> None:
     state = replace(_known(_state(1, 2), [0.5, 0.9], [0.5, 0.9]), weights=jnp.array([0.125, 0.875]))
     found = _choose(ADAPTIVE, state, _schedule(2), _verdict([0.5, 0.9], over=False), 3)
