@@ -122,9 +122,10 @@ def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
       The level; what is absent is parked outside.
     """
     drawn = _split(uniforms, spacing)
-    random = _random(drawn, stage, spacing, xp)
-    fixed = _fixed(drawn, stage, spacing, xp)
-    level = Level(*(xp.where(stage.fixed, f, r) for f, r in zip(fixed, random, strict=True)))
+    level = _fixed(drawn, stage, spacing, xp)
+    if stage.laid_out is None:  # placing takes long, and is not for what a layout replaces
+        random = _random(drawn, stage, spacing, xp)
+        level = Level(*(xp.where(stage.fixed, f, r) for f, r in zip(level, random, strict=True)))
     if stage.map is not None:
         mapped = _mapped(drawn, stage, stage.map, spacing, xp)
         choose = partial(xp.where, stage.map.mapped)

@@ -32,6 +32,8 @@ class Stage(NamedTuple):
       drawing: 1 + index of the extension's way of drawing its levels, 0 for none, int32.
       map: the maps; None if no stage has one.
       layouts: numbers of those that stages are laid out by, by kind; None if none is.
+      laid_out: whether the stage is laid out, if all are; None if any is not, so that its level is
+        placed at random, or fixed.
     """
 
     robots: Array
@@ -44,6 +46,7 @@ class Stage(NamedTuple):
     drawing: Array
     map: MapArrays | None = None
     layouts: dict[Kind, LayoutArrays] | None = None
+    laid_out: Array | None = None
 
 
 def stack(stages: Sequence[StageConfig], drawings: Sequence[LevelDrawing] = ()) -> Stage:
@@ -70,6 +73,7 @@ def stack(stages: Sequence[StageConfig], drawings: Sequence[LevelDrawing] = ()) 
         drawing=np.array([_drawing(s, names) for s in stages], np.int32),
         map=maps.stack([stage.drawn_map for stage in stages]),
         layouts=drawing.stack([stage.laid_out for stage in stages]) or None,
+        laid_out=np.ones(len(stages), bool) if all(s.laid_out for s in stages) else None,
     )
 
 
@@ -80,14 +84,15 @@ def single(stage: StageConfig, drawings: Sequence[LevelDrawing] = ()) -> Stage:
 
 def select(stages: Stage, index: Array) -> Stage:
     """Picks stages [...] by index [...] out of [S]."""
-    *fields, drawn, laid_out = stages
+    *fields, drawn, layouts, laid_out = stages
     drawn = None if drawn is None else MapArrays(*(field[index] for field in drawn))
-    if laid_out is not None:
-        laid_out = {
+    if layouts is not None:
+        layouts = {
             kind: LayoutArrays(*(field[index] for field in arrays))
-            for kind, arrays in laid_out.items()
+            for kind, arrays in layouts.items()
         }
-    return Stage(*(field[index] for field in fields), map=drawn, layouts=laid_out)
+    laid_out = None if laid_out is None else laid_out[index]
+    return Stage(*(field[index] for field in fields), drawn, layouts, laid_out)
 
 
 def largest_half(stages: Sequence[StageConfig]) -> float:
