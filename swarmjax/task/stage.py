@@ -92,7 +92,8 @@ def select(stages: Stage, index: Array) -> Stage:
             for kind, arrays in layouts.items()
         }
     laid_out = None if laid_out is None else laid_out[index]
-    return Stage(*(field[index] for field in fields), drawn, layouts, laid_out)
+    values = (field[index] for field in fields)
+    return Stage(*values, map=drawn, layouts=layouts, laid_out=laid_out)
 
 
 def largest_half(stages: Sequence[StageConfig]) -> float:
