@@ -11,10 +11,12 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 FORMAT = 2
+MEMORY_FORMAT = 4  # of a policy that remembers
 MAX_BYTES = 2**30  # of all arrays; those of two layers of 64 take 20 kB
 _MAX_LIST = 2**16  # bytes of the list of members, of which a name takes a hundred
 MAX_LETTERS = 2**20  # of `meta`, each four bytes
 MAX_ENTRIES = 2**16  # of `meta`, of which each may take a hundred bytes and more
+MEMORY = ("input/kernel", "input/bias", "recurrent/kernel", "recurrent/bias")
 _ACTIVATIONS = {
     "tanh": np.tanh,
     "relu": lambda x: np.maximum(x, 0),
@@ -40,6 +42,8 @@ class Policy(NamedTuple):
     meta: dict[str, Any]
     digest: str  # SHA-256 of all else in the file, in hexadecimal
     network: Any = None  # of format 3: normalised [..., R, O] to features
+    # of format 4: kernel [L, F, 3 H] and bias [L, 3 H] of what is seen, and of what is recalled
+    memory: tuple[np.ndarray, ...] | None = None
 
 
 def load(path: str | Path | IO[bytes]) -> Policy:
@@ -53,15 +57,18 @@ def load(path: str | Path | IO[bytes]) -> Policy:
         if sum(map(text.count, "[{,:")) > MAX_ENTRIES:
             raise ValueError(f"meta has more than {MAX_ENTRIES} entries")
         meta = json.loads(text)
-        if meta["format"] != FORMAT:
+        if meta["format"] not in (FORMAT, MEMORY_FORMAT):
             raise ValueError(f"meta.format is {json.dumps(meta['format'])[:80]}, not {FORMAT}")
         if found != digest(arrays):
             raise ValueError("digest is not that of the arrays")
+        memory = (
+            tuple(arrays.pop(f"actor/memory/{n}") for n in MEMORY) if "memory" in meta else None
+        )
         names = [*(f"hidden_{i}" for i in range((len(arrays) - 6) // 2)), "mean"]
         layers = [(arrays[f"actor/{n}/kernel"], arrays[f"actor/{n}/bias"]) for n in names]
         rest = [arrays[n] for n in ("actor/log_std", "normalizer/mean", "normalizer/std")]
         rest += [meta["policy"] == "shared", meta["observation"]["encoding"]]
-        return Policy(*[layers, *rest, *meta["action"]["high"], meta, found])
+        return Policy(*[layers, *rest, *meta["action"]["high"], meta, found], memory=memory)
     except Exception as error:  # whatever a damaged file makes zipfile, NumPy and json raise
         reason = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
         raise PolicyError(f"{path} cannot be read as a policy: {reason[:200]}.") from None
@@ -118,26 +125,74 @@ def digest(arrays: dict[str, np.ndarray]) -> str:
 
 
 def act(policy: Policy, observation: np.ndarray, normal: Any = 0.0) -> np.ndarray:
-    """Draws the action of each robot from the policy; without `normal` it is the most likely one.
+    """Draws the action of each robot; without `normal` it is the most likely one.
 
     Args:
-        policy: Of one learner for all robots, or of R or more.
+        policy: Without memory, of one learner for all robots, or of R or more.
         observation: [..., R, O] as `meta["observation"]` says: (quantity - offset) / scale.
         normal: [..., R, U] standard normal, drawn anew at each control step.
 
     Returns:
         [..., R, U] float32; -1..1 spans the commands, but it may lie beyond.
     """
+    if policy.memory is not None:
+        raise PolicyError("the policy remembers: call `begin` once an episode, and `step`.")
+    return step(policy, None, observation, normal)[1]
+
+
+def begin(policy: Policy, shape: tuple[int, ...]) -> np.ndarray | None:
+    """Returns the memory [*shape, H] of robots whose episode begins; None if there is none."""
+    return None if policy.memory is None else np.zeros((*shape, policy.memory[2].shape[1]), "f4")
+
+
+def step(
+    policy: Policy, memory: np.ndarray | None, observation: np.ndarray, normal: Any = 0.0
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """Draws actions as `act`, and remembers.
+
+    Args:
+        policy: Of one learner for all robots, or of R or more.
+        memory: [..., R, H] as `begin` or the step before returned it.
+        observation: As in `act`.
+        normal: As in `act`.
+
+    Returns:
+        The memory after, and the action.
+    """
     robots, learners = observation.shape[-2], len(policy.mean)
     if robots > learners and not policy.is_shared:
         raise PolicyError(f"{robots} robots are too many for {learners} independent policies.")
+    expected = begin(policy, observation.shape[:-1])
+    if getattr(memory, "shape", None) != getattr(expected, "shape", None):
+        found = "none" if memory is None else list(np.shape(memory))
+        wanted = "none" if expected is None else list(expected.shape)
+        raise PolicyError(f"memory is {found}: give {wanted}, as `begin` returns it.")
     mine, limit = slice(robots), policy.meta["observation"]["limit"]
     x = (observation.astype(np.float32) - policy.mean[mine]) / policy.std[mine]
     x = (policy.network or np.asarray)(np.clip(x, -limit, limit))
     *hidden, (kernel, bias) = policy.layers
     for weights, offset in hidden:
         x = _ACTIVATIONS[policy.meta["activation"]](np.vecmat(x, weights[mine]) + offset[mine])
-    return np.vecmat(x, kernel[mine]) + bias[mine] + np.exp(policy.log_std[mine]) * normal
+    if policy.memory is not None and memory is not None:
+        memory = _remember([part[mine] for part in policy.memory], memory, x)
+        x = np.concatenate([x, memory], axis=-1)
+    mean = np.vecmat(x, kernel[mine]) + bias[mine]
+    return memory, mean + np.exp(policy.log_std[mine]) * normal
+
+
+def _remember(parts: list[np.ndarray], memory: np.ndarray, features: np.ndarray) -> np.ndarray:
+    """Returns the memory after a gated recurrent unit (GRU), reset gate behind the product."""
+    seen, recalled = (
+        np.vecmat(features, parts[0]) + parts[1],
+        np.vecmat(memory, parts[2]) + parts[3],
+    )
+    (r, z, fresh), (r_, z_, old) = np.split(seen, 3, -1), np.split(recalled, 3, -1)
+    fresh = np.tanh(fresh + _logistic(r + r_) * old)
+    return fresh + _logistic(z + z_) * (memory - fresh)
+
+
+def _logistic(x: np.ndarray) -> np.ndarray:
+    return 0.5 + 0.5 * np.tanh(0.5 * x)  # 1 / (1 + exp(-x)), without overflow
 
 
 def command(policy: Policy, action: np.ndarray) -> np.ndarray:

@@ -20,7 +20,15 @@ from swarmjax import extension, policy
 from swarmjax.atomic_file import replacing
 from swarmjax.config import ConfigError
 from swarmjax.config.reading import parse_json
-from swarmjax.policy import FORMAT, MAX_BYTES, MAX_ENTRIES, MAX_LETTERS, Policy, PolicyError
+from swarmjax.policy import (
+    FORMAT,
+    MAX_BYTES,
+    MAX_ENTRIES,
+    MAX_LETTERS,
+    MEMORY_FORMAT,
+    Policy,
+    PolicyError,
+)
 from swarmjax.policy_network import PolicyNetwork
 
 ACTION_NAMES = ("speed", "turn_rate")
@@ -31,13 +39,15 @@ BODIES = ("planar", "wheeled")
 RESPONSES = ("ideal", "webots", "real")
 ARRIVALS = ("latch", "hold")
 
+_MOST_MEMORY = 1024  # numbers that a robot remembers
 NETWORK_FORMAT = 3  # of a policy whose network is code that its file does not hold
 _NETWORK = "network/"
 _DTYPE = np.dtype("<f4")
 _MOST = float(np.finfo(np.float32).max)  # numbers of `meta` are computed with in float32
 _MOST_LIMIT = 1e6  # standard deviations; beyond, sums of float32 may overflow
 _MEMBER = re.compile(
-    r"(actor/(hidden_\d{1,3}|mean)/(kernel|bias)|actor/log_std|normalizer/(mean|std)|meta|digest|"
+    r"(actor/(hidden_\d{1,3}|mean|memory/(input|recurrent))/(kernel|bias)|actor/log_std|"
+    r"normalizer/(mean|std)|meta|digest|"
     r"network/(\w{1,64}/){0,8}\w{1,64})\.npy",
     re.ASCII,
 )
@@ -152,7 +162,7 @@ def write(path: str | Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str,
         PolicyError: If `read` would refuse the file, or if it cannot be written.
     """
     path = Path(path)
-    full = {**meta, "format": NETWORK_FORMAT if "network" in meta else FORMAT}
+    full = {**meta, "format": _format(meta)}
     _refuse_in(path, lambda: check(arrays, full))
     everything = {**arrays, "meta": np.array(json.dumps(full, sort_keys=True, allow_nan=False))}
     everything["digest"] = np.array(policy.digest(everything))
@@ -174,10 +184,11 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
         PolicyError: In one sentence that names the field.
     """
     own = "network" in meta
-    if meta.get("format") != (NETWORK_FORMAT if own else FORMAT):
+    if meta.get("format") != _format(meta):
         raise PolicyError(
-            f"meta.format is {_show(meta.get('format'))}, but this version reads {FORMAT}, and "
-            f"{NETWORK_FORMAT} with meta.network: export the policy from its run again."
+            f"meta.format is {_show(meta.get('format'))}, but this version reads {FORMAT}, "
+            f"{NETWORK_FORMAT} with meta.network, and {MEMORY_FORMAT} with meta.memory: export the "
+            "policy from its run again."
         )
     if own and not _is_name(meta["network"]):
         raise PolicyError(f"meta.network is {_show(meta['network'])}: expected a name.")
@@ -193,10 +204,34 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
         expected = "1 for a shared policy" if meta["policy"] == "shared" else "1 or more"
         raise PolicyError(f"meta.learners is {_show(learners)}: expected {expected}.")
     _check_optional(meta)
+    recalled = _check_memory(meta)
     size = _check_observation(meta["observation"])
     _check_action(meta["action"])
     _check_embodiment(meta)
-    _check_arrays(arrays, learners, size, own=own)
+    _check_arrays(arrays, (learners, size, recalled), own=own)
+
+
+def _format(meta: Mapping[str, Any]) -> int:
+    """Returns the number of the format of a file that says this of itself."""
+    if "memory" in meta:
+        return MEMORY_FORMAT
+    return NETWORK_FORMAT if "network" in meta else FORMAT
+
+
+def _check_memory(meta: Mapping[str, Any]) -> int:
+    """Checks what the file says of the policy's memory; returns its size H, 0 without one."""
+    if "memory" not in meta:
+        return 0
+    if "network" in meta:
+        raise PolicyError("meta.memory is there beside meta.network: expected one of them.")
+    _entry(meta, "memory", dict)
+    _choice(meta["memory"], "kind", ("gru",), "meta.memory")
+    _entry(meta["memory"], "size", int, "meta.memory")
+    if not 1 <= meta["memory"]["size"] <= _MOST_MEMORY:
+        raise PolicyError(
+            f"meta.memory.size is {_show(meta['memory']['size'])}: expected 1 to {_MOST_MEMORY}."
+        )
+    return meta["memory"]["size"]
 
 
 def _refuse_in[T](path: Path, make: Callable[[], T]) -> T:
@@ -466,13 +501,19 @@ def _is_number(value: object) -> TypeGuard[float]:
 # Arrays
 
 
-def _check_arrays(arrays: Mapping[str, np.ndarray], learners: int, size: int, *, own: bool) -> None:
-    """Checks names, then types, shapes and values; `size` is O, `own` that the network is code."""
+def _check_arrays(
+    arrays: Mapping[str, np.ndarray], sizes: tuple[int, int, int], *, own: bool
+) -> None:
+    """Checks names, then types, shapes and values.
+
+    `sizes` are L, O and H, the last 0 without memory; `own` says that the network is code.
+    """
+    learners, size, _ = sizes
     depth = _depth(arrays, own=own)
     first = arrays.get(f"actor/{'hidden_0' if depth else 'mean'}/kernel")
     known = own and first is not None and first.ndim == 3
     width = first.shape[1] if known and first is not None else size
-    shapes = _shapes(arrays, (learners, size), width, depth)
+    shapes = _shapes(arrays, sizes, width, depth)
     if own:
         shapes |= _network_shapes(arrays, learners)
     for name in shapes:
@@ -515,19 +556,26 @@ def _depth(arrays: Mapping[str, np.ndarray], *, own: bool) -> int:
 
 
 def _shapes(
-    arrays: Mapping[str, np.ndarray], sizes: tuple[int, int], width: int, depth: int
+    arrays: Mapping[str, np.ndarray], sizes: tuple[int, int, int], width: int, depth: int
 ) -> dict[str, tuple[int, ...]]:
     """Returns the shape that each array should have; a bias says how wide its layer is.
 
-    `sizes` are L and O, `width` is what the first layer takes.
+    `sizes` are L, O and H, `width` is what the first layer takes.
     """
-    shapes, (learners, size) = {}, sizes
+    shapes, (learners, size, recalled) = {}, sizes
     for i in range(depth):
         bias = arrays.get(f"actor/hidden_{i}/bias")
         inner = bias.shape[-1] if bias is not None and bias.ndim == 2 else 0
         shapes[f"actor/hidden_{i}/kernel"] = (learners, width, inner)
         shapes[f"actor/hidden_{i}/bias"] = (learners, inner)
         width = inner
+    if recalled:
+        gates = 3 * recalled
+        shapes["actor/memory/input/kernel"] = (learners, width, gates)
+        shapes["actor/memory/recurrent/kernel"] = (learners, recalled, gates)
+        for part in ("input", "recurrent"):
+            shapes[f"actor/memory/{part}/bias"] = (learners, gates)
+        width += recalled
     actions = len(ACTION_NAMES)
     shapes["actor/mean/kernel"] = (learners, width, actions)
     shapes["actor/mean/bias"] = shapes["actor/log_std"] = (learners, actions)

@@ -61,6 +61,21 @@ def meta(**changes: Any) -> dict[str, Any]:
     return full | changes
 
 
+def remembering(given: Arrays, size: int, seed: int = 1) -> Arrays:
+    """The same networks with a memory of `size` before the last layer, which takes it besides."""
+    draw = np.random.default_rng(seed)
+    kernel = given["actor/mean/kernel"]
+    learners, width, actions = kernel.shape
+    found = dict(given)
+    for part, inner in (("input", width), ("recurrent", size)):
+        drawn = draw.normal(size=(learners, inner, 3 * size)) / np.sqrt(inner)
+        found[f"actor/memory/{part}/kernel"] = drawn.astype(np.float32)
+        bias = 0.3 * draw.normal(size=(learners, 3 * size))
+        found[f"actor/memory/{part}/bias"] = bias.astype(np.float32)
+    more = draw.normal(size=(learners, size, actions)).astype(np.float32)
+    return found | {"actor/mean/kernel": np.concatenate([kernel, more], axis=1)}
+
+
 def several(learners: int) -> dict[str, Any]:
     """What `meta` says of so many learners."""
     return {"policy": "shared" if learners == 1 else "independent", "learners": learners}

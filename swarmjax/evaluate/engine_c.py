@@ -81,15 +81,33 @@ class Controller(Protocol):
 
 
 class _ByPolicy(NamedTuple):
-    """The controller that a judge has unless it is told another: its policy, without memory."""
+    """The controller that a judge has unless it is told another: its policy."""
 
     judge: Judge
 
-    def init(self, arenas: Arenas) -> None:
-        del arenas
+    def init(self, arenas: Arenas) -> np.ndarray | None:
+        return policy.begin(self.judge.policy, arenas.pose.shape[:2])
 
-    def act(self, memory: None, arenas: Arenas) -> tuple[None, np.ndarray]:
-        return memory, act(self.judge, arenas)
+    def act(
+        self, memory: np.ndarray | None, arenas: Arenas
+    ) -> tuple[np.ndarray | None, np.ndarray]:
+        normal: Any = 0.0
+        if self.judge.config.action == "sampled":
+            shape = (arenas.pose.shape[1], len(policy_file.ACTION_NAMES))
+            clock = arenas.outcome.clock
+            normal = noise.normal(arenas.seed, clock, Stream.ACTION, shape, np)
+        return policy.step(self.judge.policy, memory, arenas.observation, normal)
+
+
+def by_policy(judge: Judge) -> Controller:
+    """Returns the controller that is the judge's policy.
+
+    What is drawn follows from the level and the clock.
+
+    Args:
+        judge: What the arenas share.
+    """
+    return _ByPolicy(judge)
 
 
 def simulate(
@@ -111,7 +129,7 @@ def simulate(
         ConfigError: If the physics of an episode breaks down.
     """
     rows, arenas = np.arange(len(levels)), start(judge, levels)
-    driver = _ByPolicy(judge) if controller is None else controller
+    driver = by_policy(judge) if controller is None else controller
     memory = driver.init(arenas)
     total = Outcome(*(np.zeros_like(field) for field in arenas.outcome))
     for _ in range(judge.config.step_limit):
@@ -257,7 +275,7 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
     Args:
         judge: What the arenas share.
         arenas: Their state before.
-        action: [A, R, U] of the robots, -1..1; None: the policy's.
+        action: [A, R, U] of the robots, -1..1; None: those of a policy that remembers nothing.
 
     Returns:
         Their state after.
@@ -266,7 +284,8 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
         ConfigError: If a position is not finite.
     """
     task, before = judge.config.task, arenas.outcome.arrived
-    action = act(judge, arenas) if action is None else action
+    if action is None:
+        _, action = by_policy(judge).act(None, arenas)
     memory, pose, impulse = _drive(judge, arenas, action, arrival.drives(task.arrival, before))
     sight = look(judge, arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)
     arrived = arrival.arrived(task.arrival, before, sight.distance <= task.target_radius)
@@ -362,23 +381,6 @@ def _drive(
             f"than {judge.substeps}, or a robot nearer to the real one."
         )
     return memory, body.pose(qpos, np), _impulses(judge, pushes, len(arenas.data))
-
-
-def act(judge: Judge, arenas: Arenas) -> np.ndarray:
-    """Lets the policy act; what is drawn follows from the level and the clock.
-
-    Args:
-        judge: What the arenas share.
-        arenas: Their state.
-
-    Returns:
-        Actions [A, R, U], as drawn.
-    """
-    if judge.config.action == "mean":
-        return policy.act(judge.policy, arenas.observation)
-    shape = (arenas.pose.shape[1], len(policy_file.ACTION_NAMES))
-    normal = noise.normal(arenas.seed, arenas.outcome.clock, Stream.ACTION, shape, np)
-    return policy.act(judge.policy, arenas.observation, normal)
 
 
 class _Pushes(NamedTuple):

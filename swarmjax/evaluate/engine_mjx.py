@@ -26,8 +26,10 @@ from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.measures import Outcome
 from swarmjax.policy import Policy
 from swarmjax.ppo import learner as ppo
+from swarmjax.ppo import networks
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import LearnerState
+from swarmjax.ppo.memory import remember
 from swarmjax.sim import noise, physics
 from swarmjax.sim.config import SimConfig
 from swarmjax.sim.noise import Stream
@@ -181,7 +183,7 @@ def play(
         None if trained.network is None else trained.network.module,
     )
     network = None if trained.network is None else trained.network.params
-    weights = trained.layers, trained.mean, trained.std, network
+    weights = trained.layers, trained.mean, trained.std, network, trained.memory
     outcome, broken = run(weights, trained.log_std, levels)
     if np.any(broken):
         raise ConfigError(
@@ -213,27 +215,38 @@ def _program(
     def play(weights: Any, log_std: Array, levels: Level) -> tuple[dict[str, Array], Array]:
         mean = partial(_mean_action, activation, limit, weights, network)
         act = partial(_act, mean, log_std if sampled else None)
-        arenas, counts, broken = _run(mine, act, levels, steps)
+        memory = _begin(weights[-1], levels.present.shape)
+        arenas, counts, broken = _run(mine, act, levels, steps, memory)
         return _outcome(arenas, counts), broken
 
     return jax.jit(play)
 
 
-def _act(mean: Callable[[Array], Array], log_std: Array | None, arenas: EnvState) -> Array:
+def _begin(memory: Any, shape: tuple[int, ...]) -> Array | None:
+    """What robots [*shape] of a policy remember before they see anything, [*shape, H]."""
+    return None if memory is None else jnp.zeros((*shape, memory[2].shape[1]), jnp.float32)
+
+
+def _act(
+    mean: Callable[[Any, Array], tuple[Any, Array]],
+    log_std: Array | None,
+    memory: Any,
+    arenas: EnvState,
+) -> tuple[Any, Array]:
     """What the judge's robots do, [E, R, U]: drawn by the same numbers as there, if at all."""
-    action = mean(arenas.observation)
+    memory, action = mean(memory, arenas.observation)
     if log_std is None:
-        return action
+        return memory, action
     shape = action.shape[1:]
     normal = noise.normal(arenas.level.seed, arenas.clock, Stream.ACTION, shape, jnp)
-    return action + jnp.exp(log_std[: len(action[0])]) * normal
+    return memory, action + jnp.exp(log_std[: len(action[0])]) * normal
 
 
 def _mean_action(
-    activation: str, limit: float, weights: Any, network: Any, observation: Array
-) -> Array:
-    """What `policy.act` says without noise, [E, R, U]: in full precision, where a GPU has less."""
-    layers, mean, std, params = weights
+    activation: str, limit: float, weights: Any, network: Any, memory: Any, observation: Array
+) -> tuple[Any, Array]:
+    """What `policy.step` says without noise, [E, R, U]: in full precision, where a GPU has less."""
+    layers, mean, std, params, parts = weights
     robots = slice(observation.shape[-2])
     x = jnp.clip((observation - mean[robots]) / std[robots], -limit, limit)
     if network is not None:
@@ -241,7 +254,11 @@ def _mean_action(
     *hidden, last = layers
     for layer in hidden:
         x = _ACTIVATIONS[activation](_dense(x, layer, robots))
-    return _dense(x, last, robots)
+    if parts is not None:
+        seen, recalled = _dense(x, parts[:2], robots), _dense(memory, parts[2:], robots)
+        memory = remember(seen, recalled, memory)
+        x = jnp.concatenate([x, memory], axis=-1)
+    return memory, _dense(x, last, robots)
 
 
 def _dense(x: Array, layer: tuple[ArrayLike, ArrayLike], robots: slice) -> Array:
@@ -280,25 +297,30 @@ def outcomes(
       were.
     """
     act = partial(_choose, config, learners, sampled=sampled)
-    arenas, _, broken = _run(world, act, levels, steps)
+    memory = networks.begin_memory(config, levels.present.shape)
+    first = None if memory is None else memory.actor
+    arenas, _, broken = _run(world, act, levels, steps, first)
     return _sum_up(arenas, broken, world.task.control_step)
 
 
 def _choose(
-    config: AlgoConfig, learners: LearnerState, arenas: EnvState, *, sampled: bool
-) -> Array:
+    config: AlgoConfig, learners: LearnerState, memory: Any, arenas: EnvState, *, sampled: bool
+) -> tuple[Any, Array]:
     """The learners' actions [E, R, U], drawn as the judge draws them, or their means."""
     count = len(jax.tree.leaves(learners)[0])
     seen = rollout.to_learners(arenas.observation, count)
-    if not sampled:
-        action = jax.vmap(partial(ppo.mode, config=config))(learners, observation=seen)
-        return rollout.to_arenas(action)
-    shape = (arenas.observation.shape[-2], ACTION_SIZE)
-    drawn = noise.normal(arenas.level.seed, arenas.clock, Stream.ACTION, shape, jnp)
-    action, _ = jax.vmap(partial(ppo.act, config=config))(
-        learners, observation=seen, noise=rollout.to_learners(drawn, count)
-    )
-    return rollout.to_arenas(action)
+    mine = None if memory is None else rollout.to_learners(memory, count)
+    if sampled:
+        shape = (arenas.observation.shape[-2], ACTION_SIZE)
+        drawn = noise.normal(arenas.level.seed, arenas.clock, Stream.ACTION, shape, jnp)
+        action, _, after = jax.vmap(
+            lambda learner, o, n, m: ppo.recall_act(learner, config, o, n, m)
+        )(learners, seen, rollout.to_learners(drawn, count), mine)
+    else:
+        action, after = jax.vmap(lambda learner, o, m: ppo.recall_mode(learner, config, o, m))(
+            learners, seen, mine
+        )
+    return None if after is None else rollout.to_arenas(after), rollout.to_arenas(action)
 
 
 class _Counts(NamedTuple):
@@ -311,8 +333,12 @@ class _Counts(NamedTuple):
     still: Array
 
 
+# Of a memory [E, R, H] or None, and arenas: the memory after, and actions.
+_Actor = Callable[[Any, EnvState], tuple[Any, Array]]
+
+
 def _run(
-    world: World, act: Callable[[EnvState], Array], levels: Level, steps: int
+    world: World, act: _Actor, levels: Level, steps: int, memory: Array | None
 ) -> tuple[EnvState, _Counts, Array]:
     """Runs an episode of each level; returns how the arenas end, and which of them broke."""
     robots, obstacles = world.spacing.robots, world.spacing.obstacles
@@ -327,19 +353,23 @@ def _run(
     counts = _Counts(none, touched, none.astype(jnp.float32), levels.start[..., :2], none)
     unbroken = jnp.zeros(len(levels.side), bool)
     step = partial(_step, world, act)
-    (arenas, counts, broken), _ = jax.lax.scan(step, (arenas, counts, unbroken), length=steps)
+    carry = (arenas, counts, unbroken, memory)
+    (arenas, counts, broken, _), _ = jax.lax.scan(step, carry, length=steps)
     return arenas, counts, broken
+
+
+_Carry = tuple[EnvState, _Counts, Array, Array | None]
 
 
 def _step(
     world: World,
-    act: Callable[[EnvState], Array],
-    carry: tuple[EnvState, _Counts, Array],
+    act: _Actor,
+    carry: _Carry,
     _: None,
-) -> tuple[tuple[EnvState, _Counts, Array], None]:
+) -> tuple[_Carry, None]:
     """Moves the arenas [E] on by a control step whose episodes are not over."""
-    arenas, counts, broken = carry
-    action = act(arenas)
+    arenas, counts, broken, memory = carry
+    memory, action = act(memory, arenas)
     moved, came = jax.vmap(partial(env.step, world))(arenas, action)
     over = broken | _all_arrived(arenas)
     broken = broken | (~over & ~came.sound)
@@ -352,7 +382,7 @@ def _step(
             for old, new in zip(counts, counted, strict=True)
         )
     )
-    return (rollout.restart(moved, held, stays), counts, broken), None
+    return (rollout.restart(moved, held, stays), counts, broken, memory), None
 
 
 def _count(world: World, counts: _Counts, before: EnvState, after: EnvState) -> _Counts:

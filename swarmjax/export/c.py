@@ -21,6 +21,49 @@ _ACTIVATIONS = {
     "swish": "0.5f * x[i] * (1.0f + tanhf(0.5f * x[i]))",
 }
 
+_MEMORY_TYPE = """#define POLICY_MEMORY SIZE
+
+/* What a robot remembers. */
+typedef struct {
+    float recalled[POLICY_MEMORY];
+} PolicyMemory;
+
+/* Forgets, as a robot does where an episode begins. */
+void policy_begin(PolicyMemory *memory);
+
+"""
+# The gated recurrent unit of `policy.step`: gates reset, update and candidate, one after the other.
+_MEMORY_CODE = """static float logistic(float x)
+{
+    return 0.5f + 0.5f * tanhf(0.5f * x);
+}
+
+static void remember(unsigned learner, const float *features, float *recalled)
+{
+    float seen[3 * POLICY_MEMORY], old[3 * POLICY_MEMORY];
+    layer(SEEN_KERNEL[learner], SEEN_BIAS[learner], FEATURES, 3 * POLICY_MEMORY, features, seen);
+    layer(RECALLED_KERNEL[learner], RECALLED_BIAS[learner], POLICY_MEMORY, 3 * POLICY_MEMORY,
+          recalled, old);
+    for (unsigned i = 0; i < POLICY_MEMORY; i++) {
+        const unsigned update = POLICY_MEMORY + i, candidate = 2 * POLICY_MEMORY + i;
+        const float fresh = tanhf(seen[candidate] + logistic(seen[i] + old[i]) * old[candidate]);
+        recalled[i] = fresh + logistic(seen[update] + old[update]) * (recalled[i] - fresh);
+    }
+}
+
+void policy_begin(PolicyMemory *memory)
+{
+    for (unsigned i = 0; i < POLICY_MEMORY; i++) {
+        memory->recalled[i] = 0.0f;
+    }
+}
+
+"""
+_MEMORY_RESET = """        if (i % (CASES / 2) < POLICY_LEARNERS) {
+            policy_begin(&memory[i % POLICY_LEARNERS]);
+        }
+"""
+
 
 def render(trained: Policy) -> dict[str, bytes]:
     """Makes the files of a policy.
@@ -31,12 +74,12 @@ def render(trained: Policy) -> dict[str, bytes]:
     Returns:
         `policy.c`, `policy.h`, `policy_test.c`, `Makefile` and `README.md`.
     """
-    values = _about(trained) | _layout(trained)
+    values = _about(trained) | _layout(trained) | _memory(trained)
     code = values | _code(trained)
     return {
         "policy.h": _fill("policy.h", values),
         "policy.c": _fill("policy.c", code),
-        "policy_test.c": _fill("policy_test.c", _cases(trained)),
+        "policy_test.c": _fill("policy_test.c", values | _cases(trained)),
         "Makefile": _fill("Makefile", {}),
         "README.md": _fill("README.md", values | {"observation": export_layout.table(trained)}),
     }
@@ -51,7 +94,7 @@ def _about(trained: Policy) -> dict[str, str]:
     robot, task = trained.meta["robot"], trained.meta["task"]
     sizes, learners = _sizes(trained), len(trained.mean)
     weights = [part for layer in trained.layers for part in layer]
-    arrays = [trained.mean, trained.std, trained.log_std, *weights]
+    arrays = [trained.mean, trained.std, trained.log_std, *weights, *(trained.memory or ())]
     parameters = sum(array.size for array in arrays)
     several = f"{learners} policies, one for each robot."
     return {
@@ -68,13 +111,45 @@ def _about(trained: Policy) -> dict[str, str]:
         **{key: short(robot[key]) for key in ("wheel_radius", "track", "max_wheel_speed")},
         "parameters": f"{parameters:,}",
         "flash": f"{4 * parameters:,}",
-        "stack": f"{2 * 4 * max(sizes[:-1]):,}",
+        "stack": f"{2 * 4 * (_widest(trained) + 3 * _recalled(trained)):,}",
     }
 
 
 def _sizes(trained: Policy) -> list[int]:
     """The sizes of the layers, from the observation to the action."""
     return [trained.mean.shape[1], *(bias.shape[1] for _, bias in trained.layers)]
+
+
+def _recalled(trained: Policy) -> int:
+    """How many numbers a robot remembers."""
+    return 0 if trained.memory is None else trained.memory[2].shape[1]
+
+
+def _widest(trained: Policy) -> int:
+    """The most numbers that a layer takes."""
+    *inputs, last, _ = _sizes(trained)
+    return max([*inputs, last + _recalled(trained)])
+
+
+def _memory(trained: Policy) -> dict[str, str]:
+    """What a policy that remembers has besides; nothing of one that does not."""
+    size = _recalled(trained)
+    if not size:
+        names = ("type", "parameter", "code", "begin", "reset", "argument", "word")
+        return dict.fromkeys((f"memory_{name}" for name in names), "") | {
+            "kept": "Nothing is kept in RAM between calls."
+        }
+    return {
+        "memory_type": _MEMORY_TYPE.replace("SIZE", str(size)),
+        "memory_parameter": "PolicyMemory *memory, ",
+        "memory_code": _MEMORY_CODE.replace("FEATURES", str(_sizes(trained)[-2])),
+        "memory_begin": "    PolicyMemory memory[POLICY_LEARNERS];\n",
+        "memory_reset": _MEMORY_RESET,
+        "memory_argument": "&memory[i % POLICY_LEARNERS], ",
+        "memory_word": "&memory, ",
+        "kept": f"A robot keeps {4 * size} bytes, a `PolicyMemory`, between calls: `policy_begin` "
+        "makes it forget\nwhere an episode begins.",
+    }
 
 
 def _layout(trained: Policy) -> dict[str, str]:
@@ -95,13 +170,13 @@ def _code(trained: Policy) -> dict[str, str]:
     robot, layout = trained.meta["robot"], trained.meta["observation"]
     sizes = _sizes(trained)
     return {
-        "widest": str(max(sizes[:-1])),
+        "widest": str(_widest(trained)),
         "offset": _values(layout["offset"]),
         "scale": _values(layout["scale"]),
         "limit": number(layout["limit"]),
         "arrays": "\n".join(_arrays(trained)),
         "activation": _ACTIVATIONS[trained.meta["activation"]],
-        "layers": "\n".join(_calls(sizes)),
+        "layers": "\n".join(_calls(sizes, _recalled(trained))),
         "max_speed": number(trained.max_speed),
         "max_turn_rate": number(trained.max_turn_rate),
         **{key: number(robot[key]) for key in ("wheel_radius", "track", "max_wheel_speed")},
@@ -115,6 +190,13 @@ def _arrays(trained: Policy) -> Iterable[str]:
     for i, (kernel, bias) in enumerate(trained.layers):
         yield _array(f"KERNEL_{i}", kernel.swapaxes(1, 2).reshape(len(kernel), -1))
         yield _array(f"BIAS_{i}", bias)
+    if trained.memory is not None:
+        for name, part in zip(
+            ("SEEN", "RECALLED"), (trained.memory[:2], trained.memory[2:]), strict=True
+        ):
+            kernel, bias = part
+            yield _array(f"{name}_KERNEL", kernel.swapaxes(1, 2).reshape(len(kernel), -1))
+            yield _array(f"{name}_BIAS", bias)
     yield _array("DEVIATION", np.exp(trained.log_std))
 
 
@@ -124,11 +206,17 @@ def _array(name: str, rows: np.ndarray) -> str:
     return "\n".join([*lines, "};"])
 
 
-def _calls(sizes: Sequence[int]) -> Iterable[str]:
-    """The calls of the layers, to and fro between two buffers."""
+def _calls(sizes: Sequence[int], recalled: int) -> Iterable[str]:
+    """The calls of the layers, to and fro between two buffers; before the last, of the memory."""
     source, target = "a", "b"
     last = len(sizes) - 2
     for i, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
+        if i == last and recalled:
+            yield f"    remember(learner, {source}, memory->recalled);"
+            yield "    for (unsigned i = 0; i < POLICY_MEMORY; i++) {"
+            yield f"        {source}[{inputs} + i] = memory->recalled[i];"
+            yield "    }"
+            inputs += recalled  # the head takes what is remembered besides
         weights = f"KERNEL_{i}[learner], BIAS_{i}[learner], {inputs}, {outputs}"
         yield f"    layer({weights}, {source}, {'action' if i == last else target});"
         if i < last:
@@ -143,9 +231,9 @@ def _cases(trained: Policy) -> dict[str, str]:
     reach = np.where(np.arange(CASES) % 2, 1.5 * trained.meta["observation"]["limit"], 3.0)
     drawn = draw.uniform(-1, 1, shape) * reach[:, None, None]
     observation = (trained.mean + trained.std * drawn).astype(np.float32)
-    action = policy.act(trained, observation)
+    action = _play(trained, observation)
     normal = draw.standard_normal(action.shape, np.float32)
-    sample = policy.act(trained, observation, normal)
+    sample = action + np.exp(trained.log_std) * normal
 
     def table(values: np.ndarray) -> str:
         rows = values.reshape(-1, values.shape[-1])
@@ -154,6 +242,17 @@ def _cases(trained: Policy) -> dict[str, str]:
     tables = {"observation": observation, "action": action, "normal": normal, "sample": sample}
     cases = CASES * len(trained.mean)
     return {"cases": str(cases)} | {name: table(values) for name, values in tables.items()}
+
+
+def _play(trained: Policy, observation: np.ndarray) -> np.ndarray:
+    """Most likely actions of observations one after the other; at half of them all is forgotten."""
+    found, memory = [], None
+    for i, seen in enumerate(observation):
+        if i in (0, CASES // 2):
+            memory = policy.begin(trained, seen.shape[:-1])
+        memory, action = policy.step(trained, memory, seen)
+        found.append(action)
+    return np.stack(found)
 
 
 def _values(row: Iterable[float]) -> str:

@@ -57,7 +57,8 @@ def render(policy: Policy) -> bytes:
         The bytes of an ONNX file. Its input `observation` is [B, O] if the policy is shared, else
         [B, R, O] with R the number of learners, as `meta["observation"]` of the policy says; its
         outputs are `action` ([..., U], as `policy.act` without `normal`) and `command` (as
-        `policy.command`: m/s and rad/s).
+        `policy.command`: m/s and rad/s). One that remembers takes `memory` [..., H] too, zeros
+        where an episode begins, and gives `memory_after`.
 
     Raises:
         ConfigError: if the package `onnx` is not installed.
@@ -75,11 +76,16 @@ def render(policy: Policy) -> bytes:
         return helper.make_tensor_value_info(name, TensorProto.FLOAT, [*leading, size])
 
     actions = len(policy.meta["action"]["names"])
+    recalled = [] if policy.memory is None else [policy.memory[2].shape[1]]
     made = helper.make_graph(
         graph.nodes,
         "policy",
-        [port("observation", policy.mean.shape[1])],
-        [port("action", actions), port("command", actions)],
+        [port("observation", policy.mean.shape[1]), *(port("memory", n) for n in recalled)],
+        [
+            port("action", actions),
+            port("command", actions),
+            *(port("memory_after", n) for n in recalled),
+        ],
         graph.constants,
     )
     operators = [helper.make_opsetid("", OPSET)]
@@ -106,8 +112,10 @@ def _graph(policy: Policy) -> _Graph:
     graph.then("Div", rows(policy.std))
     graph.then("Clip", graph.constant(-limit), graph.constant(limit))
     for i, (kernel, bias) in enumerate(policy.layers):
-        graph.then("MatMul", graph.constant(kernel[0] if shared else kernel))
         last = i == len(policy.layers) - 1
+        if last and policy.memory is not None:
+            _remember(graph, policy.memory, shared=shared)
+        graph.then("MatMul", graph.constant(kernel[0] if shared else kernel))
         graph.then("Add", rows(bias), name="action" if last and shared else None)
         if not last:
             _activate(graph, policy.meta["activation"])
@@ -118,6 +126,43 @@ def _graph(policy: Policy) -> _Graph:
     graph.then("Mul", graph.constant((high - low) / 2))
     graph.then("Add", graph.constant((high + low) / 2), name="command")
     return graph
+
+
+def _remember(graph: _Graph, parts: tuple[np.ndarray, ...], *, shared: bool) -> None:
+    """Puts the gated recurrent unit of `policy.step` behind the features, beside which it goes."""
+    size, features = parts[2].shape[1], graph.value
+    graph.value = "memory"
+    old = graph.value if shared else graph.then("Transpose", perm=[1, 0, 2])
+
+    def product(source: str, weights: tuple[np.ndarray, ...], gate: int) -> str:
+        """Of one gate: 0 reset, 1 update, 2 candidate."""
+        mine = slice(gate * size, (gate + 1) * size)
+        kernel, bias = weights[0][..., mine], weights[1][..., mine]
+        graph.value = source
+        graph.then("MatMul", graph.constant(kernel[0] if shared else kernel))
+        return graph.then("Add", graph.constant(bias[0] if shared else bias[:, None]))
+
+    def opened(gate: int) -> str:
+        """Of reset or update, within 0..1."""
+        seen = product(features, parts[:2], gate)
+        product(old, parts[2:], gate)
+        graph.then("Add", seen)
+        return graph.then("Sigmoid")
+
+    reset, update = opened(0), opened(1)
+    seen = product(features, parts[:2], 2)
+    product(old, parts[2:], 2)
+    graph.then("Mul", reset)
+    graph.then("Add", seen)
+    fresh = graph.then("Tanh")
+    graph.value = old
+    graph.then("Sub", fresh)
+    graph.then("Mul", update)
+    after = graph.then("Add", fresh, name="memory_after" if shared else None)
+    if not shared:
+        graph.then("Transpose", perm=[1, 0, 2], name="memory_after")
+    graph.value = features
+    graph.then("Concat", after, axis=-1)
 
 
 def _activate(graph: _Graph, activation: str) -> None:

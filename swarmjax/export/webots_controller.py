@@ -140,9 +140,23 @@ def to_target(
     return math.hypot(x, y), math.atan2(math.sin(turn), math.cos(turn))
 
 
+def begin(trained: Policy, robot: int) -> np.ndarray | None:
+    """Returns the memory of a robot that has a new target; None if the policy has none.
+
+    Args:
+        trained: the policy.
+        robot: its number, from 0.
+    """
+    return policy.begin(trained, (1 if trained.is_shared else robot + 1,))
+
+
 def wheel_speeds(
-    trained: Policy, observation: np.ndarray, robot: int, normal: Any = 0.0
-) -> np.ndarray:
+    trained: Policy,
+    observation: np.ndarray,
+    robot: int,
+    normal: Any = 0.0,
+    memory: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Lets the policy act.
 
     Args:
@@ -150,17 +164,20 @@ def wheel_speeds(
         observation: [O].
         robot: its number, from 0.
         normal: [U] standard normal, to draw the action with; 0 is the most likely one.
+        memory: as `begin` or the call before returned it.
 
     Returns:
-        [2] speeds of the left and the right wheel, rad/s, each within its own limit.
+        [2] speeds of the left and the right wheel, rad/s, each within its own limit, and the memory
+        after.
     """
     # Robots before this one are there only so that it meets its own network.
     seen = np.broadcast_to(observation, (1 if trained.is_shared else robot + 1, observation.size))
-    speed, turn_rate = policy.command(trained, policy.act(trained, seen, normal))[-1]
+    memory, action = policy.step(trained, memory, seen, normal)
+    speed, turn_rate = policy.command(trained, action)[-1]
     body = trained.meta["robot"]
     turn = turn_rate * 0.5 * body["track"]
     wheels = np.array([speed - turn, speed + turn]) / body["wheel_radius"]
-    return np.clip(wheels, -body["max_wheel_speed"], body["max_wheel_speed"])
+    return np.clip(wheels, -body["max_wheel_speed"], body["max_wheel_speed"]), memory
 
 
 class Devices(NamedTuple):
@@ -249,9 +266,12 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
     devices = find_devices(robot, period)
     given, draw = parse(words), np.random.default_rng()
     stops, parked_at = trained.meta["task"].get("arrival", "latch") == "latch", None
+    memory, pursued = None, None
     while robot.step(period) != -1:  # the first step gives all sensors a value
         orders = parse([*_custom(robot, given), *words])
         wheels = np.zeros(len(MOTORS))
+        if orders.target != pursued:  # an episode begins
+            memory, pursued = begin(trained, orders.robot), orders.target
         if orders.target is not None and orders.target != parked_at:
             distance, bearing = to_target(
                 devices.gps.getValues(), devices.compass.getValues(), orders.target
@@ -263,7 +283,7 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
             else:
                 seen = observe(trained, sensors, counts, distance, bearing)
                 normal = draw.standard_normal(len(MOTORS), np.float32) if orders.sampled else 0.0
-                wheels = wheel_speeds(trained, seen, orders.robot, normal)
+                wheels, memory = wheel_speeds(trained, seen, orders.robot, normal, memory)
         for motor, speed in zip(devices.motors, wheels, strict=True):
             motor.setVelocity(float(speed))
 

@@ -11,11 +11,16 @@ from swarmjax.extension import Network
 # The options of the algorithm that belong to one choice: whose, which, and what null stands for.
 _ALGO_OPTIONS: dict[str, tuple[str, str, float | int]] = {
     "gae_lambda": ("advantage", "gae", 0.95),
+    "memory_size": ("memory", "gru", 64),
     "std_decrement": ("exploration", "scheduled", 0.05),
     "std_interval": ("exploration", "scheduled", 250_000),
     "std_floor": ("exploration", "scheduled", 0.1),
 }
 
+
+# Control steps of a rollout through which a memory is trained: half a second, in which a robot
+# drives about as far as it sees.
+LEAST_SEQUENCE = 8
 
 # What the step limit may be to a return, the default first.
 _TIME_OUTS = {"gae": ("bootstrap", "terminal"), "monte_carlo": ("terminal", "leak")}
@@ -58,6 +63,14 @@ class AlgoConfig(Section):
     )
     hidden_sizes: tuple[int, ...] = field(
         default=(64, 64), metadata=about("widths of the hidden layers", 1, 4096)
+    )
+    memory: Literal["none", "gru"] = field(
+        default="none",
+        metadata=about("what robots remember; gru: a gated recurrent unit behind the layers"),
+    )
+    memory_size: int | None = field(
+        default=None,
+        metadata=about("numbers that are remembered; null: 64 [memory=gru]", 1, 1024),
     )
     activation: Literal["tanh", "relu", "swish"] = field(
         default="tanh", metadata=about("activation of the hidden layers")
@@ -198,6 +211,7 @@ class AlgoConfig(Section):
             if chosen == choice and value is None:
                 object.__setattr__(self, key, default)
         self._check_time_out()
+        self._check_memory()
         if self.std_floor is not None and self.std_floor > self.initial_std:
             raise ConfigError(
                 f"std_floor is {show(self.std_floor)}, but initial_std is "
@@ -207,6 +221,31 @@ class AlgoConfig(Section):
             raise ConfigError(
                 f"mean_activation is tanh, but activation is {self.activation}, and a policy's "
                 "file has one for all layers: give activation=tanh or mean_activation=linear."
+            )
+
+    def _check_memory(self) -> None:
+        """Refuses what goes with no memory."""
+        if self.memory == "none":
+            return
+        if self.rollout_length < LEAST_SEQUENCE:
+            raise ConfigError(
+                f"rollout_length is {self.rollout_length}, but memory is {self.memory}, which is "
+                "trained through the steps of a rollout: give at least "
+                f"{LEAST_SEQUENCE}, or memory=none."
+            )
+        for key, only in (
+            ("update_backend", ("auto", "autodiff")),
+            ("mean_activation", ("linear",)),
+        ):
+            if getattr(self, key) not in only:
+                raise ConfigError(
+                    f"{key} is {getattr(self, key)}, but memory is {self.memory}: give "
+                    f"{' or '.join(only)}, or memory=none."
+                )
+        if self.network not in (None, "mlp"):
+            raise ConfigError(
+                f"network is {show(self.network)}, but memory is {self.memory}, which goes with "
+                "hidden layers alone: give network=mlp or memory=none."
             )
 
     def _check_time_out(self) -> None:

@@ -18,6 +18,7 @@ from swarmjax.ppo import dispatch, exploration, losses, networks, normalizer, op
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.dispatch import Backend
 from swarmjax.ppo.losses import Metrics, Minibatch
+from swarmjax.ppo.memory import Memory
 from swarmjax.ppo.networks import Params
 from swarmjax.ppo.normalizer import Normalizer
 from swarmjax.ppo.optimizer import Progress
@@ -60,6 +61,9 @@ class Batch:
             but not those of Monte-Carlo returns, which are normalised themselves.
         return_: [G, N], target of the critic.
         valid: [G, N], bool or 0/1.
+        memory: [G, S, H] before the rollout of the S robots of a group, whose N samples are ordered
+            by step, [T S]; None without memory.
+        begins: [G, N], whether an episode begins with the step; None without memory.
     """
 
     observation: jax.Array
@@ -68,6 +72,8 @@ class Batch:
     advantage: jax.Array
     return_: jax.Array
     valid: jax.Array
+    memory: Memory | None = None
+    begins: jax.Array | None = None
 
 
 def init(
@@ -141,7 +147,7 @@ def normalize(learner: LearnerState, observation: jax.Array) -> jax.Array:
 def act(
     learner: LearnerState, config: AlgoConfig, observation: jax.Array, noise: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Draws actions from the policy.
+    """Draws actions from a policy without memory.
 
     Args:
         learner: Whose policy.
@@ -152,23 +158,60 @@ def act(
     Returns:
         The action mean + std * noise, [..., U], unbounded, and its log density, [...].
     """
-    mean, std = networks.action_distribution(
-        learner.params, config, normalize(learner, observation)
-    )
-    chex.assert_equal_shape([mean, noise])
-    action = mean + std * noise
-    return action, networks.log_prob(mean, std, action)
+    return recall_act(learner, config, observation, noise, None)[:2]
 
 
 def mode(learner: LearnerState, config: AlgoConfig, observation: jax.Array) -> jax.Array:
-    """Returns the policy's most likely action, [..., U], for raw observations, [..., O]."""
-    mean, _ = networks.action_distribution(learner.params, config, normalize(learner, observation))
-    return mean
+    """Returns the most likely action, [..., U], of a policy without memory; `observation` raw."""
+    return recall_mode(learner, config, observation, None)[0]
 
 
 def values(learner: LearnerState, config: AlgoConfig, observation: jax.Array) -> jax.Array:
-    """Returns the critic's expected discounted return, [...], for raw observations, [..., O]."""
-    return networks.value(learner.params, config, normalize(learner, observation))
+    """Returns the expected discounted return, [...], for raw observations, without memory."""
+    return recall_values(learner, config, observation, None)[0]
+
+
+def recall_act(
+    learner: LearnerState,
+    config: AlgoConfig,
+    observation: jax.Array,
+    noise: jax.Array,
+    memory: jax.Array | None,
+) -> tuple[jax.Array, jax.Array, jax.Array | None]:
+    """Draws actions from the policy, and remembers.
+
+    Args:
+        learner: Whose policy.
+        config: The config that made the learner.
+        observation: [..., O], raw.
+        noise: [..., U], standard normal.
+        memory: [..., H] of the actor before; None without memory.
+
+    Returns:
+        The action mean + std * noise, [..., U], unbounded, its log density, [...], and the memory
+        after.
+    """
+    seen = normalize(learner, observation)
+    mean, std, after = networks.recall_action(learner.params, config, seen, memory)
+    chex.assert_equal_shape([mean, noise])
+    action = mean + std * noise
+    return action, networks.log_prob(mean, std, action), after
+
+
+def recall_mode(
+    learner: LearnerState, config: AlgoConfig, observation: jax.Array, memory: jax.Array | None
+) -> tuple[jax.Array, jax.Array | None]:
+    """Returns the policy's most likely action, [..., U], and the memory after, as `recall_act`."""
+    seen = normalize(learner, observation)
+    mean, _, after = networks.recall_action(learner.params, config, seen, memory)
+    return mean, after
+
+
+def recall_values(
+    learner: LearnerState, config: AlgoConfig, observation: jax.Array, memory: jax.Array | None
+) -> tuple[jax.Array, jax.Array | None]:
+    """Returns the critic's expected discounted return, [...], and its memory after, likewise."""
+    return networks.recall_value(learner.params, config, normalize(learner, observation), memory)
 
 
 def update(
@@ -251,9 +294,10 @@ def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Sh
         valid=valid,
     )
     # A NaN in an invalid sample would pass through the networks into every gradient.
-    return jax.tree.map(
+    masked = jax.tree.map(
         lambda x: jnp.where(valid.reshape(valid.shape + (1,) * (x.ndim - 2)), x, 0), samples
     )
+    return replace(masked, memory=batch.memory, begins=batch.begins)
 
 
 def _normalize_advantages(advantage: jax.Array, valid: jax.Array, shards: Shards) -> jax.Array:
@@ -291,10 +335,23 @@ def _epoch(
     order = _shuffle(key, samples.valid.shape[0], config.num_minibatches, shards)
 
     def learn(progress: Progress, rows: jax.Array) -> tuple[Progress, Metrics]:
-        minibatch = jax.tree.map(lambda x: x[rows].reshape(-1, *x.shape[2:]), samples)
-        return step(progress, minibatch)
+        return step(progress, _gather(samples, rows, config))
 
     return jax.lax.scan(learn, progress, order)
+
+
+def _gather(samples: Minibatch, rows: jax.Array, config: AlgoConfig) -> Minibatch:
+    """Takes whole groups [G, N, ...] as samples [B, ...]; those that remember, step by step."""
+    if samples.memory is None:
+        return jax.tree.map(lambda x: x[rows].reshape(-1, *x.shape[2:]), samples)
+
+    def by_step(x: jax.Array) -> jax.Array:
+        sequences = x[rows].reshape(len(rows), config.rollout_length, -1, *x.shape[2:])
+        return jnp.moveaxis(sequences, 1, 0).reshape(-1, *x.shape[2:])
+
+    memory = jax.tree.map(lambda x: x[rows].reshape(-1, x.shape[-1]), samples.memory)
+    flat = jax.tree.map(by_step, replace(samples, memory=None))
+    return replace(flat, memory=memory)
 
 
 def _shuffle(key: jax.Array, groups: int, minibatches: int, shards: Shards) -> jax.Array:

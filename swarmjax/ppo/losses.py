@@ -7,6 +7,7 @@ from flax import struct
 
 from swarmjax.ppo import networks
 from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.memory import Memory
 from swarmjax.ppo.networks import Params
 
 Metrics = dict[str, jax.Array]
@@ -23,6 +24,9 @@ class Minibatch:
         advantage: [B].
         return_: [B], target of the critic.
         valid: [B], bool or 0/1.
+        memory: [B', H] before the first step of B' sequences; None without memory. Samples are then
+            ordered by step, [T B'].
+        begins: [B], whether an episode begins with the step; None without memory.
     """
 
     observation: jax.Array
@@ -31,6 +35,8 @@ class Minibatch:
     advantage: jax.Array
     return_: jax.Array
     valid: jax.Array
+    memory: Memory | None = None
+    begins: jax.Array | None = None
 
 
 def ppo_loss(
@@ -71,12 +77,11 @@ def ppo_loss(
     def mean(samples: jax.Array) -> jax.Array:
         return jnp.sum(jnp.where(valid, samples, 0.0)) / jnp.maximum(expected_valid, 1.0)
 
-    action_mean, std = networks.action_distribution(params, config, minibatch.observation)
+    action_mean, std, value = _evaluate(params, config, minibatch)
     log_prob = networks.log_prob(action_mean, std, minibatch.action)
     # Masked before exp: an overflow there would turn the zero gradient of a mask into NaN.
     log_ratio = jnp.where(valid, log_prob - minibatch.log_prob, 0.0)
     ratio = jnp.exp(log_ratio)
-    value = networks.value(params, config, minibatch.observation)
     metrics = {
         "policy_loss": -mean(_clipped_surrogate(ratio, minibatch.advantage, config.clip_epsilon)),
         "value_loss": mean(0.5 * (value - minibatch.return_) ** 2),
@@ -93,6 +98,22 @@ def ppo_loss(
         + config.bound_cost * metrics["bound_loss"]
     )
     return loss, metrics
+
+
+def _evaluate(
+    params: Params, config: AlgoConfig, minibatch: Minibatch
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Computes mean action [B, U], deviation [U] and value [B]; of sequences, through time."""
+    seen, memory = minibatch.observation, minibatch.memory
+    if memory is None or minibatch.begins is None:
+        mean, std = networks.action_distribution(params, config, seen)
+        return mean, std, networks.value(params, config, seen)
+    sequences = memory.actor.shape[0]
+    begins = minibatch.begins.reshape(-1, sequences)
+    steps = seen.reshape(-1, sequences, seen.shape[-1])
+    mean, std, _ = networks.recall_action(params, config, steps, memory.actor, begins)
+    value, _ = networks.recall_value(params, config, steps, memory.critic, begins)
+    return mean.reshape(-1, mean.shape[-1]), std, value.reshape(-1)
 
 
 def _clipped_surrogate(ratio: jax.Array, advantage: jax.Array, clip: float) -> jax.Array:

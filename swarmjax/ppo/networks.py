@@ -16,7 +16,9 @@ from flax import linen as nn
 
 from swarmjax.config import ConfigError
 from swarmjax.extension import Network, describe
+from swarmjax.ppo import memory as ppo_memory
 from swarmjax.ppo.config import AlgoConfig, resolve
+from swarmjax.ppo.memory import Gru, Memory
 
 Params = dict[str, Any]
 
@@ -51,8 +53,16 @@ class _Actor(nn.Module):
     action_size: int
 
     @nn.compact
-    def __call__(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def __call__(
+        self,
+        observation: jax.Array,
+        memory: jax.Array | None = None,
+        begins: jax.Array | None = None,
+    ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
         features = _torso(self.config)(observation)
+        if memory is not None:
+            gru = Gru(_memory_size(self.config), name="memory")
+            features, memory = gru(features, memory, begins)
         layer = _layer(self.config, features, self.action_size, _HEAD_GAIN, "mean")
         log_std = self.param(
             "log_std",
@@ -60,18 +70,32 @@ class _Actor(nn.Module):
             (self.action_size,),
             jnp.float32,
         )
-        return _OUTPUTS[self.config.mean_activation](layer(features)), log_std
+        return _OUTPUTS[self.config.mean_activation](layer(features)), log_std, memory
 
 
 class _Critic(nn.Module):
-    """Value (`value`) of an observation: [B, O] -> [B]."""
+    """Value (`value`) of an observation: [B, O] -> [B], and the memory after."""
 
     config: AlgoConfig
 
     @nn.compact
-    def __call__(self, observation: jax.Array) -> jax.Array:
+    def __call__(
+        self,
+        observation: jax.Array,
+        memory: jax.Array | None = None,
+        begins: jax.Array | None = None,
+    ) -> tuple[jax.Array, jax.Array | None]:
         features = _torso(self.config)(observation)
-        return _layer(self.config, features, 1, _HEAD_GAIN, "value")(features)[..., 0]
+        if memory is not None:
+            gru = Gru(_memory_size(self.config), name="memory")
+            features, memory = gru(features, memory, begins)
+        found = _layer(self.config, features, 1, _HEAD_GAIN, "value")(features)[..., 0]
+        return found, memory
+
+
+def _memory_size(config: AlgoConfig) -> int:
+    assert config.memory_size is not None  # the config has filled it in
+    return config.memory_size
 
 
 def _torso(config: AlgoConfig) -> nn.Module:
@@ -107,20 +131,37 @@ def init_params(
 
     Returns:
         `{"actor": {"torso": {"hidden_0": ..}, "mean": .., "log_std": [U]}, "critic": {"torso":
-        {"hidden_0": ..}, "value": ..}}`, each layer a dict of `kernel` [in, out] and `bias` [out].
+        {"hidden_0": ..}, "value": ..}}`, each layer a dict of `kernel` [in, out] and `bias` [out];
+        with `config.memory`, `{"memory": {"input": .., "recurrent": ..}}` in each besides.
     """
     actor_key, critic_key = jax.random.split(key)
-    observation = jnp.zeros((observation_size,), jnp.float32)
+    observation, memory = jnp.zeros((observation_size,), jnp.float32), begin_memory(config, ())
+    mine, theirs = (None, None) if memory is None else memory
     return {
-        "actor": _Actor(config, action_size).init(actor_key, observation)["params"],
-        "critic": _Critic(config).init(critic_key, observation)["params"],
+        "actor": _Actor(config, action_size).init(actor_key, observation, mine)["params"],
+        "critic": _Critic(config).init(critic_key, observation, theirs)["params"],
     }
+
+
+def begin_memory(config: AlgoConfig, shape: tuple[int, ...]) -> Memory | None:
+    """Returns the memory of episodes that begin.
+
+    Args:
+        config: Says whether, and how much, is remembered.
+        shape: Axes before that of the memory.
+
+    Returns:
+        [*shape, H] each, or None if nothing is remembered.
+    """
+    if config.memory == "none":
+        return None
+    return ppo_memory.begin((*shape, _memory_size(config)))
 
 
 def action_distribution(
     params: Params, config: AlgoConfig, observation: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Computes the diagonal Gaussian of the action.
+    """Computes the diagonal Gaussian of the action of a policy without memory.
 
     Args:
         params: What `init_params` returned.
@@ -131,17 +172,11 @@ def action_distribution(
         The mean [B, U], within -1..1 if the output is tanh, otherwise unbounded, and the standard
         deviation [U], which no observation changes, nor any gradient if it is scheduled.
     """
-    _check_input(params["actor"], observation)
-    actor = _Actor(config, params["actor"]["log_std"].shape[-1])
-    output = actor.apply({"params": params["actor"]}, observation)
-    mean, log_std = cast("tuple[jax.Array, jax.Array]", output)
-    if config.exploration == "scheduled":
-        log_std = jax.lax.stop_gradient(log_std)
-    return mean, jnp.exp(log_std)
+    return recall_action(params, config, observation, None)[:2]
 
 
 def value(params: Params, config: AlgoConfig, observation: jax.Array) -> jax.Array:
-    """Computes the value of an observation.
+    """Computes the value of an observation, of a critic without memory.
 
     Args:
         params: What `init_params` returned.
@@ -151,8 +186,59 @@ def value(params: Params, config: AlgoConfig, observation: jax.Array) -> jax.Arr
     Returns:
         The expected discounted return, [B].
     """
+    return recall_value(params, config, observation, None)[0]
+
+
+def recall_action(
+    params: Params,
+    config: AlgoConfig,
+    observation: jax.Array,
+    memory: jax.Array | None,
+    begins: jax.Array | None = None,
+) -> tuple[jax.Array, jax.Array, jax.Array | None]:
+    """Computes the diagonal Gaussian of the action, and what is remembered.
+
+    Args:
+        params: What `init_params` returned.
+        config: The config that made `params`.
+        observation: [B, O], normalised, or [T, B, O] of sequences.
+        memory: [B, H] of the actor before; None without memory.
+        begins: [T, B] of sequences, whether an episode begins with the step; None of one step.
+
+    Returns:
+        Mean and standard deviation as `action_distribution`, and the memory [B, H] after.
+    """
+    _check_input(params["actor"], observation)
+    actor = _Actor(config, params["actor"]["log_std"].shape[-1])
+    output = actor.apply({"params": params["actor"]}, observation, memory, begins)
+    mean, log_std, after = cast("tuple[jax.Array, jax.Array, jax.Array | None]", output)
+    if config.exploration == "scheduled":
+        log_std = jax.lax.stop_gradient(log_std)
+    return mean, jnp.exp(log_std), after
+
+
+def recall_value(
+    params: Params,
+    config: AlgoConfig,
+    observation: jax.Array,
+    memory: jax.Array | None,
+    begins: jax.Array | None = None,
+) -> tuple[jax.Array, jax.Array | None]:
+    """Computes the value of an observation, and what is remembered.
+
+    Args:
+        params: What `init_params` returned.
+        config: The config that made `params`.
+        observation: As in `recall_action`.
+        memory: [B, H] of the critic before; None without memory.
+        begins: As in `recall_action`.
+
+    Returns:
+        The value [B], or [T, B], and the memory [B, H] after.
+    """
     _check_input(params["critic"], observation)
-    return cast("jax.Array", _Critic(config).apply({"params": params["critic"]}, observation))
+    output = _Critic(config).apply({"params": params["critic"]}, observation, memory, begins)
+    return cast("tuple[jax.Array, jax.Array | None]", output)
 
 
 def beyond_range(mean: jax.Array) -> jax.Array:

@@ -185,10 +185,12 @@ def record(
     mount = electronics.mount(arenas.factors)
     frames = [_look(judge, arenas, np.zeros_like(arenas.pose[..., :2]))]
     over = np.zeros(len(levels), bool)  # by `hold` robots may leave again, and it stays over
+    driver = engine_c.by_policy(judge)
+    memory = driver.init(arenas)
     while len(frames) <= judge.config.step_limit and not over.all():
-        action = np.clip(engine_c.act(judge, arenas), -1.0, 1.0)
-        arenas = engine_c.step(judge, arenas)
-        frames.append(_look(judge, arenas, action))
+        memory, action = driver.act(memory, arenas)
+        arenas = engine_c.step(judge, arenas, action)
+        frames.append(_look(judge, arenas, np.clip(action, -1.0, 1.0)))
         over |= frames[-1].arrived.all(axis=-1)
         report(1)
     every = Frame(*(np.stack(field) for field in zip(*frames, strict=True)))

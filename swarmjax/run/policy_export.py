@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -65,44 +66,55 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
     encoding = resolve_encoding(trained.task, trained.realism)
     chosen = pieces.choose(extension.load(trained.extensions), trained.task, trained.stage)
     described = observation.describe(encoding, chosen.observations)
-    return _own_network(trained.algo) | {
-        "policy": trained.algo.policy,
-        "learners": trained.learners,
-        "activation": trained.algo.activation,
-        "observation": described | {"limit": ppo.OBSERVATION_LIMIT},
-        "action": {
-            "names": list(policy_file.ACTION_NAMES),
-            "units": list(policy_file.ACTION_UNITS),
-            "low": [0.0, -robot.max_turn_rate],
-            "high": [robot.max_speed, robot.max_turn_rate],
-        },
-        "robot": {
-            "preset": files.preset_of("robot", robot),
-            **to_dict(robot),
-        },
-        "sensors": {
-            "preset": files.preset_of("realism", trained.realism),
-            "response": trained.realism.infrared,
-            "range": trained.task.sensor_range,
-            "poses": [list(pose) for pose in epuck.SENSOR_POSES],
-            "height": epuck.SENSOR_HEIGHT,
-            "tilt": epuck.SENSOR_TILT,
-        },
-        "task": {key: getattr(trained.task, key) for key in _TASK}
-        | {"observations": [piece.name for piece in chosen.observations]},
-        "realism": to_dict(trained.realism),
-        "stages": [to_dict(stage) for stage in trained.stage],
-        "extensions": trained.pieces,
-        "config": to_dict(trained),
-        "versions": provenance.versions(),
-        "update": update,
-        "seed": seed,
-    }
+    return (
+        _own_network(trained.algo)
+        | _memory(trained.algo)
+        | {
+            "policy": trained.algo.policy,
+            "learners": trained.learners,
+            "activation": trained.algo.activation,
+            "observation": described | {"limit": ppo.OBSERVATION_LIMIT},
+            "action": {
+                "names": list(policy_file.ACTION_NAMES),
+                "units": list(policy_file.ACTION_UNITS),
+                "low": [0.0, -robot.max_turn_rate],
+                "high": [robot.max_speed, robot.max_turn_rate],
+            },
+            "robot": {
+                "preset": files.preset_of("robot", robot),
+                **to_dict(robot),
+            },
+            "sensors": {
+                "preset": files.preset_of("realism", trained.realism),
+                "response": trained.realism.infrared,
+                "range": trained.task.sensor_range,
+                "poses": [list(pose) for pose in epuck.SENSOR_POSES],
+                "height": epuck.SENSOR_HEIGHT,
+                "tilt": epuck.SENSOR_TILT,
+            },
+            "task": {key: getattr(trained.task, key) for key in _TASK}
+            | {"observations": [piece.name for piece in chosen.observations]},
+            "realism": to_dict(trained.realism),
+            "stages": [to_dict(stage) for stage in trained.stage],
+            "extensions": trained.pieces,
+            "config": to_dict(trained),
+            "versions": provenance.versions(),
+            "update": update,
+            "seed": seed,
+        }
+    )
 
 
 def _own_network(algo: AlgoConfig) -> dict[str, str]:
     """Names the network of an extension, if the policy has one."""
     return {} if algo.network in (None, "mlp") else {"network": algo.network}
+
+
+def _memory(algo: AlgoConfig) -> dict[str, Any]:
+    """Says what the policy remembers, if it does."""
+    if algo.memory == "none":
+        return {}
+    return {"memory": {"kind": algo.memory, "size": algo.memory_size}}
 
 
 def seed_path(path: Path, trained: TrainConfig, seed: int) -> Path:

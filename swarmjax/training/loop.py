@@ -145,7 +145,7 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
         _draw_waiting(program, schedule, state.curriculum, level_key),
         rollout_key,
     )
-    batch = rollout.batch(trajectory, config.algo, shards)
+    batch = rollout.batch(trajectory, config.algo, shards, state.arenas.recall)
     explored = rollout.explore(program, state.learners, config.algo.rollout_length)
     learners, learned = jax.vmap(
         lambda learner, b, k: ppo.update(
@@ -194,7 +194,9 @@ def _assigned(program: Program, curriculum: Curriculum) -> Array:
 def _draw_first(program: Program, schedule: Schedule, curriculum: Curriculum, key: Array) -> Arena:
     """Draws the first episode of each arena of this device."""
     index, cohort = _assigned(program, curriculum)[None], curriculum.cohort
-    return rollout.draw_starts(program.world, schedule.stages, index, cohort, key, program.shards)
+    return rollout.draw_starts(
+        program.world, schedule.stages, index, cohort, key, program.shards, program.config.algo
+    )
 
 
 def _draw_waiting(
@@ -203,7 +205,9 @@ def _draw_waiting(
     """Draws the episodes that wait for the arenas of this device during a rollout."""
     index = jnp.tile(_assigned(program, curriculum), (program.config.waiting, 1))
     cohort = curriculum.cohort
-    return rollout.draw_starts(program.world, schedule.stages, index, cohort, key, program.shards)
+    return rollout.draw_starts(
+        program.world, schedule.stages, index, cohort, key, program.shards, program.config.algo
+    )
 
 
 def _mix(stage: Array, stages: int) -> Array:

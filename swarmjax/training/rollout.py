@@ -17,6 +17,8 @@ from swarmjax.ppo import gae, monte_carlo
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch, LearnerState
+from swarmjax.ppo.memory import Memory
+from swarmjax.ppo.networks import begin_memory
 from swarmjax.shards import ALONE, Shards
 from swarmjax.sim import gaps, physics
 from swarmjax.task import env, extended, level
@@ -38,10 +40,13 @@ class Arena(EnvState):
     Attributes:
       stage: [] index of the stage on which the episode began, int32.
       cohort: [] the curriculum's cohort in which it began, int32.
+      recall: [R, H] of each robot's actor and critic before they see the observation; None if they
+        remember nothing.
     """
 
     stage: Array
     cohort: Array
+    recall: Memory | None = None
 
 
 class Trajectory(NamedTuple):
@@ -57,6 +62,7 @@ class Trajectory(NamedTuple):
       terminated: the robot arrived in this step; by `task.arrival=hold`, all were there at once.
       truncated: the time ran out for the robot.
       valid: a transition to learn from.
+      over: the episode ended with the step; None where nothing is remembered.
     """
 
     observation: Array
@@ -68,6 +74,7 @@ class Trajectory(NamedTuple):
     terminated: Array
     truncated: Array
     valid: Array
+    over: Array | None = None
 
 
 def to_learners(x: Array, learners: int) -> Array:
@@ -100,7 +107,13 @@ def to_arenas(x: Array) -> Array:
 
 
 def draw_starts(
-    world: World, stages: Stage, index: Array, cohort: Array, key: Array, shards: Shards = ALONE
+    world: World,
+    stages: Stage,
+    index: Array,
+    cohort: Array,
+    key: Array,
+    shards: Shards = ALONE,
+    config: AlgoConfig | None = None,
 ) -> Arena:
     """Draws fresh levels: episodes that wait until their arena is free.
 
@@ -115,10 +128,12 @@ def draw_starts(
       cohort: [] the curriculum's cohort.
       key: random key, consumed.
       shards: how the arenas are spread over devices; A counts those of this one.
+      config: says whether robots remember; None: they do not.
 
     Returns:
       [W A] the episodes that wait, packed.
     """
+    memory = None if config is None else begin_memory(config, (world.spacing.robots,))
     waiting, arenas = index.shape
     size = (waiting, arenas // shards.local_streams, level.uniform_count(world.spacing))
     uniforms = shards.draw(key, lambda key: jax.random.uniform(key, size), axis=1)
@@ -128,7 +143,8 @@ def draw_starts(
         stage = task_stage.select(stages, i)
         drawn = extended.draw(uniform, stage, world.spacing, world.drawings)
         begun = vars(env.reset(world, drawn))
-        return Arena(**begun, stage=i.astype(jnp.int32), cohort=jnp.asarray(cohort, jnp.int32))
+        at = i.astype(jnp.int32), jnp.asarray(cohort, jnp.int32)
+        return Arena(**begun, stage=at[0], cohort=at[1], recall=memory)
 
     return jax.vmap(start)(uniforms.reshape(-1, size[-1]), index.ravel())
 
@@ -149,12 +165,12 @@ def collect(
       The arenas, packed; the trajectory; the episodes that ended.
     """
     config = program.config.algo
-    waits = _Waiting(starts, _values(config, learners, starts.observation))
+    waits = _Waiting(starts, *_values(config, learners, starts))
     step = functools.partial(_step, program, learners, waits)
     unpack = functools.partial(physics.unpack, program.world.physics)
     arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
     begun = jnp.zeros_like(arenas.clock)
-    carry = (arenas, _values(config, learners, arenas.observation), begun)
+    carry = (arenas, _values(config, learners, arenas), begun)
     steps = config.rollout_length
     keys = jax.random.split(key, steps)
     (arenas, *_), (trajectory, counts) = jax.lax.scan(step, carry, (keys, 1 + jnp.arange(steps)))
@@ -168,13 +184,19 @@ def explore(program: Program, learners: LearnerState, steps: Array | int) -> Lea
     return jax.vmap(lambda learner: ppo.explore(learner, config, steps * arenas))(learners)
 
 
-def batch(trajectory: Trajectory, config: AlgoConfig, shards: Shards = ALONE) -> Batch:
+def batch(
+    trajectory: Trajectory,
+    config: AlgoConfig,
+    shards: Shards = ALONE,
+    memory: Memory | None = None,
+) -> Batch:
     """Turns a rollout into what the learners learn from.
 
     Args:
       trajectory: [T, L, A, N, ...].
       config: says what a return is.
       shards: how the arenas are spread over devices.
+      memory: [A, R, H] of the arenas before the rollout; None if robots remember nothing.
 
     Returns:
       [L] batches of A groups of T * N samples.
@@ -187,7 +209,7 @@ def batch(trajectory: Trajectory, config: AlgoConfig, shards: Shards = ALONE) ->
         x = jnp.moveaxis(x, 0, 2)
         return x.reshape(*x.shape[:2], -1, *x.shape[4:])
 
-    return Batch(
+    found = Batch(
         observation=group(trajectory.observation),
         action=group(trajectory.action),
         log_prob=group(trajectory.log_prob),
@@ -195,6 +217,12 @@ def batch(trajectory: Trajectory, config: AlgoConfig, shards: Shards = ALONE) ->
         return_=group(returns),
         valid=group(trajectory.valid),
     )
+    over = trajectory.over
+    if memory is None or over is None:
+        return found
+    first = jax.tree.map(lambda x: to_learners(x, over.shape[1]), memory)
+    begins = jnp.concatenate([jnp.zeros_like(over[:1]), over[:-1]])
+    return replace(found, memory=first, begins=group(begins))
 
 
 def _bootstrapped(trajectory: Trajectory, config: AlgoConfig, _: Shards) -> tuple[Array, Array]:
@@ -236,10 +264,12 @@ class _Waiting(NamedTuple):
     Attributes:
       starts: [W A], packed.
       value: [L, W A, N] of their first observations.
+      memory: [L, W A, N, H] of the critic after them; None if nothing is remembered.
     """
 
     starts: Arena
     value: Array
+    memory: Array | None
 
 
 # What `Ended` counts, by name, and how many numbers each is.
@@ -258,7 +288,8 @@ _COUNTS = {
 }
 
 _Counts = tuple[Array, Array, Robots | None]  # counts [A, K], rewards [A], robots
-_Carry = tuple[Arena, Array, Array]  # arenas, their values, how many episodes each has begun
+_Values = tuple[Array, Array | None]  # [L, A, N], and what the critic remembers after
+_Carry = tuple[Arena, _Values, Array]  # arenas, their values, how many episodes each has begun
 
 
 def _step(
@@ -269,18 +300,19 @@ def _step(
     now: tuple[Array, Array],
 ) -> tuple[_Carry, tuple[Trajectory, _Counts]]:
     """One control step of all arenas, the first of a rollout being 1."""
-    (arenas, value, begun), (key, number) = carry, now
+    (arenas, (value, remembered), begun), (key, number) = carry, now
     count = value.shape[0]
     mine = to_learners(arenas.observation, count)
     noise = _noise(program.shards, key, mine.shape[:-1])
     config = program.config.algo
-    action, log_prob = jax.vmap(lambda learner, o, n: ppo.act(learner, config, o, n))(
-        explore(program, learners, number), mine, noise
-    )
+    acting = explore(program, learners, number)
+    action, log_prob, memory = _act(config, acting, mine, noise, arenas.recall)
     arenas, came = jax.vmap(functools.partial(env.step, program.world))(arenas, to_arenas(action))
-    next_value = _values(config, learners, came.observation)
+    if memory is not None and remembered is not None:
+        arenas = replace(arenas, recall=Memory(memory, to_arenas(remembered)))
+    next_value, next_remembered = _values(config, learners, arenas, came.observation)
     ended = _ended(arenas, came, by_robot=program.by_robot)
-    starts, start_value = _next(waits, begun)
+    starts, (start_value, start_remembered) = _next(waits, begun)
     arenas = restart(arenas, starts, came.done)
     over = jnp.broadcast_to(came.done[None, :, None], next_value.shape)
     transition = Trajectory(
@@ -293,9 +325,29 @@ def _step(
         terminated=to_learners(came.terminated, count),
         truncated=to_learners(came.truncated, count),
         valid=to_learners(came.valid, count),
+        over=None if memory is None else over,
     )
-    carry = (arenas, jnp.where(over, start_value, next_value), begun + came.done)
+    values = jnp.where(over, start_value, next_value)
+    if next_remembered is not None and start_remembered is not None:
+        next_remembered = jnp.where(over[..., None], start_remembered, next_remembered)
+    carry = (arenas, (values, next_remembered), begun + came.done)
     return carry, (transition, _to_counts(ended))
+
+
+def _act(
+    config: AlgoConfig,
+    learners: LearnerState,
+    seen: Array,
+    noise: Array,
+    memory: Memory | None,
+) -> tuple[Array, Array, Array | None]:
+    """Draws actions [L, A, N, U]; returns them, their log density and the memory [A, R, H]."""
+    count = seen.shape[0]
+    mine = None if memory is None else to_learners(memory.actor, count)
+    action, log_prob, after = jax.vmap(
+        lambda learner, o, n, m: ppo.recall_act(learner, config, o, n, m)
+    )(learners, seen, noise, mine)
+    return action, log_prob, None if after is None else to_arenas(after)
 
 
 def _noise(shards: Shards, key: Array, shape: tuple[int, ...]) -> Array:
@@ -305,22 +357,28 @@ def _noise(shards: Shards, key: Array, shape: tuple[int, ...]) -> Array:
     return shards.draw(key, lambda key: jax.random.normal(key, size), axis=1)
 
 
-def _next(waits: _Waiting, begun: Array) -> tuple[Arena, Array]:
+def _next(waits: _Waiting, begun: Array) -> tuple[Arena, _Values]:
     """Picks the episode [A] that each arena begins next, and its value [L, A, N]."""
     arenas = begun.shape[0]
     count = waits.starts.cohort.shape[0] // arenas
-    starts, value = waits
+    starts, value, remembered = waits
     if count > 1:
         index = jnp.minimum(begun, count - 1) * arenas + jnp.arange(arenas)
         starts, value = jax.tree.map(lambda x: x[index], starts), value[:, index]
-    return replace(starts, cohort=jnp.where(begun < count, starts.cohort, UNCOUNTED)), value
+        remembered = None if remembered is None else remembered[:, index]
+    starts = replace(starts, cohort=jnp.where(begun < count, starts.cohort, UNCOUNTED))
+    return starts, (value, remembered)
 
 
-def _values(config: AlgoConfig, learners: LearnerState, seen: Array) -> Array:
-    """Values [L, A, N] of observations [A, R, O]."""
+def _values(
+    config: AlgoConfig, learners: LearnerState, arenas: Arena, seen: Array | None = None
+) -> _Values:
+    """Values [L, A, N] of what arenas observe, or of `seen` [A, R, O], after what they remember."""
     count = jax.tree.leaves(learners)[0].shape[0]
-    return jax.vmap(lambda learner, o: ppo.values(learner, config, o))(
-        learners, to_learners(seen, count)
+    observation = arenas.observation if seen is None else seen
+    memory = None if arenas.recall is None else to_learners(arenas.recall.critic, count)
+    return jax.vmap(lambda learner, o, m: ppo.recall_values(learner, config, o, m))(
+        learners, to_learners(observation, count), memory
     )
 
 

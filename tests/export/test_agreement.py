@@ -96,3 +96,96 @@ def test_all_forms_of_a_policy_agree(activation: Activation, learners: int, tmp_
     for name, action in found.items():
         assert action.dtype == np.float32
         np.testing.assert_allclose(action, expected, rtol=0, atol=TOLERANCE, err_msg=name)
+
+
+STEPS, MEMORY = 1_000, 16
+
+
+def _by_flax_steps(arrays: Arrays, seen: np.ndarray, begins: np.ndarray) -> np.ndarray:
+    """Actions [T, R, U] of the networks that were trained, through all steps at once."""
+    config = AlgoConfig(memory="gru", memory_size=MEMORY)
+
+    def act(mine: dict[str, jax.Array], observation: jax.Array) -> jax.Array:
+        def layer(name: str) -> dict[str, jax.Array]:
+            return {part: mine[f"actor/{name}/{part}"] for part in ("kernel", "bias")}
+
+        torso = {f"hidden_{i}": layer(f"hidden_{i}") for i in range(2)}
+        memory = {part: layer(f"memory/{part}") for part in ("input", "recurrent")}
+        heads = {"mean": layer("mean"), "log_std": mine["actor/log_std"]}
+        actor = {"torso": torso, "memory": memory, **heads}
+        moments = normalizer.Normalizer(
+            count=jnp.ones(()),
+            mean=mine["normalizer/mean"],
+            variance=mine["normalizer/std"] ** 2,
+        )
+        features = normalizer.normalize(moments, observation, 10.0)
+        none = jnp.zeros(MEMORY)
+        return networks.recall_action({"actor": actor}, config, features, none, begins)[0]
+
+    mapped = jax.jit(jax.vmap(act, in_axes=(0, 1), out_axes=1))
+    return np.asarray(mapped({name: jnp.asarray(array) for name, array in arrays.items()}, seen))
+
+
+def _by_numpy_steps(trained: Policy, seen: np.ndarray, begins: np.ndarray) -> np.ndarray:
+    found, memory = [], None
+    for now, begun in zip(seen, begins, strict=True):
+        memory = policy.begin(trained, now.shape[:-1]) if begun else memory
+        memory, action = policy.step(trained, memory, now)
+        found.append(action)
+    return np.stack(found)
+
+
+def _by_onnx_steps(trained: Policy, seen: np.ndarray, begins: np.ndarray) -> np.ndarray:
+    pytest.importorskip("onnx", reason="needs the package onnx")
+    runtime = pytest.importorskip("onnxruntime", reason="needs the package onnxruntime")
+    content = export_onnx.render(trained)
+    session = runtime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    found, rows = [], (1,) if trained.is_shared else (1, seen.shape[1])
+    memory = np.zeros((*rows, MEMORY), np.float32)
+    for now, begun in zip(seen, begins, strict=True):
+        fed = {"observation": now.reshape(*rows, -1), "memory": memory * np.float32(not begun)}
+        action, memory = session.run(["action", "memory_after"], fed)
+        found.append(action.reshape(seen.shape[1], -1))
+    return np.stack(found)
+
+
+def _by_c_steps(trained: Policy, seen: np.ndarray, begins: np.ndarray, folder: Path) -> np.ndarray:
+    export_folder.write_folder(folder, export_c.render(trained))
+    flags = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC")
+    subprocess.run(["gcc", *flags, "policy.c", "-lm", "-o", "policy.so"], cwd=folder, check=True)
+    library, into = ctypes.CDLL(str(folder / "policy.so")), ctypes.c_void_p
+    action = np.zeros((*seen.shape[:2], 2), np.float32)
+    memory = np.ones((seen.shape[1], MEMORY), np.float32)
+    for step, begun in enumerate(begins):
+        for robot in range(seen.shape[1]):
+            mine = into(memory[robot].ctypes.data)
+            if begun:
+                library.policy_begin(mine)
+            where = into(seen[step, robot].ctypes.data), mine, into(action[step, robot].ctypes.data)
+            library.policy_action(robot, *where)
+    return action
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs Debian's package gcc")
+@pytest.mark.parametrize("learners", [1, 3])
+def test_all_forms_of_a_policy_that_remembers_agree_over_a_thousand_steps(
+    learners: int, tmp_path: Path
+) -> None:
+    plain = policies.arrays(hidden=AlgoConfig().hidden_sizes, learners=learners)
+    arrays = policies.remembering(plain, MEMORY)
+    said = several(learners) | {"memory": {"kind": "gru", "size": MEMORY}}
+    trained = saved(tmp_path / "policy.npz", arrays, **said)
+    seen = policies.seen(trained, STEPS)
+    begins = np.arange(STEPS) % 300 == 0
+    expected = _by_numpy_steps(trained, seen, begins)
+    found = {
+        "Flax": _by_flax_steps(arrays, seen, begins),
+        "ONNX": _by_onnx_steps(trained, seen, begins),
+        "C": _by_c_steps(trained, seen, begins, tmp_path / "c"),
+    }
+    for name, action in found.items():
+        assert action.dtype == np.float32
+        # The memory forgets: differences of one step do not add up over a thousand.
+        np.testing.assert_allclose(action, expected, rtol=0, atol=TOLERANCE, err_msg=name)
+    # And it matters: the same observations after others, or none, give other actions.
+    assert np.abs(expected - _by_numpy_steps(trained, seen, begins | True)).max() > 0.1

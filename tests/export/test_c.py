@@ -55,6 +55,27 @@ def test_it_builds_without_warnings_and_its_self_test_passes(
     assert _run(folder, "./self_test").returncode == 0
 
 
+@needs_gcc
+@pytest.mark.parametrize("learners", [1, 3])
+def test_one_that_remembers_builds_without_warnings_and_its_self_test_passes(
+    learners: int, tmp_path: Path
+) -> None:
+    given = policies.remembering(policies.arrays(hidden=(16, 7), learners=learners), 5)
+    said = several(learners) | {"memory": {"kind": "gru", "size": 5}}
+    folder = _written(tmp_path / "c", saved(tmp_path / "p.npz", given, **said))
+    built = _run(folder, "gcc", *STRICT, "policy.c", "policy_test.c", "-lm", "-o", "self_test")
+    assert (built.returncode, built.stdout, built.stderr) == (0, "", "")
+    assert _run(folder, "./self_test").returncode == 0
+    source = (folder / "policy.c").read_text()
+    (folder / "policy.c").write_text(
+        source.replace("- recalled[i]", "+ recalled[i]").replace(
+            "(recalled[i] - fresh)", "(recalled[i])"
+        )
+    )
+    _run(folder, "gcc", "-std=c99", "policy.c", "policy_test.c", "-lm", "-o", "self_test")
+    assert _run(folder, "./self_test").returncode != 0
+
+
 @pytest.mark.parametrize(
     ("said", "holds"), [({}, 0), ({"arrival": "latch"}, 0), ({"arrival": "hold"}, 1)]
 )

@@ -48,8 +48,8 @@ void policy_observe(const float quantity[POLICY_OBSERVATIONS],
     }
 }
 
-void policy_action(unsigned learner, const float observation[POLICY_OBSERVATIONS],
-                   float action[POLICY_ACTIONS])
+${memory_code}void policy_action(unsigned learner, const float observation[POLICY_OBSERVATIONS],
+                   ${memory_parameter}float action[POLICY_ACTIONS])
 {
     float a[WIDEST], b[WIDEST];
     learner %= POLICY_LEARNERS;

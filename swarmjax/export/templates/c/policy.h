@@ -27,14 +27,14 @@ $action
 #define POLICY_TARGET_RADIUS $target_radius_f /* m, distance to the target that counts as arrival */
 #define POLICY_HOLDS $holds /* 1: it drives on within that distance; 0: the robot is to stop there for good */
 
-/* Scales quantities, in the units above, to an observation. */
+$memory_type/* Scales quantities, in the units above, to an observation. */
 void policy_observe(const float quantity[POLICY_OBSERVATIONS],
                     float observation[POLICY_OBSERVATIONS]);
 
 /* Computes the most likely action; -1..1 spans the commands, but it may lie beyond. `learner` is
  * the robot's number, modulo POLICY_LEARNERS: any number will do if all robots share the policy. */
 void policy_action(unsigned learner, const float observation[POLICY_OBSERVATIONS],
-                   float action[POLICY_ACTIONS]);
+                   ${memory_parameter}float action[POLICY_ACTIONS]);
 
 /* Draws an action from the policy, as robots do when it is judged, around its most likely one:
  * `normal` are standard normal numbers, independent of each other and of those before. Robots that

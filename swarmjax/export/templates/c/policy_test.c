@@ -37,9 +37,9 @@ static int agrees(const float *found, const float *expected)
 
 int main(void)
 {
-    for (int i = 0; i < CASES; i++) {
+$memory_begin    for (int i = 0; i < CASES; i++) {
         float action[POLICY_ACTIONS];
-        policy_action((unsigned)i % POLICY_LEARNERS, OBSERVATION[i], action);
+$memory_reset        policy_action((unsigned)i % POLICY_LEARNERS, OBSERVATION[i], ${memory_argument}action);
         if (!agrees(action, ACTION[i])) {
             return 1 + i;
         }

@@ -1,0 +1,101 @@
+"""What robots remember: a gated recurrent unit (GRU) between the hidden layers and the heads.
+
+Cho et al. 2014, "Learning Phrase Representations using RNN Encoder-Decoder", section 2.3, with the
+reset gate behind the recurrent product, as in cuDNN, PyTorch, Flax and ONNX
+(`linear_before_reset=1`). The heads see the hidden layers' features beside the memory, so that a
+policy which remembers nothing of use is no worse than one without.
+
+B stands for any number of leading axes, T for control steps, F for features, H for the memory.
+"""
+
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+
+class Memory(NamedTuple):
+    """What actor and critic remember before they see an observation, [B, H] each."""
+
+    actor: Any
+    critic: Any
+
+
+def begin(shape: tuple[int, ...]) -> Memory:
+    """Returns the memory [B, H] of episodes that begin."""
+    return Memory(jnp.zeros(shape, jnp.float32), jnp.zeros(shape, jnp.float32))
+
+
+class Gru(nn.Module):
+    """A GRU with its three gates side by side: reset, update, candidate.
+
+    Attributes:
+        size: H.
+    """
+
+    size: int
+
+    @nn.compact
+    def __call__(
+        self, features: jax.Array, memory: jax.Array, begins: jax.Array | None = None
+    ) -> tuple[jax.Array, jax.Array]:
+        """Remembers one observation, or a sequence of them.
+
+        Args:
+            features: [B, F], or [T, B, F] of a sequence.
+            memory: [B, H] before.
+            begins: [T, B] of a sequence, whether an episode begins with this step, which then
+                remembers nothing of what was before.
+
+        Returns:
+            What the heads take, features beside memory [.., F + H], and the memory [B, H] after.
+        """
+        seen = nn.Dense(3 * self.size, kernel_init=_INPUT, name="input")(features)
+        recurrent = nn.Dense(3 * self.size, kernel_init=_recurrent, name="recurrent")
+        if begins is None:
+            memory = remember(seen, recurrent(memory), memory)
+            return jnp.concatenate([features, memory], axis=-1), memory
+        chex.assert_equal_shape_prefix([features, begins], begins.ndim)
+
+        def step(memory: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[Any, Any]:
+            seen, begins = now
+            memory = jnp.where(begins[..., None], 0.0, memory)
+            memory = remember(seen, recurrent(memory), memory)
+            return memory, memory
+
+        if self.is_initializing():
+            recurrent(memory)
+        memory, every = jax.lax.scan(step, memory, (seen, begins))
+        return jnp.concatenate([features, every], axis=-1), memory
+
+
+def remember(seen: jax.Array, recalled: jax.Array, memory: jax.Array) -> jax.Array:
+    """Computes what is remembered after an observation.
+
+    Args:
+        seen: [B, 3 H], features times the kernel of what is seen, and its bias.
+        recalled: [B, 3 H], the memory times the kernel of what is recalled, and its bias.
+        memory: [B, H] before.
+
+    Returns:
+        The memory [B, H] after, within -1..1.
+    """
+    reset, update, candidate = jnp.split(seen, 3, axis=-1)
+    reset_, update_, candidate_ = jnp.split(recalled, 3, axis=-1)
+    fresh = jnp.tanh(candidate + nn.sigmoid(reset + reset_) * candidate_)
+    kept = nn.sigmoid(update + update_)
+    return fresh + kept * (memory - fresh)
+
+
+# Flax's own choice for its GRU: Glorot's for what is seen, orthogonal for what is recalled.
+_INPUT = nn.initializers.lecun_normal()
+
+
+def _recurrent(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
+    """Draws one orthogonal matrix [H, H] a gate, side by side."""
+    rows, columns = shape
+    make = nn.initializers.orthogonal()
+    gates = [make(each, (rows, columns // 3), dtype) for each in jax.random.split(key, 3)]
+    return jnp.concatenate(gates, axis=-1)
