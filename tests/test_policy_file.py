@@ -90,12 +90,32 @@ def _part(part: str, **changes: Any) -> dict[str, Any]:
 
 
 _GOOD = policies.arrays()
+_RECALLS = policies.remembering(_GOOD, 5)
+_MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
 
 
 @pytest.mark.parametrize(
     ("arrays", "meta", "sentence"),
     [
         (_without("actor/mean/bias"), {}, r"actor/mean/bias is missing"),
+        (_GOOD, _MEMORY, r"actor/memory/input/kernel is missing"),
+        (_RECALLS, {}, r"actor/mean/kernel has shape \[1, 8, 2\]: expected \[1, 3, 2\]"),
+        (
+            _RECALLS,
+            _MEMORY | {"memory": {"kind": "lstm", "size": 5}},
+            r'meta.memory.kind is "lstm": expec',
+        ),
+        (
+            _RECALLS,
+            _MEMORY | {"memory": {"kind": "gru", "size": 0}},
+            r"meta.memory.size is 0: expected 1 to",
+        ),
+        (
+            _RECALLS,
+            _MEMORY | {"memory": {"kind": "gru", "size": 4}},
+            r"actor/mean/kernel has shape \[1, 8, 2\]: expected \[1, 7, 2\]",
+        ),
+        (_RECALLS, _MEMORY | {"network": "mine"}, r"meta.memory is there beside meta.network"),
         (_without("actor/hidden_0/kernel"), {}, r"actor/hidden_0/kernel is missing"),
         (_without("normalizer/std"), {}, r"normalizer/std is missing"),
         (_with("critic/bias", _f32([1])), {}, r'"critic/bias.npy" is not known: format 2'),
@@ -141,8 +161,8 @@ _GOOD = policies.arrays()
         (
             _GOOD,
             {"format": 1},
-            r"meta.format is 1, but this version reads 2, and 3 with meta.network: export the "
-            "policy",
+            r"meta.format is 1, but this version reads 2, 3 with meta.network, and 4 with meta.memory: "
+            "export the policy",
         ),
         (_GOOD, {"activation": "gelu"}, r'meta.activation is "gelu": expected tanh or relu or sw'),
         (_GOOD, {"policy": "mine"}, r'meta.policy is "mine": expected shared or independent'),

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+import policies
 import pytest
 import steering
 from policies import EMBODIMENT
@@ -278,6 +279,25 @@ def test_the_engines_of_the_command_agree(
     np.testing.assert_allclose(mjx.found["spl"][0, free], c.found["spl"][0, free], atol=2e-3)
     for name in ("targets_reached", "all_reached", "contacts_per_robot"):
         np.testing.assert_array_equal(mjx.found[name][0, free], c.found[name][0, free])
+
+
+def test_the_engines_agree_on_a_policy_that_remembers(tmp_path: Path) -> None:
+    given = policies.remembering(_arrays((STEER,)), 6)
+    head = given["actor/mean/kernel"]
+    head[:, 2:] *= 0.3  # beside the steering, of as many numbers as the bearing has
+    path = tmp_path / "policy.npz"
+    said = policies.meta(activation="relu", memory={"kind": "gru", "size": 6})
+    policy_file.write(path, given | {"actor/log_std": np.full((1, 2), -3.0, np.float32)}, said)
+    c, mjx = (_judge(path, STAGES[0], engine, episodes=8).trials[0] for engine in ("c", "mjx"))
+    free = c.found["contacts_per_robot"][0] == 0.0
+    assert free.sum() > 2
+    np.testing.assert_allclose(mjx.found["spl"][0, free], c.found["spl"][0, free], atol=2e-3)
+    # Without its memory it drives another way.
+    none = {name: array * ("memory" not in name) for name, array in given.items()}
+    other = tmp_path / "other.npz"
+    policy_file.write(other, none | {"actor/log_std": np.full((1, 2), -3.0, np.float32)}, said)
+    forgetful = _judge(other, STAGES[0], "c", episodes=8).trials[0]
+    assert np.abs(forgetful.found["spl"] - c.found["spl"])[0, free].max() > 0.01
 
 
 def test_boxes_beyond_what_the_engine_is_compiled_for_are_refused() -> None:

@@ -1,6 +1,7 @@
 """The gated recurrent unit: its equations, its gradient through time, and where it forgets."""
 
 import functools
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import linen as nn
+from jax.flatten_util import ravel_pytree
 
 from swarmjax.config import ConfigError
 from swarmjax.ppo import learner, losses, networks
@@ -22,6 +24,11 @@ STEPS, ROWS, WIDTH, SIZE = 6, 3, 4, 5
 
 def _drawn(*shape: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+
+
+def _run(made: Gru, params: Any, *given: Any) -> tuple[np.ndarray, np.ndarray]:
+    found: Any = made.apply(params, *given)
+    return np.asarray(found[0]), np.asarray(found[1])
 
 
 def _gru() -> tuple[Gru, Any]:
@@ -46,8 +53,9 @@ def test_the_unit_is_that_of_flax() -> None:
         theirs[f"i{gate}"] = {k: mine["input"][k][..., part] for k in ("kernel", "bias")}
         theirs[f"h{gate}"] = {"kernel": mine["recurrent"]["kernel"][:, part]}
     theirs["hn"]["bias"] = mine["recurrent"]["bias"][2 * SIZE :]
-    (beside, after) = made.apply(params, features, memory)
-    expected, _ = nn.GRUCell(SIZE).apply({"params": theirs}, memory, features)
+    beside, after = _run(made, params, features, memory)
+    cell: Any = nn.GRUCell(SIZE)
+    expected, _ = cell.apply({"params": theirs}, memory, features)
     np.testing.assert_allclose(after, expected, atol=1e-6)  # float32, numbers of about 1
     np.testing.assert_array_equal(beside, np.concatenate([features, after], axis=-1))
 
@@ -57,11 +65,11 @@ def test_a_sequence_is_its_steps_one_by_one_and_forgets_where_an_episode_begins(
     features, memory = _drawn(STEPS, ROWS, WIDTH), _drawn(ROWS, SIZE, seed=1)
     begins = np.zeros((STEPS, ROWS), bool)
     begins[2, 0] = begins[4, 1] = begins[0, 2] = True
-    found, last = made.apply(params, features, memory, begins)
+    found, last = _run(made, params, features, memory, begins)
     now = memory
     for step in range(STEPS):
         now = np.where(begins[step][:, None], 0.0, now)
-        beside, now = made.apply(params, features[step], now)
+        beside, now = _run(made, params, features[step], now)
         np.testing.assert_allclose(found[step], beside, atol=1e-6)
     np.testing.assert_allclose(last, now, atol=1e-6)
 
@@ -72,7 +80,8 @@ def test_nothing_leaks_over_the_border_of_an_episode() -> None:
     begins = jnp.zeros((STEPS, ROWS), bool).at[3].set(True)
 
     def after(features: jax.Array) -> jax.Array:
-        return jnp.sum(made.apply(params, features, memory, begins)[0][3:] ** 2)
+        found: Any = made.apply(params, features, memory, begins)
+        return jnp.sum(found[0][3:] ** 2)
 
     gradient = np.asarray(jax.grad(after)(features))
     assert (gradient[:3] == 0.0).all()
@@ -107,7 +116,7 @@ def test_the_gradient_through_time_is_that_of_finite_differences() -> None:
             lambda x: x.astype(float) if x.dtype == jnp.float32 else x, _minibatch()
         )
         params = networks.init_params(jax.random.key(0), CONFIG, WIDTH, 2)
-        flat, tree = jax.flatten_util.ravel_pytree(jax.tree.map(lambda x: x.astype(float), params))
+        flat, tree = ravel_pytree(jax.tree.map(lambda x: x.astype(float), params))
         towards = np.random.default_rng(0).normal(size=(4, len(flat)))
 
         def loss(flat: jax.Array) -> jax.Array:
@@ -138,7 +147,7 @@ def _play(config: AlgoConfig, state: Any, key: jax.Array) -> tuple[Batch, jax.Ar
 
     def step(carry: Any, now: Any) -> tuple[Any, Any]:
         mine, theirs = carry
-        action, log_prob, mine = learner.recall_act(state, config, *now, mine)
+        action, log_prob, mine = learner.recall_act(state, config, now[0], now[1], mine)
         value, theirs = learner.recall_values(state, config, now[0], theirs)
         return (mine, theirs), (action, log_prob, value)
 
@@ -153,9 +162,10 @@ def _play(config: AlgoConfig, state: Any, key: jax.Array) -> tuple[Batch, jax.Ar
     begins = jnp.broadcast_to(clock == 0, shown.shape)
     parts = (seen, action, log_prob, advantage, return_, jnp.ones_like(over), begins)
     grouped = [jnp.moveaxis(x, 0, 1) for x in parts]
-    batch = Batch(*[], **dict(zip(_FIELDS, grouped[:6], strict=True)))
+    batch = Batch(**dict(zip(_FIELDS, grouped[:6], strict=True)))
     if memory is not None:
-        batch = batch.replace(memory=jax.tree.map(lambda x: x[:, None], memory), begins=grouped[6])
+        groups = jax.tree.map(lambda x: x[:, None], memory)
+        batch = replace(batch, memory=groups, begins=grouped[6])
     return batch, jnp.sum(reward) / _WORLDS
 
 

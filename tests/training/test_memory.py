@@ -1,0 +1,101 @@
+"""Robots that remember, in training: what the learners recompute, and runs bit for bit."""
+
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmjax.ppo import learner as ppo
+from swarmjax.ppo import losses, networks
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.learner import Batch, LearnerState
+from swarmjax.run.checkpoint import digest, to_leaves
+from swarmjax.run.settings import TrainConfig
+from swarmjax.training import loop, rollout
+from swarmjax.training import program as programs
+from swarmjax.training.loop import TrainState
+from swarmjax.training.program import Program
+from swarmjax.training.rollout import Arena, Trajectory
+
+SIZE, UPDATES = 4, 6
+
+
+class Trained(NamedTuple):
+    """A run of some updates, one by one, and the rollout that comes next."""
+
+    program: Program
+    states: list[TrainState]
+    arenas: Arena
+    trajectory: Trajectory
+    batch: Batch
+
+
+def _algo(config: TrainConfig, policy: str) -> AlgoConfig:
+    algo = replace(config.algo, memory="gru", memory_size=SIZE)
+    return AlgoConfig(**{**vars(algo), "policy": policy})
+
+
+@pytest.fixture(scope="module", params=["shared", "independent"])
+def trained(request: pytest.FixtureRequest, tiny_config: TrainConfig) -> Trained:
+    config = replace(tiny_config, algo=_algo(tiny_config, request.param))
+    program, schedule = programs.load(config)
+    chunk = jax.jit(partial(loop.train_chunk, program))
+    states = [jax.jit(partial(loop.init, program))(schedule)]
+    for _ in range(UPDATES):
+        states.append(chunk(schedule, states[-1], np.int32(1))[0])
+    at_once, _ = chunk(schedule, states[0], np.int32(UPDATES))
+    assert digest(to_leaves(at_once)) == digest(to_leaves(states[-1]))  # any chunk size
+    last = states[-1]
+    waiting = loop._draw_waiting(program, schedule, last.curriculum, jax.random.key(1))
+    collect = jax.jit(partial(rollout.collect, program))
+    # In the middle of their episodes, which end at 16 steps.
+    before = replace(last.arenas, clock=jnp.array([0, 0, 9, 10, 11, 12, 13, 0], jnp.int32))
+    arenas, trajectory, _ = collect(last.learners, before, waiting, jax.random.key(2))
+    batch = rollout.batch(trajectory, config.algo, memory=before.recall)
+    return Trained(program, states, arenas, trajectory, batch)
+
+
+def _one(learners: LearnerState) -> LearnerState:
+    return jax.tree.map(lambda x: x[0], learners)
+
+
+def test_what_is_recomputed_through_time_is_what_the_rollout_saw(trained: Trained) -> None:
+    config, learners = trained.program.config.algo, trained.states[-1].learners
+    batch = jax.tree.map(lambda x: x[0], trained.batch)
+    samples = ppo._samples(_one(learners), config, batch, ppo.ALONE)
+    # Arenas in another order, as minibatches have them.
+    rows = jnp.array([3, 0, 7, 1, 2, 6, 5, 4])
+    minibatch = ppo._gather(samples, rows, config)
+    mean, std, value = losses._evaluate(_one(learners).params, config, minibatch)
+    log_prob = networks.log_prob(mean, std, minibatch.action)
+    valid = np.asarray(minibatch.valid)
+    assert valid.sum() > 50
+    assert np.asarray(trained.trajectory.over).any()  # episodes end within it
+    tolerance = {"rtol": 0, "atol": 2e-6}  # float32; products of a batch of another size
+    np.testing.assert_allclose(log_prob[valid], minibatch.log_prob[valid], **tolerance)
+    seen = np.asarray(trained.trajectory.value[:, 0])[:, rows].reshape(-1)
+    np.testing.assert_allclose(value[valid], seen[valid], **tolerance)
+
+
+def test_a_robot_forgets_where_its_episode_begins(trained: Trained) -> None:
+    over, recall = trained.trajectory.over, trained.arenas.recall
+    assert over is not None
+    assert recall is not None
+    over = np.asarray(over[-1, 0, :, 0])
+    begun = np.asarray(trained.arenas.clock) == 0
+    np.testing.assert_array_equal(begun, over)
+    assert (np.asarray(recall.actor)[begun] == 0.0).all()
+    assert (np.abs(recall.actor)[~begun].max(axis=(1, 2)) > 0.0).all()
+    assert (np.asarray(recall.critic)[begun] == 0.0).all()
+
+
+def test_a_memory_is_trained(trained: Trained) -> None:
+    first, last = (to_leaves(trained.states[i]) for i in (0, -1))
+    for part in ("input", "recurrent"):
+        for side in ("actor", "critic"):
+            name = f"learners/params/{side}/memory/{part}/kernel"
+            assert np.abs(last[name] - first[name]).max() > 1e-4, name
