@@ -13,13 +13,13 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from benchmarks import key_value
 from swarmjax import command, provenance
-from swarmjax.config import ConfigError, Section, about, build, files, reading
+from swarmjax.config import ConfigError, Section, about, build, files, reading, show
 from swarmjax.evaluate import cells
 from swarmjax.evaluate.cells import Cell, Suite
 from swarmjax.evaluate.suite_config import SUITE_SEED
@@ -44,11 +44,13 @@ class Draw(NamedTuple):
     """A puzzle with starts and targets.
 
     Attributes:
+      number: of the level in its cell.
       rows: of the layout, `#` blocked and `.` free.
       start: [R] places of the robots, no two alike.
       target: [R] of their targets, no two alike.
     """
 
+    number: int
     rows: tuple[str, ...]
     start: tuple[Place, ...]
     target: tuple[Place, ...]
@@ -60,10 +62,18 @@ class PuzzlesConfig(Section):
 
     out: str = field(metadata=about("file .npz for the levels"))
     cell: float = field(default=EDGE, metadata=about("edge of a cell of a puzzle, m", 0.08, 0.3))
+    robots: tuple[int, ...] = field(
+        default=ROBOTS, metadata=about("numbers of robots, a cell of the suite each", 1, 4)
+    )
+    draws: int = field(
+        default=DRAWS, metadata=about("of starts and targets, for each puzzle", 1, 1000)
+    )
 
     def _check(self) -> None:
         if Path(self.out).suffix != ".npz":
             raise ConfigError(f"out is {reading.called(self.out)}: give a file .npz.")
+        if not self.robots or len(set(self.robots)) < len(self.robots):
+            raise ConfigError(f"robots is {show(self.robots)}: give some of 1 to 4, each once.")
 
 
 def layouts() -> dict[str, tuple[str, ...]]:
@@ -109,20 +119,20 @@ def fewest_steps(draw: Draw) -> int | None:
         int(np.ravel_multi_index([place.index(each) for each in ends], shape))
         for ends in (draw.start, draw.target)
     )
-    seen = np.zeros(np.prod(shape), bool)
+    seen = np.zeros(len(place) ** len(shape), bool)
     edge, steps = np.array([start]), 0
     while len(edge):
         seen[edge] = True
         if seen[goal]:
             return steps
-        reached = np.zeros_like(seen)
+        reached = np.zeros(seen.shape, bool)
         reached[_successors(np.stack(np.unravel_index(edge, shape), axis=-1), beside)] = True
         edge, steps = np.flatnonzero(reached & ~seen), steps + 1
     return None
 
 
-def _successors(state: np.ndarray, beside: np.ndarray) -> np.ndarray:
-    """Numbers of the states that follow some states [F, R], robots moved one after the other."""
+def _successors(state: np.ndarray, beside: np.ndarray) -> Any:
+    """Numbers [K] of the states that follow some states [F, R], robots moved one after the other."""
     before, after = state, state[:, :0]
     for robot in range(state.shape[1]):
         row, option = np.nonzero(beside[before[:, robot]] >= 0)
@@ -135,24 +145,28 @@ def _successors(state: np.ndarray, beside: np.ndarray) -> np.ndarray:
     return np.ravel_multi_index(tuple(after.T), (len(beside),) * state.shape[1])
 
 
-def draw_ends(rows: Sequence[str], robots: int, random: np.random.Generator) -> Draw:
+def draw_puzzle(number: int, rows: Sequence[str], robots: int) -> Draw:
     """Draws starts and targets: each target can be reached from its start, and is another place.
 
     Args:
+      number: of the level.
       rows: of the layout.
       robots: how many.
-      random: numbers.
 
     Returns:
       The puzzle, of all that are so each as likely.
     """
     place, beside = near(rows)
-    part = _parts(beside)
+    part, random = _parts(beside), _random(robots, number)
     while True:
         start, target = (random.permutation(len(place))[:robots] for _ in range(2))
         if (start != target).all() and (part[start] == part[target]).all():
             ends = (tuple(place[i] for i in each) for each in (start, target))
-            return Draw(tuple(rows), *ends)
+            return Draw(number, tuple(rows), *ends)
+
+
+def _random(*key: int) -> np.random.Generator:
+    return np.random.default_rng([SEED, *key])
 
 
 def _parts(beside: np.ndarray) -> np.ndarray:
@@ -166,14 +180,13 @@ def _parts(beside: np.ndarray) -> np.ndarray:
 # --- arenas
 
 
-def to_level(draw: Draw, edge: float, boxes: int, random: np.random.Generator) -> Level:
+def to_level(draw: Draw, edge: float, boxes: int) -> Level:
     """Makes a puzzle's arena: a map of the task, robots in the middle of cells, any way round.
 
     Args:
       draw: the puzzle.
       edge: of a cell, m.
       boxes: of the level; those that the walls do not need are absent.
-      random: numbers for headings and the level's seed.
 
     Returns:
       The level of one arena.
@@ -182,6 +195,7 @@ def to_level(draw: Draw, edge: float, boxes: int, random: np.random.Generator) -
     ends, robots, count = np.array([each.pair[0] for each in read]), len(read), len(read[0].wall)
     obstacle = np.full((boxes, 5), 0.5 * edge)
     obstacle[:count] = read[0].wall
+    random = _random(robots, draw.number, 1)
     yaw = random.uniform(-np.pi, np.pi, robots)
     found = Level(
         side=np.float32(read[0].side),
@@ -203,19 +217,20 @@ def _read(rows: Sequence[str], start: Place, target: Place, edge: float) -> maps
     return maps.read(["".join(row) for row in letters], edge)
 
 
-def draw_puzzles(robots: int) -> list[Draw]:
-    """Draws the puzzles of a cell: `DRAWS` of each layout, one layout after the other.
+def draw_puzzles(robots: int, draws: int) -> list[Draw]:
+    """Draws the puzzles of a cell, those of one layout after the other.
 
     Args:
       robots: how many.
+      draws: for each layout; fewer are the first of more, up to `DRAWS`.
 
     Returns:
       The puzzles.
     """
     return [
-        draw_ends(rows, robots, np.random.default_rng([SEED, robots, i, number]))
+        draw_puzzle(max(draws, DRAWS) * i + k, rows, robots)
         for i, rows in enumerate(layouts().values())
-        for number in range(DRAWS)
+        for k in range(draws)
     ]
 
 
@@ -231,10 +246,10 @@ def make_cell(puzzles: Sequence[Draw], edge: float) -> Cell:
     """
     robots = len(puzzles[0].start)
     stage = max((_stage(each.rows, robots, edge) for each in puzzles), key=lambda x: x.obstacles)
-    random = np.random.default_rng([SEED, robots])
-    drawn = [to_level(each, edge, stage.obstacles, random) for each in puzzles]
+    drawn = [to_level(each, edge, stage.obstacles) for each in puzzles]
     levels = Level(*(np.stack(fields) for fields in zip(*drawn, strict=True)))
-    return Cell(stage.name, stage, "box", None, SEED, np.arange(len(drawn)), levels, STEPS)
+    episodes = np.array([each.number for each in puzzles])
+    return Cell(stage.name, stage, "box", None, SEED, episodes, levels, STEPS)
 
 
 def _stage(rows: Sequence[str], robots: int, edge: float) -> StageConfig:
@@ -251,7 +266,7 @@ def _stage(rows: Sequence[str], robots: int, edge: float) -> StageConfig:
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings = key_value.load(PuzzlesConfig, arguments)
-    puzzles = {robots: draw_puzzles(robots) for robots in ROBOTS}
+    puzzles = {robots: draw_puzzles(robots, settings.draws) for robots in settings.robots}
     made = {robots: make_cell(drawn, settings.cell) for robots, drawn in puzzles.items()}
     cells.write(Path(settings.out), Suite("puzzles", tuple(made.values())))
     for robots, drawn in puzzles.items():
@@ -270,7 +285,7 @@ def _line(cell: Cell, puzzles: Sequence[Draw]) -> dict[str, object]:
         "episodes": len(steps),
         "solvable": len(solved),
         "fewest_steps": {"mean": float(np.mean(solved)), "largest": max(solved)},
-        "unsolvable": [i for i, each in enumerate(steps) if each is None],
+        "unsolvable": [p.number for p, each in zip(puzzles, steps, strict=True) if each is None],
         "edge_m": cell.stage.cell,
         "steps": cell.steps,
         "digest": cell.digest,
