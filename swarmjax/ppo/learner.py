@@ -18,7 +18,7 @@ from swarmjax.ppo import dispatch, exploration, losses, networks, normalizer, op
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.dispatch import Backend
 from swarmjax.ppo.losses import Metrics, Minibatch
-from swarmjax.ppo.memory import Memory
+from swarmjax.ppo.memory import Recall
 from swarmjax.ppo.networks import Params
 from swarmjax.ppo.normalizer import Normalizer
 from swarmjax.ppo.optimizer import Progress
@@ -72,7 +72,7 @@ class Batch:
     advantage: jax.Array
     return_: jax.Array
     valid: jax.Array
-    memory: Memory | None = None
+    memory: Recall | None = None
     begins: jax.Array | None = None
 
 

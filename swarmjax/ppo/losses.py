@@ -7,7 +7,7 @@ from flax import struct
 
 from swarmjax.ppo import networks
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.memory import Memory
+from swarmjax.ppo.memory import Recall
 from swarmjax.ppo.networks import Params
 
 Metrics = dict[str, jax.Array]
@@ -35,7 +35,7 @@ class Minibatch:
     advantage: jax.Array
     return_: jax.Array
     valid: jax.Array
-    memory: Memory | None = None
+    memory: Recall | None = None
     begins: jax.Array | None = None
 
 

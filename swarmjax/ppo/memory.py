@@ -16,16 +16,16 @@ import jax.numpy as jnp
 from flax import linen as nn
 
 
-class Memory(NamedTuple):
+class Recall(NamedTuple):
     """What actor and critic remember before they see an observation, [B, H] each."""
 
     actor: Any
     critic: Any
 
 
-def begin(shape: tuple[int, ...]) -> Memory:
+def begin(shape: tuple[int, ...]) -> Recall:
     """Returns the memory [B, H] of episodes that begin."""
-    return Memory(jnp.zeros(shape, jnp.float32), jnp.zeros(shape, jnp.float32))
+    return Recall(jnp.zeros(shape, jnp.float32), jnp.zeros(shape, jnp.float32))
 
 
 class Gru(nn.Module):

@@ -18,7 +18,7 @@ from swarmjax.config import ConfigError
 from swarmjax.extension import Network, describe
 from swarmjax.ppo import memory as ppo_memory
 from swarmjax.ppo.config import AlgoConfig, resolve
-from swarmjax.ppo.memory import Gru, Memory
+from swarmjax.ppo.memory import Gru, Recall
 
 Params = dict[str, Any]
 
@@ -143,7 +143,7 @@ def init_params(
     }
 
 
-def begin_memory(config: AlgoConfig, shape: tuple[int, ...]) -> Memory | None:
+def begin_memory(config: AlgoConfig, shape: tuple[int, ...]) -> Recall | None:
     """Returns the memory of episodes that begin.
 
     Args:

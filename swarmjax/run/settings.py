@@ -326,7 +326,15 @@ def load_train(
 
 
 # Of the learner, what a run with init_from has to share with the run that it begins with.
-_SHARED = ("policy", "network", "hidden_sizes", "activation", "mean_activation")
+_SHARED = (
+    "policy",
+    "network",
+    "hidden_sizes",
+    "memory",
+    "memory_size",
+    "activation",
+    "mean_activation",
+)
 
 
 def _inherited(typed: Sequence[str]) -> list[str]:

@@ -143,6 +143,13 @@ def _check_alike(init_from: str, stored: TrainConfig, settings: TrainConfig) -> 
             show(settings.algo.hidden_sizes),
             f"algo.hidden_sizes={hidden}",
         ),
+        *(
+            (f"algo.{key}", held, wanted, f"algo.{key}={held}")
+            for key in ("memory", "memory_size")
+            for held, wanted in [
+                tuple(show(getattr(each.algo, key), quote="") for each in (stored, settings))
+            ]
+        ),
         ("algo.activation", activation, settings.algo.activation, f"algo.activation={activation}"),
         (
             "algo.mean_activation",

@@ -17,7 +17,7 @@ from swarmjax.ppo import gae, monte_carlo
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch, LearnerState
-from swarmjax.ppo.memory import Memory
+from swarmjax.ppo.memory import Recall
 from swarmjax.ppo.networks import begin_memory
 from swarmjax.shards import ALONE, Shards
 from swarmjax.sim import gaps, physics
@@ -46,7 +46,7 @@ class Arena(EnvState):
 
     stage: Array
     cohort: Array
-    recall: Memory | None = None
+    recall: Recall | None = None
 
 
 class Trajectory(NamedTuple):
@@ -188,7 +188,7 @@ def batch(
     trajectory: Trajectory,
     config: AlgoConfig,
     shards: Shards = ALONE,
-    memory: Memory | None = None,
+    memory: Recall | None = None,
 ) -> Batch:
     """Turns a rollout into what the learners learn from.
 
@@ -309,7 +309,7 @@ def _step(
     action, log_prob, memory = _act(config, acting, mine, noise, arenas.recall)
     arenas, came = jax.vmap(functools.partial(env.step, program.world))(arenas, to_arenas(action))
     if memory is not None and remembered is not None:
-        arenas = replace(arenas, recall=Memory(memory, to_arenas(remembered)))
+        arenas = replace(arenas, recall=Recall(memory, to_arenas(remembered)))
     next_value, next_remembered = _values(config, learners, arenas, came.observation)
     ended = _ended(arenas, came, by_robot=program.by_robot)
     starts, (start_value, start_remembered) = _next(waits, begun)
@@ -339,7 +339,7 @@ def _act(
     learners: LearnerState,
     seen: Array,
     noise: Array,
-    memory: Memory | None,
+    memory: Recall | None,
 ) -> tuple[Array, Array, Array | None]:
     """Draws actions [L, A, N, U]; returns them, their log density and the memory [A, R, H]."""
     count = seen.shape[0]

@@ -17,7 +17,7 @@ from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.gae import generalized_advantages
 from swarmjax.ppo.learner import Batch
 from swarmjax.ppo.losses import Minibatch
-from swarmjax.ppo.memory import Gru, Memory
+from swarmjax.ppo.memory import Gru, Recall
 
 STEPS, ROWS, WIDTH, SIZE = 6, 3, 4, 5
 
@@ -105,7 +105,7 @@ def _minibatch() -> Minibatch:
         advantage=jnp.array(_drawn(count, seed=2)),
         return_=jnp.array(_drawn(count, seed=3)),
         valid=jnp.array(np.arange(count) % 7 > 0),
-        memory=Memory(*(jnp.array(_drawn(sequences, SIZE, seed=i)) for i in (4, 5))),
+        memory=Recall(*(jnp.array(_drawn(sequences, SIZE, seed=i)) for i in (4, 5))),
         begins=jnp.array(begins.reshape(-1)),
     )
 

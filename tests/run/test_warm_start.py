@@ -265,6 +265,10 @@ def test_a_started_run_resumes_without_the_run_it_started_from(
             "algo.hidden_sizes is [8], but here it is [8,8]: give algo.hidden_sizes=[8]",
         ),
         (
+            ["algo.memory=gru", "algo.rollout_length=8"],
+            "algo.memory is none, but here it is gru: give algo.memory=none",
+        ),
+        (
             ["algo.activation=relu"],
             "algo.activation is tanh, but here it is relu: give algo.activation=tanh",
         ),
