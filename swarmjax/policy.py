@@ -57,8 +57,9 @@ def load(path: str | Path | IO[bytes]) -> Policy:
         if sum(map(text.count, "[{,:")) > MAX_ENTRIES:
             raise ValueError(f"meta has more than {MAX_ENTRIES} entries")
         meta = json.loads(text)
-        if meta["format"] not in (FORMAT, MEMORY_FORMAT):
-            raise ValueError(f"meta.format is {json.dumps(meta['format'])[:80]}, not {FORMAT}")
+        wanted = MEMORY_FORMAT if "memory" in meta else FORMAT
+        if meta["format"] != wanted:
+            raise ValueError(f"meta.format is {json.dumps(meta['format'])[:80]}, not {wanted}")
         if found != digest(arrays):
             raise ValueError("digest is not that of the arrays")
         memory = (

@@ -23,6 +23,7 @@ from swarmjax.evaluate.judge import Judge
 from swarmjax.evaluate.judge import draw_level as draw_level
 from swarmjax.evaluate.judge import load as load
 from swarmjax.evaluate.measures import Outcome
+from swarmjax.policy import PolicyError
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps, noise
 from swarmjax.sim import model as sim_model
@@ -285,6 +286,8 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
     """
     task, before = judge.config.task, arenas.outcome.arrived
     if action is None:
+        if judge.policy.memory is not None:
+            raise PolicyError("the policy remembers: give the action, as `by_policy` chooses it.")
         _, action = by_policy(judge).act(None, arenas)
     memory, pose, impulse = _drive(judge, arenas, action, arrival.drives(task.arrival, before))
     sight = look(judge, arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)

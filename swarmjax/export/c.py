@@ -132,12 +132,13 @@ def _widest(trained: Policy) -> int:
 
 
 def _memory(trained: Policy) -> dict[str, str]:
-    """What a policy that remembers has besides; nothing of one that does not."""
+    """The parts of the files that are about a memory; empty for a policy without one."""
     size = _recalled(trained)
     if not size:
         names = ("type", "parameter", "code", "begin", "reset", "argument", "word")
         return dict.fromkeys((f"memory_{name}" for name in names), "") | {
-            "kept": "Nothing is kept in RAM between calls."
+            "kept": "Nothing is kept in RAM between calls.",
+            "memory_start": "",
         }
     return {
         "memory_type": _MEMORY_TYPE.replace("SIZE", str(size)),
@@ -147,8 +148,9 @@ def _memory(trained: Policy) -> dict[str, str]:
         "memory_reset": _MEMORY_RESET,
         "memory_argument": "&memory[i % POLICY_LEARNERS], ",
         "memory_word": "&memory, ",
-        "kept": f"A robot keeps {4 * size} bytes, a `PolicyMemory`, between calls: `policy_begin` "
-        "makes it forget\nwhere an episode begins.",
+        "kept": f"A robot keeps {4 * size} bytes between calls, a\n`PolicyMemory`.",
+        "memory_start": "Where an episode begins:\n\n    PolicyMemory memory;\n\n"
+        "    policy_begin(&memory);\n\n",
     }
 
 
@@ -175,6 +177,7 @@ def _code(trained: Policy) -> dict[str, str]:
         "scale": _values(layout["scale"]),
         "limit": number(layout["limit"]),
         "arrays": "\n".join(_arrays(trained)),
+        "tanh": ", and that not for relu" if trained.memory is None else "",
         "activation": _ACTIVATIONS[trained.meta["activation"]],
         "layers": "\n".join(_calls(sizes, _recalled(trained))),
         "max_speed": number(trained.max_speed),

@@ -270,8 +270,8 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
     while robot.step(period) != -1:  # the first step gives all sensors a value
         orders = parse([*_custom(robot, given), *words])
         wheels = np.zeros(len(MOTORS))
-        if orders.target != pursued:  # an episode begins
-            memory, pursued = begin(trained, orders.robot), orders.target
+        if (orders.target, orders.robot) != pursued:  # an episode begins
+            memory, pursued = begin(trained, orders.robot), (orders.target, orders.robot)
         if orders.target is not None and orders.target != parked_at:
             distance, bearing = to_target(
                 devices.gps.getValues(), devices.compass.getValues(), orders.target

@@ -18,8 +18,8 @@ _ALGO_OPTIONS: dict[str, tuple[str, str, float | int]] = {
 }
 
 
-# Control steps of a rollout through which a memory is trained: half a second, in which a robot
-# drives about as far as it sees.
+# Control steps of a rollout through which a memory is trained: a quarter of a second, in which a
+# robot drives about as far as it sees.
 LEAST_SEQUENCE = 8
 
 # What the step limit may be to a return, the default first.
@@ -224,7 +224,7 @@ class AlgoConfig(Section):
             )
 
     def _check_memory(self) -> None:
-        """Refuses what goes with no memory."""
+        """Refuses what a memory does not go with."""
         if self.memory == "none":
             return
         if self.rollout_length < LEAST_SEQUENCE:

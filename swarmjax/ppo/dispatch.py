@@ -42,7 +42,7 @@ def resolve(config: AlgoConfig, observation_size: int, action_size: int) -> Back
     Raises:
         ConfigError: `fused` is asked for where there is no such GPU, or of layers that do not fit.
     """
-    if config.memory != "none":  # the faster ways know no steps that hang together
+    if config.memory != "none":  # the faster ways take samples one by one
         return "autodiff"
     if _fuses(config, observation_size, action_size):
         return "fused"

@@ -297,7 +297,8 @@ def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Sh
     masked = jax.tree.map(
         lambda x: jnp.where(valid.reshape(valid.shape + (1,) * (x.ndim - 2)), x, 0), samples
     )
-    return replace(masked, memory=batch.memory, begins=batch.begins)
+    memory = jax.tree.map(lambda x: jnp.where(jnp.isfinite(x), x, 0.0), batch.memory)
+    return replace(masked, memory=memory, begins=batch.begins)
 
 
 def _normalize_advantages(advantage: jax.Array, valid: jax.Array, shards: Shards) -> jax.Array:

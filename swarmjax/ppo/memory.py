@@ -2,8 +2,8 @@
 
 Cho et al. 2014, "Learning Phrase Representations using RNN Encoder-Decoder", section 2.3, with the
 reset gate behind the recurrent product, as in cuDNN, PyTorch, Flax and ONNX
-(`linear_before_reset=1`). The heads see the hidden layers' features beside the memory, so that a
-policy which remembers nothing of use is no worse than one without.
+(`linear_before_reset=1`). The heads see the hidden layers' features beside the memory, which they
+can therefore ignore.
 
 B stands for any number of leading axes, T for control steps, F for features, H for the memory.
 """
@@ -14,6 +14,9 @@ import chex
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
+
+# Flax's own choice for its GRU: LeCun's for what is seen, orthogonal for what is recalled.
+_INPUT = nn.initializers.lecun_normal()
 
 
 class Recall(NamedTuple):
@@ -65,8 +68,6 @@ class Gru(nn.Module):
             memory = remember(seen, recurrent(memory), memory)
             return memory, memory
 
-        if self.is_initializing():
-            recurrent(memory)
         memory, every = jax.lax.scan(step, memory, (seen, begins))
         return jnp.concatenate([features, every], axis=-1), memory
 
@@ -87,10 +88,6 @@ def remember(seen: jax.Array, recalled: jax.Array, memory: jax.Array) -> jax.Arr
     fresh = jnp.tanh(candidate + nn.sigmoid(reset + reset_) * candidate_)
     kept = nn.sigmoid(update + update_)
     return fresh + kept * (memory - fresh)
-
-
-# Flax's own choice for its GRU: Glorot's for what is seen, orthogonal for what is recalled.
-_INPUT = nn.initializers.lecun_normal()
 
 
 def _recurrent(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:

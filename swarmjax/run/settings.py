@@ -350,6 +350,10 @@ def _inherited(typed: Sequence[str]) -> list[str]:
     except ConfigError:  # which `warm_start.read` refuses, when the run is to begin
         return []
     others = [key for key in to_dict(held.algo) if key not in _SHARED]
+    if held.algo.memory == "none" or any(
+        word.startswith(("algo.memory=", "algo=")) for word in typed
+    ):
+        others.append("memory_size")  # an option of the memory that is typed
     return [
         *inherit.group_words(TrainConfig, "robot", held.robot, typed),
         *inherit.group_words(TrainConfig, "task", held.task, typed),

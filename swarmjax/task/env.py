@@ -253,18 +253,8 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     memory, seen = task_electronics.sense(
         world.electronics, memory, state.factors, sight, clock, jnp
     )
-    gap = sim_gaps.gaps(pose, level.side, level.obstacle, world.robot.hull_radius, jnp)
-    begins, apart = sim_gaps.count_contacts(gap, state.apart, world.task.control_step, jnp)
-    begins = begins & level.present[:, None]
-    earned = reward.Step(
-        state.distance,
-        sight.distance,
-        sight.ray,
-        world.task.sensor_range,
-        arrives,
-        begins & active[:, None],
-        None if rule == "latch" else ~state.arrived,
-    )
+    begins, apart = _count_contacts(world, state, pose)
+    earned = _earned(world, state, sight, arrives, begins & active[:, None])
     if world.terms:
         earned = _fill(world, earned, state, action, pose)
     gained = reward.total(earned, world.task.reward, world.terms)
@@ -295,6 +285,29 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
         valid=valid,
         done=complete | timeout | ~sound,
         sound=sound,
+    )
+
+
+def _count_contacts(world: World, state: EnvState, pose: Array) -> tuple[Array, Array]:
+    """Tells which contacts [R, 3] begin at poses [R, 3], and how long all have been apart."""
+    level = state.level
+    gap = sim_gaps.gaps(pose, level.side, level.obstacle, world.robot.hull_radius, jnp)
+    begins, apart = sim_gaps.count_contacts(gap, state.apart, world.task.control_step, jnp)
+    return begins & level.present[:, None], apart
+
+
+def _earned(
+    world: World, state: EnvState, sight: Sight, arrives: Array, begins: Array
+) -> reward.Step:
+    """Puts together what the built-in terms of the reward look at."""
+    return reward.Step(
+        state.distance,
+        sight.distance,
+        sight.ray,
+        world.task.sensor_range,
+        arrives,
+        begins,
+        None if world.task.arrival == "latch" else ~state.arrived,
     )
 
 

@@ -67,11 +67,9 @@ def test_one_that_remembers_builds_without_warnings_and_its_self_test_passes(
     assert (built.returncode, built.stdout, built.stderr) == (0, "", "")
     assert _run(folder, "./self_test").returncode == 0
     source = (folder / "policy.c").read_text()
-    (folder / "policy.c").write_text(
-        source.replace("- recalled[i]", "+ recalled[i]").replace(
-            "(recalled[i] - fresh)", "(recalled[i])"
-        )
-    )
+    changed = source.replace("(recalled[i] - fresh)", "(recalled[i])")
+    assert changed != source
+    (folder / "policy.c").write_text(changed)
     _run(folder, "gcc", "-std=c99", "policy.c", "policy_test.c", "-lm", "-o", "self_test")
     assert _run(folder, "./self_test").returncode != 0
 

@@ -263,6 +263,29 @@ def test_a_robot_that_holds_drives_on_at_its_target(tmp_path: Path) -> None:
     assert "A robot drives on at its target" in (folder / "README.md").read_text()
 
 
+@pytest.mark.parametrize("learners", [1, 3])
+def test_a_robot_remembers_until_it_has_another_target_or_number(
+    learners: int, tmp_path: Path
+) -> None:
+    given = policies.arrays(hidden=(16, 16), learners=learners, names=NAMES)
+    said = several(learners) | {"memory": {"kind": "gru", "size": 4}, "observation": METRIC}
+    path = tmp_path / "policy.npz"
+    saved(path, policies.remembering(given, 4), **said)
+    assert export.main([f"policy={path}", "format=webots"]) == 0
+    folder = tmp_path / "swarmjax_epuck"
+    still = {"counts": [67.19] * 8, "compass": [0.0, 1.0, 0.0], "gps": [-0.5, 0.0, 0.0]}
+    told = ["target=0,0"] * 3 + ["target=0,0.0001"] * 2 + ["target=0,0 robot=2"]
+    done = _simulate(folder, [still | {"custom": word} for word in told], "action=mean")
+    assert (done.returncode, done.stderr) == (0, "")
+    wheels = _told(folder, len(told))
+    # The same is seen at each step: what differs is what is remembered.
+    assert np.abs(wheels[1] - wheels[0]).max() > 1e-3
+    np.testing.assert_allclose(wheels[3], wheels[0], atol=1e-2)  # 0.1 mm of 0.5 m
+    np.testing.assert_allclose(wheels[4], wheels[1], atol=1e-2)
+    if learners == 1:
+        np.testing.assert_array_equal(wheels[5], wheels[0])
+
+
 def test_the_arguments_win_over_custom_data(tmp_path: Path) -> None:
     _, folder = _exported(tmp_path)
     step = {"counts": [67.19] * 8, "compass": [0.0, 1.0, 0.0], "gps": [0.0, 0.0, 0.0]}

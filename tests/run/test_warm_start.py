@@ -293,6 +293,18 @@ def test_other_networks_are_refused(
     assert sentence == f"init_from is '{trained}', whose {what}, or another run."
 
 
+@pytest.mark.parametrize("word", ["algo.memory=none", "algo=paper"])
+def test_a_run_that_remembers_names_the_memory_that_it_has(
+    word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stored = to_dict(load_train([*TINY, "algo.memory=gru", "algo.rollout_length=8"]))
+    (tmp_path / "config.json").write_text(json.dumps(stored))
+    monkeypatch.chdir(tmp_path)
+    said = _refusal(capsys, monkeypatch, *TINY[:4], "arenas=8", "init_from=.", word)
+    assert said.startswith("init_from is '.', whose ")
+    assert "memory_size is 64, but memory is none" not in said
+
+
 def test_independent_learners_are_told_how_many_they_were(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -279,9 +279,16 @@ def test_layouts_are_turned_and_mirrored() -> None:
 
 
 def test_other_stages_of_a_program_are_drawn_as_alone() -> None:
-    stages = [_stage("trap"), _stage("fence")]
+    # With one that is placed at random, which laid-out stages alone do without.
+    stages = [
+        _stage("trap"),
+        _stage("fence"),
+        StageConfig(name="s", robots=5, side=1.2, obstacles=3),
+    ]
     spacing = Spacing(5, 3, HULL, REACH)
     both = task_stage.stack(stages)
+    assert both.laid_out is None
+    assert task_stage.stack(stages[:2]).laid_out is not None
     for number, stage in enumerate(stages):
         alone = task_stage.single(stage)
         for uniforms in _uniforms(spacing, 5):

@@ -1,4 +1,4 @@
-/* See policy.h. Of the mathematical library this needs tanhf alone, and that not for relu. */
+/* See policy.h. Of the mathematical library this needs tanhf alone$tanh. */
 #include "policy.h"
 
 #include <math.h>
