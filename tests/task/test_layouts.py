@@ -96,12 +96,23 @@ def test_no_robot_starts_where_it_has_arrived(name: str) -> None:
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_numpy_and_jax_draw_the_same_bits(name: str) -> None:
+    _assert_same_bits(name, 20)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_numpy_and_jax_draw_the_same_bits_of_ten_thousand_levels(name: str) -> None:
+    _assert_same_bits(name, 10_000)
+
+
+def _assert_same_bits(name: str, count: int) -> None:
     stage = _stage(name)
     spacing, arrays = _spacing(stage), task_stage.single(stage)
-    uniforms = _uniforms(spacing, 20)
+    uniforms = _uniforms(spacing, count)
     ours = jax.tree.map(jnp.asarray, arrays)
-    drawn = jax.jit(jax.vmap(lambda u: level.sample(u, ours, spacing, jnp)))(uniforms)
-    for number, each in enumerate(_levels(name)[:20]):
+    draw = jax.jit(lambda us: jax.lax.map(lambda u: level.sample(u, ours, spacing, jnp), us))
+    drawn = [np.asarray(field) for field in draw(uniforms)]
+    for number, each in enumerate(_levels(name, count)):
         for mine, theirs in zip(drawn, each, strict=True):
             np.testing.assert_array_equal(mine[number], theirs)
 
@@ -257,6 +268,18 @@ def test_robots_on_a_circle_change_places() -> None:
         np.testing.assert_allclose(np.linalg.norm(drawn.target, axis=-1), 0.8, atol=ROUNDING)
         angles = np.sort(np.arctan2(drawn.target[:, 1], drawn.target[:, 0]))
         np.testing.assert_allclose(np.diff(angles), 2.0 * np.pi / 16, atol=0.003)
+
+
+@pytest.mark.parametrize("count", [40, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_robots_on_a_circle_arrive_by_all_driving_around_it(count: int) -> None:
+    """The plan: all go half way round at once, as far apart as they began."""
+    angles = np.linspace(0.0, np.pi, 65)
+    turns = np.stack([np.cos(angles), -np.sin(angles), np.sin(angles), np.cos(angles)], axis=-1)
+    for drawn in _levels("circle", count):
+        way = np.einsum("tij,rj->tri", turns.reshape(-1, 2, 2), drawn.start[:, :2])
+        assert np.abs(way).max() <= 0.5 * drawn.side - HULL
+        assert min(_least(places) for places in way) >= 2.0 * HULL
+        assert np.linalg.norm(way[-1] - drawn.target, axis=-1).max() < REACH
 
 
 def test_starts_of_a_crowd_lie_outside_every_zone_of_arrival() -> None:
