@@ -1,6 +1,5 @@
 """Both judges by `task.arrival=hold`: by a scene worked out by hand, and on the same levels."""
 
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -19,9 +18,7 @@ from swarmjax.evaluate import cells, engine_c, engine_mjx, judge, measures
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import Evaluation, evaluate
 from swarmjax.evaluate.measures import Outcome
-from swarmjax.policy import Policy
 from swarmjax.sim.config import RobotConfig
-from swarmjax.task import observation
 from swarmjax.task.config import TaskConfig
 from swarmjax.task.env import EnvState
 from swarmjax.task.level import Level
@@ -40,27 +37,12 @@ def _settings(path: Path, **rest: Any) -> EvaluateConfig:
     return EvaluateConfig(policy=str(path), **(given | rest))
 
 
-def _told(trained: Policy, action: np.ndarray) -> Policy:
-    """A policy that does what it is told, [R, 2], whatever it sees."""
-    none = np.zeros((len(action), observation.SIZE), np.float32)
-    layer = np.zeros((len(action), observation.SIZE, 2), np.float32), action
-    return trained._replace(
-        layers=[layer],
-        log_std=np.full_like(action, steering.NO_NOISE),
-        mean=none,
-        std=none + 1.0,
-        is_shared=False,
-    )
-
-
 def _by_c(path: Path, actions: np.ndarray) -> Outcome:
     """Plays the scene in MuJoCo C, until it is over."""
-    trained = policy_file.read(str(path))
-    mine = judge.load(_settings(path), trained)
+    mine = judge.load(_settings(path), policy_file.read(str(path)))
     arenas = engine_c.start(mine, [holding.level()])
     for action in actions:
-        told = dataclasses.replace(mine, policy=_told(trained, action))
-        arenas = engine_c.step(told, arenas)
+        arenas = engine_c.step(mine, arenas, action[None])
         if arenas.outcome.arrived.all():
             break
     return arenas.outcome
@@ -71,12 +53,12 @@ def _by_mjx(path: Path, actions: np.ndarray) -> Outcome:
     levels = Level(*(np.asarray(field)[None] for field in holding.level()))
     world = engine_mjx.load(_settings(path), np.zeros((0, 2)), 1)
 
-    def act(arenas: EnvState) -> jax.Array:
+    def act(memory: Any, arenas: EnvState) -> tuple[Any, jax.Array]:
         row = jnp.minimum(arenas.clock, len(actions) - 1)
-        return jnp.asarray(actions)[row]
+        return memory, jnp.asarray(actions)[row]
 
     run = jax.jit(partial(engine_mjx._run, world, act, steps=len(actions) + 5))
-    arenas, counts, broken = run(levels)
+    arenas, counts, broken = run(levels, memory=None)
     assert not np.asarray(broken).any()
     return Outcome(**jax.tree.map(np.asarray, engine_mjx._outcome(arenas, counts)))
 

@@ -61,8 +61,7 @@ def _spoilt(batch: Batch, valid: jax.Array) -> Batch:
     def spoil(x: jax.Array) -> jax.Array:
         return jnp.where(valid.reshape(valid.shape + (1,) * (x.ndim - 2)), x, jnp.nan)
 
-    samples = {name: spoil(x) for name, x in vars(batch).items() if name != "valid"}
-    return Batch(**samples, valid=valid)
+    return replace(jax.tree.map(spoil, batch), valid=valid)
 
 
 def _assert_equal(got: object, expected: object) -> None:

@@ -17,7 +17,7 @@ from holding import ENTERS, LEAVES, OTHER, RETURNS
 from swarmjax import policy_file
 from swarmjax.evaluate import engine_c
 from swarmjax.evaluate import judge as evaluate_judge
-from swarmjax.evaluate.engine_c import Arenas, Judge
+from swarmjax.evaluate.engine_c import Arenas
 from swarmjax.replay import pack, page, record
 from swarmjax.replay.config import ReplayConfig
 from swarmjax.replay.record import Recording
@@ -38,17 +38,26 @@ def _settings(policy: Path, *words: str) -> ReplayConfig:
     return load_levels(ReplayConfig, [f"policy={policy}", *WORDS, *words])
 
 
-def _act(judge: Judge, arenas: Arenas) -> np.ndarray:
-    """What robots of the scene do, in the place of what a policy would."""
-    row = min(int(arenas.outcome.clock[0]), RETURNS - 1)
-    return np.broadcast_to(holding.actions()[row], (len(arenas.data), 2, 2))
+class _Driver:
+    """Does what robots of the scene do, in the place of what a policy would."""
+
+    def init(self, arenas: Arenas) -> None:
+        """Nothing to remember."""
+
+    def act(self, memory: None, arenas: Arenas) -> tuple[None, np.ndarray]:
+        row = min(int(arenas.outcome.clock[0]), RETURNS - 1)
+        return memory, np.broadcast_to(holding.actions()[row], (len(arenas.data), 2, 2))
+
+
+def _drive(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(engine_c, "by_policy", lambda judge: _Driver())
 
 
 @pytest.fixture(scope="module")
 def recordings(policy: Path) -> list[Recording]:
     """The scene, beside one in which robot 1 has far to go; 80 steps at most."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(engine_c, "act", _act)
+        _drive(patch)
         settings = _settings(policy, "task.arrival=hold", "steps=80")
         judge = evaluate_judge.load(settings.evaluation, policy_file.read(policy))
         one = holding.level()
@@ -65,7 +74,7 @@ def test_an_episode_ends_when_all_are_there_whatever_others_do(
 def test_recording_ends_with_the_last_episode_though_robots_have_left_again(
     policy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engine_c, "act", _act)
+    _drive(monkeypatch)
     settings = _settings(policy, "task.arrival=hold", "steps=140")
     judge = evaluate_judge.load(settings.evaluation, policy_file.read(policy))
     one, steps = holding.level(), []
