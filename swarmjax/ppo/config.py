@@ -72,6 +72,13 @@ class AlgoConfig(Section):
         default=None,
         metadata=about("numbers that are remembered; null: 64 [memory=gru]", 1, 1024),
     )
+    critic: Literal["observation", "state"] = field(
+        default="observation",
+        metadata=about(
+            "what the critic sees; state: also where targets, robots and walls are, which the "
+            "policy never does"
+        ),
+    )
     activation: Literal["tanh", "relu", "swish"] = field(
         default="tanh", metadata=about("activation of the hidden layers")
     )
@@ -212,6 +219,7 @@ class AlgoConfig(Section):
                 object.__setattr__(self, key, default)
         self._check_time_out()
         self._check_memory()
+        self._check_critic()
         if self.std_floor is not None and self.std_floor > self.initial_std:
             raise ConfigError(
                 f"std_floor is {show(self.std_floor)}, but initial_std is "
@@ -246,6 +254,14 @@ class AlgoConfig(Section):
             raise ConfigError(
                 f"network is {show(self.network)}, but memory is {self.memory}, which goes with "
                 "hidden layers alone: give network=mlp or memory=none."
+            )
+
+    def _check_critic(self) -> None:
+        """Refuses what a critic that sees the state does not go with."""
+        if self.critic == "state" and self.update_backend == "fused":
+            raise ConfigError(
+                "update_backend is fused, but critic is state: give auto or autodiff, or "
+                "critic=observation."
             )
 
     def _check_time_out(self) -> None:

@@ -74,7 +74,7 @@ def _has_fast() -> bool:
 
 def _fuses(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
     """Whether the kernels compute the gradient; refuses them where they cannot be had."""
-    if config.update_backend == "autodiff":
+    if config.update_backend == "autodiff" or config.critic == "state":
         return False
     if not _has_fast():
         if config.update_backend == "auto":

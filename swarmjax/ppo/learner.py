@@ -39,6 +39,7 @@ class LearnerState:
         optimizer_state: Of the optimiser that `init` was given.
         normalizer: Moments of the valid observations of all updates so far; those of a learner
             that does not normalise stay 0 and 1.
+        state_normalizer: Likewise, of the states that the critic sees; None if it sees none.
         explored: [], int32, control steps that the schedule of exploration has counted; None if
             exploration is learned.
     """
@@ -46,6 +47,7 @@ class LearnerState:
     params: Params
     optimizer_state: optax.OptState
     normalizer: Normalizer
+    state_normalizer: Normalizer | None = None
     explored: jax.Array | None = None
 
 
@@ -64,6 +66,7 @@ class Batch:
         memory: [G, S, H] before the rollout of the S robots of a group, whose N samples are ordered
             by step, [T S]; None without memory.
         begins: [G, N], whether an episode begins with the step; None without memory.
+        state: [G, N, P], raw, what the critic sees besides; None if nothing.
     """
 
     observation: jax.Array
@@ -74,10 +77,16 @@ class Batch:
     valid: jax.Array
     memory: Recall | None = None
     begins: jax.Array | None = None
+    state: jax.Array | None = None
 
 
 def init(
-    key: jax.Array, config: AlgoConfig, observation_size: int, action_size: int, updates: int
+    key: jax.Array,
+    config: AlgoConfig,
+    observation_size: int,
+    action_size: int,
+    updates: int,
+    state_size: int = 0,
 ) -> LearnerState:
     """Makes a learner that has seen nothing.
 
@@ -87,15 +96,17 @@ def init(
         observation_size: O.
         action_size: U.
         updates: Number of updates of the whole run, at least 1: the learning rate's horizon.
+        state_size: P, what the critic sees besides.
 
     Returns:
         The learner's first state.
     """
-    params = networks.init_params(key, config, observation_size, action_size)
+    params = networks.init_params(key, config, observation_size, action_size, state_size)
     return LearnerState(
         params=params,
         optimizer_state=optimizer.make(config, updates).init(params),
         normalizer=normalizer.init(observation_size),
+        state_normalizer=normalizer.init(state_size) if state_size else None,
         explored=jnp.zeros((), jnp.int32) if config.exploration == "scheduled" else None,
     )
 
@@ -208,10 +219,34 @@ def recall_mode(
 
 
 def recall_values(
-    learner: LearnerState, config: AlgoConfig, observation: jax.Array, memory: jax.Array | None
+    learner: LearnerState,
+    config: AlgoConfig,
+    observation: jax.Array,
+    memory: jax.Array | None,
+    state: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array | None]:
-    """Returns the critic's expected discounted return, [...], and its memory after, likewise."""
-    return networks.recall_value(learner.params, config, normalize(learner, observation), memory)
+    """Computes the critic's values, and remembers.
+
+    Args:
+        learner: Whose critic.
+        config: The config that made the learner.
+        observation: [..., O], raw.
+        memory: [..., H] of the critic before; None without memory.
+        state: [..., P], raw, what the critic sees besides; None if nothing.
+
+    Returns:
+        The expected discounted return, [...], and the memory after.
+    """
+    seen = normalize(learner, observation)
+    if state is not None:
+        seen = jnp.concatenate([seen, _normalize_state(learner, state)], axis=-1)
+    return networks.recall_value(learner.params, config, seen, memory)
+
+
+def _normalize_state(learner: LearnerState, state: jax.Array) -> jax.Array:
+    """Normalises what the critic sees besides, [..., P]."""
+    assert learner.state_normalizer is not None  # `init` was told its size
+    return normalizer.normalize(learner.state_normalizer, state, OBSERVATION_LIMIT)
 
 
 def update(
@@ -256,11 +291,22 @@ def update(
     metrics["skipped_steps"] = jnp.where(lost, 1.0, metrics["skipped_steps"])
     metrics = optimizer.mean_of_taken(metrics)
     metrics["std"] = jnp.mean(jnp.exp(params["actor"]["log_std"]))
-    moments = learner.normalizer
-    if config.normalize_observations:
-        moments = normalizer.update(moments, batch.observation, batch.valid, shards)
-    learned = replace(learner, params=params, optimizer_state=optimizer_state, normalizer=moments)
-    return learned, metrics
+    learned = replace(learner, params=params, optimizer_state=optimizer_state)
+    return _take_in(learned, config, batch, shards), metrics
+
+
+def _take_in(
+    learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Shards
+) -> LearnerState:
+    """Adds what a batch saw to the moments by which the learner normalises."""
+    if not config.normalize_observations:
+        return learner
+    seen = normalizer.update(learner.normalizer, batch.observation, batch.valid, shards)
+    learner = replace(learner, normalizer=seen)
+    if batch.state is None or learner.state_normalizer is None:
+        return learner
+    state = normalizer.update(learner.state_normalizer, batch.state, batch.valid, shards)
+    return replace(learner, state_normalizer=state)
 
 
 def _is_finite(batch: Batch) -> jax.Array:
@@ -292,6 +338,7 @@ def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Sh
         advantage=advantage,
         return_=batch.return_,
         valid=valid,
+        state=None if batch.state is None else _normalize_state(learner, batch.state),
     )
     # A NaN in an invalid sample would pass through the networks into every gradient.
     masked = jax.tree.map(

@@ -27,6 +27,7 @@ class Minibatch:
         memory: [B', H] before the first step of B' sequences; None without memory. Samples are then
             ordered by step, [T B'].
         begins: [B], whether an episode begins with the step; None without memory.
+        state: [B, P], normalised, what the critic sees besides; None if nothing.
     """
 
     observation: jax.Array
@@ -37,6 +38,7 @@ class Minibatch:
     valid: jax.Array
     memory: Recall | None = None
     begins: jax.Array | None = None
+    state: jax.Array | None = None
 
 
 def ppo_loss(
@@ -105,14 +107,17 @@ def _evaluate(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Computes mean action [B, U], deviation [U] and value [B]; of sequences, through time."""
     seen, memory = minibatch.observation, minibatch.memory
+    judged = seen
+    if minibatch.state is not None:
+        judged = jnp.concatenate([seen, minibatch.state], axis=-1)
     if memory is None or minibatch.begins is None:
         mean, std = networks.action_distribution(params, config, seen)
-        return mean, std, networks.value(params, config, seen)
+        return mean, std, networks.value(params, config, judged)
     sequences = memory.actor.shape[0]
     begins = minibatch.begins.reshape(-1, sequences)
-    steps = seen.reshape(-1, sequences, seen.shape[-1])
-    mean, std, _ = networks.recall_action(params, config, steps, memory.actor, begins)
-    value, _ = networks.recall_value(params, config, steps, memory.critic, begins)
+    seen, judged = (x.reshape(-1, sequences, x.shape[-1]) for x in (seen, judged))
+    mean, std, _ = networks.recall_action(params, config, seen, memory.actor, begins)
+    value, _ = networks.recall_value(params, config, judged, memory.critic, begins)
     return mean.reshape(-1, mean.shape[-1]), std, value.reshape(-1)
 
 

@@ -119,7 +119,11 @@ def _uniform(
 
 
 def init_params(
-    key: jax.Array, config: AlgoConfig, observation_size: int, action_size: int
+    key: jax.Array,
+    config: AlgoConfig,
+    observation_size: int,
+    action_size: int,
+    state_size: int = 0,
 ) -> Params:
     """Draws the parameters of a new actor and a new critic.
 
@@ -128,6 +132,7 @@ def init_params(
         config: Layers, how they begin, and the initial standard deviation.
         observation_size: O.
         action_size: U.
+        state_size: P, what the critic sees besides.
 
     Returns:
         `{"actor": {"torso": {"hidden_0": ..}, "mean": .., "log_std": [U]}, "critic": {"torso":
@@ -135,11 +140,12 @@ def init_params(
         with `config.memory`, `{"memory": {"input": .., "recurrent": ..}}` in each besides.
     """
     actor_key, critic_key = jax.random.split(key)
-    observation, memory = jnp.zeros((observation_size,), jnp.float32), begin_memory(config, ())
+    seen, judged = (jnp.zeros(n) for n in (observation_size, observation_size + state_size))
+    memory = begin_memory(config, ())
     mine, theirs = (None, None) if memory is None else memory
     return {
-        "actor": _Actor(config, action_size).init(actor_key, observation, mine)["params"],
-        "critic": _Critic(config).init(critic_key, observation, theirs)["params"],
+        "actor": _Actor(config, action_size).init(actor_key, seen, mine)["params"],
+        "critic": _Critic(config).init(critic_key, judged, theirs)["params"],
     }
 
 
@@ -181,7 +187,7 @@ def value(params: Params, config: AlgoConfig, observation: jax.Array) -> jax.Arr
     Args:
         params: What `init_params` returned.
         config: The config that made `params`.
-        observation: [B, O], normalised.
+        observation: [B, O + P], normalised, as in `recall_value`.
 
     Returns:
         The expected discounted return, [B].
@@ -229,7 +235,8 @@ def recall_value(
     Args:
         params: What `init_params` returned.
         config: The config that made `params`.
-        observation: As in `recall_action`.
+        observation: [B, O + P] or [T, B, O + P], normalised: what the policy sees, and after it
+            the state that the critic sees besides, if any.
         memory: [B, H] of the critic before; None without memory.
         begins: As in `recall_action`.
 

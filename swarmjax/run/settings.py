@@ -332,6 +332,7 @@ _SHARED = (
     "hidden_sizes",
     "memory",
     "memory_size",
+    "critic",
     "activation",
     "mean_activation",
 )

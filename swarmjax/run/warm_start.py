@@ -20,7 +20,7 @@ from swarmjax.run.settings import TrainConfig, from_stored, read_config
 from swarmjax.task.config import resolve_encoding
 from swarmjax.training.loop import TrainState
 
-_CARRIED = ("params", "normalizer")  # of a learner
+_CARRIED = ("params", "normalizer", "state_normalizer")  # of a learner
 _EXPLORED = "explored"  # likewise, of one whose exploration is scheduled
 _MET = "curriculum/met"  # robots that have trained: a promotion copies nobody over them
 
@@ -145,7 +145,7 @@ def _check_alike(init_from: str, stored: TrainConfig, settings: TrainConfig) -> 
         ),
         *(
             (f"algo.{key}", held, wanted, f"algo.{key}={held}")
-            for key in ("memory", "memory_size")
+            for key in ("memory", "memory_size", "critic")
             for held, wanted in [
                 tuple(show(getattr(each.algo, key), quote="") for each in (stored, settings))
             ]

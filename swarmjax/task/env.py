@@ -20,7 +20,7 @@ from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps as sim_gaps
 from swarmjax.sim.config import RobotConfig, SimConfig, physics_substeps
 from swarmjax.sim.realism_config import RealismConfig
-from swarmjax.task import arrival, extended, observation, pieces, reward, room
+from swarmjax.task import arrival, extended, observation, pieces, reward, room, surroundings
 from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors as task_factors
 from swarmjax.task import stage as task_stage
@@ -215,6 +215,20 @@ def reset(world: World, level: Level) -> EnvState:
         apart=jnp.full((robots, len(sim_gaps.KINDS)), sim_gaps.CONTACT_PAUSE),
         episode=_no_episode(robots),
     )
+
+
+def look_around(world: World, state: EnvState) -> Array:
+    """Lists what is around each robot of an arena, as a critic in training may see it.
+
+    Args:
+      world: the compiled environment.
+      state: the arena.
+
+    Returns:
+      [R, P] as `surroundings.look` has it.
+    """
+    pose = physics.poses(world.physics, state.sim)
+    return surroundings.look(pose, state.level, state.arrived)
 
 
 def _no_episode(robots: int) -> Episode:

@@ -69,9 +69,11 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
     curriculum = curricula.init(schedule, config.curriculum, program.mode)
     starts = _draw_first(program, schedule, curriculum, level_key)
     size = program.world.observation_size
-    learners = jax.vmap(lambda key: ppo.init(key, config.algo, size, ACTION_SIZE, config.updates))(
-        jax.random.split(learner_key, config.learners)
-    )
+    learners = jax.vmap(
+        lambda key: ppo.init(
+            key, config.algo, size, ACTION_SIZE, config.updates, program.state_size
+        )
+    )(jax.random.split(learner_key, config.learners))
     return TrainState(
         learners=learners,
         arenas=starts,

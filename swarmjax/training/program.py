@@ -12,7 +12,7 @@ from swarmjax.ppo import dispatch, networks
 from swarmjax.ppo.dispatch import Backend
 from swarmjax.provenance import cores
 from swarmjax.shards import Shards
-from swarmjax.task import env
+from swarmjax.task import env, surroundings
 from swarmjax.task.env import World
 from swarmjax.training import episodes
 from swarmjax.training.config import ProgramConfig
@@ -49,6 +49,11 @@ class Program[C: ProgramConfig]:
         if self.by_robot:
             most = min(most, episodes.rows_of_call(self.config))
         return min(self.config.updates, most)
+
+    @property
+    def state_size(self) -> int:
+        """Entries of what a critic sees besides the observation, P; 0 if nothing."""
+        return surroundings.SIZE if self.config.algo.critic == "state" else 0
 
     @property
     def mode(self) -> Mode:

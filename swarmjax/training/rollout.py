@@ -63,6 +63,7 @@ class Trajectory(NamedTuple):
       truncated: the time ran out for the robot.
       valid: a transition to learn from.
       over: the episode ended with the step; None where nothing is remembered.
+      state: [.., P], raw, what the critic sees besides the observation; None if nothing.
     """
 
     observation: Array
@@ -75,6 +76,7 @@ class Trajectory(NamedTuple):
     truncated: Array
     valid: Array
     over: Array | None = None
+    state: Array | None = None
 
 
 def to_learners(x: Array, learners: int) -> Array:
@@ -165,12 +167,12 @@ def collect(
       The arenas, packed; the trajectory; the episodes that ended.
     """
     config = program.config.algo
-    waits = _Waiting(starts, *_values(config, learners, starts))
+    waits = _Waiting(starts, _judge(program, learners, starts))
     step = functools.partial(_step, program, learners, waits)
     unpack = functools.partial(physics.unpack, program.world.physics)
     arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
     begun = jnp.zeros_like(arenas.clock)
-    carry = (arenas, _values(config, learners, arenas), begun)
+    carry = (arenas, _judge(program, learners, arenas), begun)
     steps = config.rollout_length
     keys = jax.random.split(key, steps)
     (arenas, *_), (trajectory, counts) = jax.lax.scan(step, carry, (keys, 1 + jnp.arange(steps)))
@@ -216,6 +218,7 @@ def batch(
         advantage=group(advantages),
         return_=group(returns),
         valid=group(trajectory.valid),
+        state=None if trajectory.state is None else group(trajectory.state),
     )
     over = trajectory.over
     if memory is None or over is None:
@@ -258,18 +261,25 @@ def _timed_out(trajectory: Trajectory) -> Array:
     return trajectory.truncated & trajectory.valid
 
 
-class _Waiting(NamedTuple):
-    """Episodes that wait.
+class _Judged(NamedTuple):
+    """What critics make of what robots see now, [L, A, N, ...].
 
     Attributes:
-      starts: [W A], packed.
-      value: [L, W A, N] of their first observations.
-      memory: [L, W A, N, H] of the critic after them; None if nothing is remembered.
+      value: of it.
+      memory: [.., H] of the critic after it; None if nothing is remembered.
+      state: [.., P], raw, what the critic sees besides the observation; None if nothing.
     """
 
-    starts: Arena
     value: Array
     memory: Array | None
+    state: Array | None
+
+
+class _Waiting(NamedTuple):
+    """Episodes [W A] that wait, packed, and what critics make of their beginnings."""
+
+    starts: Arena
+    judged: _Judged
 
 
 # What `Ended` counts, by name, and how many numbers each is.
@@ -288,8 +298,7 @@ _COUNTS = {
 }
 
 _Counts = tuple[Array, Array, Robots | None]  # counts [A, K], rewards [A], robots
-_Values = tuple[Array, Array | None]  # [L, A, N], and what the critic remembers after
-_Carry = tuple[Arena, _Values, Array]  # arenas, their values, how many episodes each has begun
+_Carry = tuple[Arena, _Judged, Array]  # arenas, and how many episodes each has begun
 
 
 def _step(
@@ -300,37 +309,35 @@ def _step(
     now: tuple[Array, Array],
 ) -> tuple[_Carry, tuple[Trajectory, _Counts]]:
     """One control step of all arenas, the first of a rollout being 1."""
-    (arenas, (value, remembered), begun), (key, number) = carry, now
-    count = value.shape[0]
+    (arenas, judged, begun), (key, number) = carry, now
+    count = judged.value.shape[0]
     mine = to_learners(arenas.observation, count)
     noise = _noise(program.shards, key, mine.shape[:-1])
     config = program.config.algo
     acting = explore(program, learners, number)
     action, log_prob, memory = _act(config, acting, mine, noise, arenas.recall)
     arenas, came = jax.vmap(functools.partial(env.step, program.world))(arenas, to_arenas(action))
-    if memory is not None and remembered is not None:
-        arenas = replace(arenas, recall=Recall(memory, to_arenas(remembered)))
-    next_value, next_remembered = _values(config, learners, arenas, came.observation)
+    if memory is not None and judged.memory is not None:
+        arenas = replace(arenas, recall=Recall(memory, to_arenas(judged.memory)))
+    reached = _judge(program, learners, arenas)
     ended = _ended(arenas, came, by_robot=program.by_robot)
-    starts, (start_value, start_remembered) = _next(waits, begun)
+    starts, first = _next(waits, begun)
     arenas = restart(arenas, starts, came.done)
-    over = jnp.broadcast_to(came.done[None, :, None], next_value.shape)
+    over = jnp.broadcast_to(came.done[None, :, None], reached.value.shape)
     transition = Trajectory(
         observation=mine,
         action=action,
         log_prob=log_prob,
-        value=value,
-        next_value=next_value,
+        value=judged.value,
+        next_value=reached.value,
         reward=to_learners(came.reward, count),
         terminated=to_learners(came.terminated, count),
         truncated=to_learners(came.truncated, count),
         valid=to_learners(came.valid, count),
         over=None if memory is None else over,
+        state=judged.state,
     )
-    values = jnp.where(over, start_value, next_value)
-    if next_remembered is not None and start_remembered is not None:
-        next_remembered = jnp.where(over[..., None], start_remembered, next_remembered)
-    carry = (arenas, (values, next_remembered), begun + came.done)
+    carry = (arenas, _pick(over, first, reached), begun + came.done)
     return carry, (transition, _to_counts(ended))
 
 
@@ -357,29 +364,30 @@ def _noise(shards: Shards, key: Array, shape: tuple[int, ...]) -> Array:
     return shards.draw(key, lambda key: jax.random.normal(key, size), axis=1)
 
 
-def _next(waits: _Waiting, begun: Array) -> tuple[Arena, _Values]:
-    """Picks the episode [A] that each arena begins next, and its value [L, A, N]."""
+def _next(waits: _Waiting, begun: Array) -> tuple[Arena, _Judged]:
+    """Picks the episode [A] that each arena begins next, and what critics make of it."""
     arenas = begun.shape[0]
     count = waits.starts.cohort.shape[0] // arenas
-    starts, value, remembered = waits
+    starts, judged = waits
     if count > 1:
         index = jnp.minimum(begun, count - 1) * arenas + jnp.arange(arenas)
-        starts, value = jax.tree.map(lambda x: x[index], starts), value[:, index]
-        remembered = None if remembered is None else remembered[:, index]
-    starts = replace(starts, cohort=jnp.where(begun < count, starts.cohort, UNCOUNTED))
-    return starts, (value, remembered)
+        starts = jax.tree.map(lambda x: x[index], starts)
+        judged = jax.tree.map(lambda x: x[:, index], judged)
+    return replace(starts, cohort=jnp.where(begun < count, starts.cohort, UNCOUNTED)), judged
 
 
-def _values(
-    config: AlgoConfig, learners: LearnerState, arenas: Arena, seen: Array | None = None
-) -> _Values:
-    """Values [L, A, N] of what arenas observe, or of `seen` [A, R, O], after what they remember."""
-    count = jax.tree.leaves(learners)[0].shape[0]
-    observation = arenas.observation if seen is None else seen
+def _judge(program: Program, learners: LearnerState, arenas: Arena) -> _Judged:
+    """Lets critics judge what the robots of arenas [A] see now."""
+    config, count = program.config.algo, jax.tree.leaves(learners)[0].shape[0]
     memory = None if arenas.recall is None else to_learners(arenas.recall.critic, count)
-    return jax.vmap(lambda learner, o, m: ppo.recall_values(learner, config, o, m))(
-        learners, to_learners(observation, count), memory
+    state = None
+    if config.critic == "state":
+        around = jax.vmap(functools.partial(env.look_around, program.world))(arenas)
+        state = to_learners(around, count)
+    value, after = jax.vmap(lambda learner, *seen: ppo.recall_values(learner, config, *seen))(
+        learners, to_learners(arenas.observation, count), memory, state
     )
+    return _Judged(value, after, state)
 
 
 def restart[S: EnvState](arenas: S, starts: S, done: Array) -> S:

@@ -269,6 +269,10 @@ def test_a_started_run_resumes_without_the_run_it_started_from(
             "algo.memory is none, but here it is gru: give algo.memory=none",
         ),
         (
+            ["algo.critic=state"],
+            "algo.critic is observation, but here it is state: give algo.critic=observation",
+        ),
+        (
             ["algo.activation=relu"],
             "algo.activation is tanh, but here it is relu: give algo.activation=tanh",
         ),

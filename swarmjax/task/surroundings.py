@@ -1,0 +1,103 @@
+"""What is around each robot, in its own frame: the truth, for a critic in training alone.
+
+Pinto et al. 2017, "Asymmetric Actor Critic for Image-Based Robot Learning": the critic may see the
+state, since only the actor is deployed. The nearest robots and walls are listed, nearest first. The
+list is as long in every arena, so that a critic can go on learning in another one.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from swarmjax.sim import model
+from swarmjax.task.level import Level
+
+NEAREST_ROBOTS = 8
+NEAREST_RECTANGLES = 12  # boxes, and walls inside and around the arena
+REACH = 2.0  # m; the largest arena of the stage files is as wide, and what is farther is as good
+
+_OWN = 3  # target x, y; arrived
+_ROBOT = 8  # there, x, y, heading x, y, target x, y, arrived
+_RECTANGLE = 8  # there, nearest x, y, right end x, y, left end x, y, half the short edge
+
+SIZE = _OWN + NEAREST_ROBOTS * _ROBOT + NEAREST_RECTANGLES * _RECTANGLE  # entries, P
+
+
+def look(pose: Array, level: Level, arrived: Array) -> Array:
+    """Lists what is around each robot of one arena.
+
+    Args:
+      pose: [R, 3] x (m), y (m), yaw (rad).
+      level: of the episode.
+      arrived: [R] whether the robot has arrived.
+
+    Returns:
+      [R, P] in the robots' frames, x forward: m, within +-2; directions, within +-1; and marks, 0
+      or 1. All of what is absent is 0.
+    """
+    target = _into_frame(pose, level.target)
+    own = [*target, arrived.astype(jnp.float32)]
+    parts = [jnp.stack(own, axis=-1), _robots(pose, level, arrived), _rectangles(pose, level)]
+    found = jnp.concatenate(parts, axis=-1)
+    # An arena whose physics broke is not learned from; its critic sees numbers all the same.
+    return jnp.clip(jnp.where(jnp.isfinite(found), found, 0.0), -REACH, REACH)
+
+
+def _robots(pose: Array, level: Level, arrived: Array) -> Array:
+    """Lists the other robots, [R, N * _ROBOT]."""
+    yaw = pose[None, :, 2] - pose[:, None, 2]
+    x, y = _into_frame(pose[:, None], pose[None, :, :2])
+    target = _into_frame(pose[:, None], level.target[None])
+    is_there = level.present & ~jnp.eye(len(pose), dtype=bool)
+    rows = (1.0, x, y, jnp.cos(yaw), jnp.sin(yaw), *target, arrived)
+    return _nearest(jnp.hypot(x, y), is_there, rows, NEAREST_ROBOTS)
+
+
+def _rectangles(pose: Array, level: Level) -> Array:
+    """Lists the boxes and walls, [R, N * _RECTANGLE]."""
+    x, y, yaw, half_x, half_y = model.fixture_rectangles(level.side, level.obstacle, jnp).T
+    # The nearest point: the robot's place in the rectangle's frame, pushed into it.
+    centre = jnp.stack([x, y, yaw], axis=-1)
+    at_x, at_y = _into_frame(centre, pose[:, None, :2])
+    in_x, in_y = jnp.clip(at_x, -half_x, half_x), jnp.clip(at_y, -half_y, half_y)
+    gap = jnp.hypot(at_x - in_x, at_y - in_y)
+    nearest = _out_of_frame(centre, in_x, in_y)
+    along = jnp.where(half_x >= half_y, 0.0, 0.5 * jnp.pi) + yaw
+    reach = jnp.maximum(half_x, half_y)
+    end = jnp.stack([reach * jnp.cos(along), reach * jnp.sin(along)], axis=-1)
+    viewer = pose[:, None]
+    one, other = (_into_frame(viewer, centre[:, :2] + sign * end) for sign in (-1.0, 1.0))
+    is_left = one[0] * other[1] - one[1] * other[0] >= 0.0  # the other, seen from the robot
+    right = [jnp.where(is_left, a, b) for a, b in zip(one, other, strict=True)]
+    left = [jnp.where(is_left, b, a) for a, b in zip(one, other, strict=True)]
+    thin = jnp.minimum(half_x, half_y)
+    rows = (1.0, *_into_frame(viewer, nearest), *right, *left, thin)
+    is_there = jnp.concatenate([level.obstacle_present, jnp.ones(model.WALLS, bool)])
+    return _nearest(gap, is_there, rows, NEAREST_RECTANGLES)
+
+
+def _nearest(distance: Array, is_there: Array, rows: tuple[Any, ...], count: int) -> Array:
+    """Takes the nearest things [R, N] that are there: [R, count * F], nearest first, then zeros."""
+    is_there = jnp.broadcast_to(is_there, distance.shape)
+    listed = min(count, distance.shape[1])
+    _, chosen = jax.lax.top_k(-jnp.where(is_there, distance, jnp.inf), listed)
+    every = jnp.stack([jnp.broadcast_to(row, distance.shape) for row in rows], axis=-1)
+    every = jnp.where(is_there[..., None], every, 0.0)
+    found = jnp.take_along_axis(every, chosen[..., None], axis=1)
+    found = jnp.pad(found, ((0, 0), (0, count - listed), (0, 0)))
+    return found.reshape(len(distance), -1)
+
+
+def _into_frame(frame: Array, point: Array) -> tuple[Array, Array]:
+    """Turns points [..., 2] of the arena into coordinates in frames [..., 3]."""
+    x, y = point[..., 0] - frame[..., 0], point[..., 1] - frame[..., 1]
+    cos, sin = jnp.cos(frame[..., 2]), jnp.sin(frame[..., 2])
+    return cos * x + sin * y, cos * y - sin * x
+
+
+def _out_of_frame(frame: Array, x: Array, y: Array) -> Array:
+    """Turns coordinates in frames [..., 3] into points [..., 2] of the arena."""
+    cos, sin = jnp.cos(frame[..., 2]), jnp.sin(frame[..., 2])
+    return jnp.stack([frame[..., 0] + cos * x - sin * y, frame[..., 1] + sin * x + cos * y], -1)

@@ -1,0 +1,192 @@
+"""A critic that sees the state: what it is shown, what it learns, and what never sees it."""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmjax.config import ConfigError
+from swarmjax.ppo import dispatch, networks
+from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.learner import Batch, LearnerState
+from swarmjax.run.checkpoint import digest, to_leaves
+from swarmjax.run.settings import TrainConfig
+from swarmjax.task import env
+from swarmjax.training import loop, rollout
+from swarmjax.training import program as programs
+from swarmjax.training.loop import TrainState
+from swarmjax.training.program import Program
+from swarmjax.training.rollout import Trajectory
+
+UPDATES = 3
+
+
+class Trained(NamedTuple):
+    """A run of some updates, and the rollout that comes next."""
+
+    program: Program
+    last: TrainState
+    trajectory: Trajectory
+
+
+def _algo(config: TrainConfig, **rest: Any) -> AlgoConfig:
+    return AlgoConfig(**{**vars(config.algo), "critic": "state", **rest})
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_config: TrainConfig) -> Trained:
+    """Of learners that are one for each robot, and remember."""
+    algo = _algo(tiny_config, policy="independent", memory="gru", memory_size=4)
+    config = replace(tiny_config, algo=algo)
+    program, schedule = programs.load(config)
+    chunk = jax.jit(partial(loop.train_chunk, program))
+    first = last = jax.jit(partial(loop.init, program))(schedule)
+    for _ in range(UPDATES):
+        last = chunk(schedule, last, np.int32(1))[0]
+    at_once, _ = chunk(schedule, first, np.int32(UPDATES))
+    assert digest(to_leaves(at_once)) == digest(to_leaves(last))  # any chunk size
+    waiting = loop._draw_waiting(program, schedule, last.curriculum, jax.random.key(1))
+    collect = jax.jit(partial(rollout.collect, program))
+    _, trajectory, _ = collect(last.learners, last.arenas, waiting, jax.random.key(2))
+    return Trained(program, last, trajectory)
+
+
+def _look(trained: Trained) -> np.ndarray:
+    """What is around the robots before the rollout, [A, R, P]."""
+    look = jax.vmap(partial(env.look_around, trained.program.world))
+    return np.asarray(look(trained.last.arenas))
+
+
+def test_the_critic_is_shown_what_is_around_each_robot(trained: Trained) -> None:
+    seen = trained.trajectory.state
+    assert seen is not None
+    assert seen.shape[-1] == trained.program.state_size
+    learners = trained.trajectory.value.shape[1]
+    now = rollout.to_learners(jnp.asarray(_look(trained)), learners)
+    np.testing.assert_array_equal(seen[0], now)
+    assert np.isfinite(seen).all()
+    assert np.ptp(np.asarray(seen), axis=0).max() > 0.0  # robots move
+
+
+def test_its_value_is_that_of_observation_and_state(trained: Trained) -> None:
+    config, learners = trained.program.config.algo, trained.last.learners
+    moments = learners.state_normalizer
+    assert moments is not None
+    assert trained.trajectory.state is not None
+    assert (np.asarray(moments.count) > 0).any()
+    count = trained.trajectory.value.shape[1]
+    state = np.asarray(trained.trajectory.state[0])
+    mean, std = (np.asarray(x)[:, None, None] for x in (moments.mean, moments.std))
+    normal = np.clip((state - mean) / std, -10.0, 10.0)
+    observation = jax.vmap(ppo.normalize)(learners, trained.trajectory.observation[0])
+    both = np.concatenate([observation, normal], axis=-1)
+    recall = trained.last.arenas.recall
+    memory = None if recall is None else rollout.to_learners(recall.critic, count)
+    value, _ = jax.vmap(lambda p, s, m: networks.recall_value(p, config, s, m))(
+        learners.params, both, memory
+    )
+    # float32; a product that is batched in another way.
+    np.testing.assert_allclose(trained.trajectory.value[0], value, atol=1e-5)
+
+
+def test_the_actor_sees_nothing_of_it(trained: Trained) -> None:
+    """Its first layer takes the observation alone; the critic's takes both."""
+    params: Any = trained.last.learners.params
+    size, more = trained.program.world.observation_size, trained.program.state_size
+    layer = {side: params[side]["torso"]["hidden_0"]["kernel"] for side in params}
+    assert layer["actor"].shape[1] == size
+    assert layer["critic"].shape[1] == size + more
+
+
+# --- what is learned
+
+SIZE, STATE = 3, 5
+CONFIG = AlgoConfig(
+    critic="state",
+    hidden_sizes=(16,),
+    num_minibatches=2,
+    epochs=4,
+    critic_learning_rate=1e-2,
+    learning_rate_schedule="constant",
+)
+
+
+def _batch(learner: LearnerState, seed: int) -> Batch:
+    """Samples whose return follows from the state alone."""
+    keys = jax.random.split(jax.random.key(seed), 3)
+    shape = (8, 32)
+    observation = jax.random.normal(keys[0], (*shape, SIZE))
+    noise = jax.random.normal(keys[1], (*shape, 2))
+    state = jax.random.normal(keys[2], (*shape, STATE))
+    action, log_prob = ppo.act(learner, CONFIG, observation, noise)
+    return Batch(
+        observation=observation,
+        action=action,
+        log_prob=log_prob,
+        advantage=jnp.zeros(shape),
+        return_=jnp.tanh(state[..., 0] - state[..., 1]),
+        valid=jnp.ones(shape, bool),
+        state=state,
+    )
+
+
+def _learn(told: bool) -> float:
+    """Trains a critic, that is told the state or nothing of it; returns its last value loss."""
+    learner = ppo.init(jax.random.key(0), CONFIG, SIZE, 2, 100, STATE)
+    update = jax.jit(lambda *given: ppo.update(given[0], CONFIG, *given[1:], updates=100))
+    loss = np.inf
+    for step in range(100):
+        batch = _batch(learner, step)
+        shown = batch if told else replace(batch, state=jnp.zeros((8, 32, STATE)))
+        learner, metrics = update(learner, shown, jax.random.key(step))
+        loss = float(metrics["value_loss"])
+    return loss
+
+
+def test_a_value_that_only_the_state_tells_is_learned() -> None:
+    # Half the variance of what is to be told is 0.19.
+    assert _learn(told=True) < 0.02
+    assert _learn(told=False) > 0.15
+
+
+@pytest.mark.parametrize("backend", ["autodiff", "blocks"])
+def test_a_state_changes_nothing_of_the_policy(backend: dispatch.Backend) -> None:
+    # Norms of gradients are clipped over both networks together: not here.
+    config = replace(CONFIG, num_minibatches=1, max_grad_norm=None)
+    learner = ppo.init(jax.random.key(0), config, SIZE, 2, 100, STATE)
+    batch = replace(_batch(learner, 0), advantage=_batch(learner, 1).return_)
+    other = replace(batch, state=jnp.zeros((8, 32, STATE)))
+    one, two = (
+        ppo.update(learner, config, each, jax.random.key(0), 100, backend)[0].params
+        for each in (batch, other)
+    )
+    jax.tree.map(np.testing.assert_array_equal, one["actor"], two["actor"])
+    kernels = [each["critic"]["torso"]["hidden_0"]["kernel"] for each in (one, two)]
+    assert np.abs(kernels[0] - kernels[1]).max() > 0.0
+
+
+def test_what_is_not_valid_may_hold_nan() -> None:
+    learner = ppo.init(jax.random.key(0), CONFIG, SIZE, 2, 100, STATE)
+    batch = _batch(learner, 0)
+    assert batch.state is not None
+    valid = batch.valid.at[:, ::2].set(False)
+    holes = jnp.where(valid[..., None], batch.state, jnp.nan)
+    found, expected = (
+        ppo.update(learner, CONFIG, replace(batch, valid=valid, state=x), jax.random.key(0), 100)[0]
+        for x in (holes, batch.state)
+    )
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+
+
+# --- where it goes, and what it does not go with
+
+
+def test_kernels_of_the_policy_alone_are_not_chosen() -> None:
+    assert dispatch.resolve(CONFIG, SIZE, 2) == "autodiff"
+    with pytest.raises(ConfigError, match="update_backend is fused, but critic is state"):
+        AlgoConfig(critic="state", update_backend="fused")
