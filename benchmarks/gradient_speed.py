@@ -5,7 +5,8 @@
 autodiff and every launch of the kernels, times calls of them in turn, and prints a JSON line for
 each: seconds of a gradient, and how far it is from autodiff's at the same and at full precision.
 Every gradient by the kernels has the networks laid out as vectors and back in it, which learners do
-once an update.
+once an update. With `algo.memory=gru` samples are sequences as long as a rollout, and with
+`algo.critic=state` the critic sees as much as in training; both by autodiff alone.
 """
 
 import functools
@@ -14,7 +15,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import jax
@@ -24,7 +25,7 @@ from jax.errors import JaxRuntimeError
 
 from benchmarks import key_value, timing
 from swarmjax import command, provenance
-from swarmjax.config import Section, about
+from swarmjax.config import ConfigError, Section, about
 from swarmjax.ppo import losses, networks
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.fast import fused
@@ -32,7 +33,7 @@ from swarmjax.ppo.fast.kernel import Launch
 from swarmjax.ppo.losses import Minibatch
 from swarmjax.ppo.networks import Params
 from swarmjax.run.settings import load_train
-from swarmjax.task import observation
+from swarmjax.task import observation, surroundings
 from swarmjax.training import program as programs
 
 _STEP = 1e-6  # along each gradient: none may be computed once for all
@@ -67,26 +68,29 @@ class SpeedConfig(Section):
 
 def minibatch(key: jax.Array, params: Params, algo: AlgoConfig, size: int) -> Minibatch:
     """Draws samples whose ratios are about 1, some of them clipped."""
-    keys = jax.random.split(key, 6)
-    seen = jax.random.normal(keys[0], (size, observation.SIZE))
-    action = jax.random.normal(keys[1], (size, programs.ACTION_SIZE))
-    mean, std = networks.action_distribution(params, algo, seen)
-    moved = 0.1 * jax.random.normal(keys[2], (size,))
-    return Minibatch(
-        observation=seen,
-        action=action,
-        log_prob=networks.log_prob(mean, std, action) + moved,
+    keys = jax.random.split(key, 7)
+    memory = networks.begin_memory(algo, (size // algo.rollout_length,))
+    state = jax.random.normal(keys[6], (size, surroundings.SIZE))
+    drawn = Minibatch(
+        observation=jax.random.normal(keys[0], (size, observation.SIZE)),
+        action=jax.random.normal(keys[1], (size, programs.ACTION_SIZE)),
+        log_prob=0.1 * jax.random.normal(keys[2], (size,)),
         advantage=jax.random.normal(keys[3], (size,)),
         return_=jax.random.normal(keys[4], (size,)),
         valid=jax.random.uniform(keys[5], (size,)) < _VALID,
+        memory=memory,
+        begins=None if memory is None else jnp.zeros(size, bool),
+        state=state if algo.critic == "state" else None,
     )
+    mean, std, _ = losses.evaluate(params, algo, drawn)
+    return replace(drawn, log_prob=drawn.log_prob + networks.log_prob(mean, std, drawn.action))
 
 
 def methods(given: SpeedConfig, algo: AlgoConfig) -> dict[Launch | None, Gradient]:
     """Makes what is timed: autodiff, without a launch, and the kernels with each."""
     autodiff = jax.grad(losses.ppo_loss, has_aux=True)
     made: dict[Launch | None, Gradient] = {None: _of_samples(autodiff, algo)}
-    if given.kernels != "none":
+    if given.kernels != "none" and algo.memory == "none" and algo.critic == "observation":
         for launch in itertools.starmap(
             Launch, itertools.product(given.tile, given.programs, given.warps)
         ):
@@ -145,7 +149,9 @@ def _difference(one: Params, other: Params) -> float:
 def lines(given: SpeedConfig, algo: AlgoConfig, size: int) -> Iterator[dict[str, Any]]:
     """Measures one size of the minibatch; yields a line for each method."""
     init_key, key = jax.random.split(jax.random.key(0))
-    params = networks.init_params(init_key, algo, observation.SIZE, programs.ACTION_SIZE)
+    sizes = observation.SIZE, programs.ACTION_SIZE
+    more = surroundings.SIZE if algo.critic == "state" else 0
+    params = networks.init_params(init_key, algo, *sizes, more)
     samples = jax.jit(minibatch, static_argnums=(2, 3))(key, params, algo, size)
     made = methods(given, algo)
     built = {
@@ -182,6 +188,8 @@ def _about(
         **(dict.fromkeys(Launch._fields) if launch is None else launch._asdict()),
         "hidden": algo.hidden_sizes,
         "activation": algo.activation,
+        "memory": algo.memory_size,
+        "critic": algo.critic,
         "steps": given.steps,
         "kernels": given.kernels,
         "matmul_precision": timing.matmul_precision(),
@@ -195,6 +203,12 @@ def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     given, words = key_value.parse(SpeedConfig, arguments)
     algo = load_train(words).algo
+    for size in given.batch:
+        if algo.memory != "none" and size % algo.rollout_length:
+            raise ConfigError(
+                f"batch is {size}, but algo.memory is {algo.memory}: give a multiple of "
+                f"algo.rollout_length, which is {algo.rollout_length}."
+            )
     for size in given.batch:
         for line in lines(given, algo, size):
             sys.stdout.write(json.dumps(line) + "\n")

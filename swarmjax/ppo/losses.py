@@ -79,7 +79,7 @@ def ppo_loss(
     def mean(samples: jax.Array) -> jax.Array:
         return jnp.sum(jnp.where(valid, samples, 0.0)) / jnp.maximum(expected_valid, 1.0)
 
-    action_mean, std, value = _evaluate(params, config, minibatch)
+    action_mean, std, value = evaluate(params, config, minibatch)
     log_prob = networks.log_prob(action_mean, std, minibatch.action)
     # Masked before exp: an overflow there would turn the zero gradient of a mask into NaN.
     log_ratio = jnp.where(valid, log_prob - minibatch.log_prob, 0.0)
@@ -102,10 +102,19 @@ def ppo_loss(
     return loss, metrics
 
 
-def _evaluate(
+def evaluate(
     params: Params, config: AlgoConfig, minibatch: Minibatch
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Computes mean action [B, U], deviation [U] and value [B]; of sequences, through time."""
+    """Computes what actor and critic make of samples; of sequences, through time.
+
+    Args:
+        params: Of actor and critic.
+        minibatch: B samples.
+        config: The config that made `params`.
+
+    Returns:
+        Mean action [B, U], deviation [U] and value [B].
+    """
     seen, memory = minibatch.observation, minibatch.memory
     judged = seen
     if minibatch.state is not None:
