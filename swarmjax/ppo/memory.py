@@ -8,6 +8,8 @@ can therefore ignore.
 B stands for any number of leading axes, T for control steps, F for features, H for the memory.
 """
 
+import functools
+import math
 from typing import Any, NamedTuple
 
 import chex
@@ -15,7 +17,8 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-# Flax's own choice for its GRU: LeCun's for what is seen, orthogonal for what is recalled.
+# `algo.initialization=orthogonal` means Flax's own choice for its GRU: LeCun's for what is seen,
+# orthogonal for what is recalled, no bias.
 _INPUT = nn.initializers.lecun_normal()
 
 
@@ -36,9 +39,12 @@ class Gru(nn.Module):
 
     Attributes:
         size: H.
+        uniform: Whether kernels and biases begin within 1 / sqrt(H), as those of PyTorch's GRU
+            (`torch.nn.RNNBase.reset_parameters`).
     """
 
     size: int
+    uniform: bool = False
 
     @nn.compact
     def __call__(
@@ -55,8 +61,8 @@ class Gru(nn.Module):
         Returns:
             What the heads take, features beside memory [.., F + H], and the memory [B, H] after.
         """
-        seen = nn.Dense(3 * self.size, kernel_init=_INPUT, name="input")(features)
-        recurrent = nn.Dense(3 * self.size, kernel_init=_recurrent, name="recurrent")
+        seen = self._layer(_INPUT, "input")(features)
+        recurrent = self._layer(_recurrent, "recurrent")
         if begins is None:
             memory = remember(seen, recurrent(memory), memory)
             return jnp.concatenate([features, memory], axis=-1), memory
@@ -70,6 +76,20 @@ class Gru(nn.Module):
 
         memory, every = jax.lax.scan(step, memory, (seen, begins))
         return jnp.concatenate([features, every], axis=-1), memory
+
+    def _layer(self, kernel: Any, name: str) -> nn.Dense:
+        """Makes what the three gates add up to, side by side."""
+        if not self.uniform:
+            return nn.Dense(3 * self.size, kernel_init=kernel, name=name)
+        within = functools.partial(uniform, bound=1.0 / math.sqrt(self.size))
+        return nn.Dense(3 * self.size, kernel_init=within, bias_init=within, name=name)
+
+
+def uniform(
+    key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32, *, bound: float
+) -> jax.Array:
+    """Draws numbers within +-`bound`, as Flax calls what initialises."""
+    return jax.random.uniform(key, shape, dtype, -bound, bound)
 
 
 def remember(seen: jax.Array, recalled: jax.Array, memory: jax.Array) -> jax.Array:

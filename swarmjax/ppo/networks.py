@@ -61,8 +61,7 @@ class _Actor(nn.Module):
     ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
         features = _torso(self.config)(observation)
         if memory is not None:
-            gru = Gru(_memory_size(self.config), name="memory")
-            features, memory = gru(features, memory, begins)
+            features, memory = _gru(self.config)(features, memory, begins)
         layer = _layer(self.config, features, self.action_size, _HEAD_GAIN, "mean")
         log_std = self.param(
             "log_std",
@@ -87,10 +86,13 @@ class _Critic(nn.Module):
     ) -> tuple[jax.Array, jax.Array | None]:
         features = _torso(self.config)(observation)
         if memory is not None:
-            gru = Gru(_memory_size(self.config), name="memory")
-            features, memory = gru(features, memory, begins)
+            features, memory = _gru(self.config)(features, memory, begins)
         found = _layer(self.config, features, 1, _HEAD_GAIN, "value")(features)[..., 0]
         return found, memory
+
+
+def _gru(config: AlgoConfig) -> Gru:
+    return Gru(_memory_size(config), config.initialization == "uniform", name="memory")
 
 
 def _memory_size(config: AlgoConfig) -> int:
@@ -108,14 +110,8 @@ def _layer(config: AlgoConfig, features: jax.Array, width: int, gain: float, nam
     if config.initialization == "orthogonal":
         return nn.Dense(width, kernel_init=nn.initializers.orthogonal(gain), name=name)
     # What `torch.nn.Linear.reset_parameters` comes to: the bound of both is 1 / sqrt(inputs).
-    uniform = functools.partial(_uniform, bound=1.0 / math.sqrt(features.shape[-1]))
+    uniform = functools.partial(ppo_memory.uniform, bound=1.0 / math.sqrt(features.shape[-1]))
     return nn.Dense(width, kernel_init=uniform, bias_init=uniform, name=name)
-
-
-def _uniform(
-    key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32, *, bound: float
-) -> jax.Array:
-    return jax.random.uniform(key, shape, dtype, -bound, bound)
 
 
 def init_params(

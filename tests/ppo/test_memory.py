@@ -245,6 +245,13 @@ def test_refuses_what_goes_with_no_memory(changed: dict[str, Any], said: str) ->
         AlgoConfig(**({"memory": "gru"} | changed))
 
 
+def test_a_uniform_unit_begins_within_the_bound_of_pytorch() -> None:
+    config = replace(CONFIG, initialization="uniform", memory_size=64)
+    params = networks.init_params(jax.random.key(0), config, WIDTH, 2)["actor"]["memory"]
+    for part in jax.tree.leaves(params):
+        assert 0.1 < np.abs(part).max() <= 1 / 8
+
+
 def test_a_memory_begins_empty() -> None:
     assert networks.begin_memory(AlgoConfig(), (2, 3)) is None
     made = networks.begin_memory(CONFIG, (2, 3))

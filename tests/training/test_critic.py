@@ -17,7 +17,7 @@ from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.run.checkpoint import digest, to_leaves
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task import env
-from swarmjax.training import loop, rollout
+from swarmjax.training import loop, rollout, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
 from swarmjax.training.program import Program
@@ -101,6 +101,25 @@ def test_the_actor_sees_nothing_of_it(trained: Trained) -> None:
     layer = {side: params[side]["torso"]["hidden_0"]["kernel"] for side in params}
     assert layer["actor"].shape[1] == size
     assert layer["critic"].shape[1] == size + more
+
+
+@pytest.mark.slow
+def test_seeds_side_by_side_are_those_alone(tiny_config: TrainConfig) -> None:
+    """With a memory, a state, and a policy for each robot, for one update."""
+    algo = _algo(tiny_config, policy="independent", memory="gru", memory_size=4)
+
+    def run(first: int, count: int) -> dict[str, np.ndarray]:
+        config = replace(tiny_config, algo=algo, seed=first, seeds=count, seeds_by="vmap")
+        program, schedule = programs.load(config)
+        state = jax.jit(partial(seeds.init, program))(schedule)
+        state, _ = jax.jit(partial(seeds.train_chunk, program))(schedule, state, np.int32(1))
+        return to_leaves(state.learners.params)
+
+    together = run(0, 2)
+    for lane in range(2):
+        for name, leaf in run(lane, 1).items():
+            # Batched products round in another way, as in test_seeds.py.
+            np.testing.assert_allclose(together[name][lane], leaf[0], atol=1e-5, err_msg=name)
 
 
 # --- what is learned

@@ -20,9 +20,12 @@ from swarmjax.training.program import Program
 @pytest.fixture(scope="module")
 def states(tiny_config: TrainConfig, tiny_world: World) -> tuple[TrainState, TrainState]:
     """A state on the second stage with episodes counted, and the same with arenas drawn again."""
-    program = Program(tiny_config, tiny_world)
+    algo = replace(tiny_config.algo, memory="gru", memory_size=4)
+    program = Program(replace(tiny_config, algo=algo), tiny_world)
     schedule = programs.schedule(tiny_config)
     begun = jax.jit(partial(loop.init, program))(schedule)
+    remembered = jax.tree.map(lambda x: x + 1.0, begun.arenas.recall)
+    begun = replace(begun, arenas=replace(begun.arenas, recall=remembered))
     weights = np.float32([0.0, 1.0])
     tally = jax.tree.map(lambda x: x + 3, begun.curriculum.current)
     there = replace(
@@ -52,6 +55,12 @@ def test_arenas_begin_on_the_stages_of_now(states: tuple[TrainState, TrainState]
     before, after = states
     assert set(before.arenas.stage.tolist()) == {0}
     assert set(after.arenas.stage.tolist()) == {1}
+
+
+def test_arenas_begin_with_nothing_to_remember(states: tuple[TrainState, TrainState]) -> None:
+    recall = states[1].arenas.recall
+    assert recall is not None
+    assert not any(np.any(part) for part in recall)
 
 
 def test_a_cohort_begins_that_holds_all_new_episodes(states: tuple[TrainState, TrainState]) -> None:

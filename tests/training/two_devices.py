@@ -1,6 +1,7 @@
-"""Trains a small run over devices, and writes what came of it: `OUT DEVICES [COORDINATOR RANK]`.
+"""Trains a small run over devices, and writes what came of it.
 
-With a coordinator it is one of two processes, which have a device each.
+`OUT DEVICES WORDS [COORDINATOR RANK]`: words of the config with spaces between them. With a
+coordinator it is one of two processes, which have a device each.
 """
 
 import re
@@ -26,11 +27,11 @@ WORDS = [
 ]
 
 
-def main(out: str, devices: str, *more: str) -> None:
+def main(out: str, devices: str, words: str, *more: str) -> None:
     """Trains, and writes the learners and the metrics of all updates."""
     if more:
         jax.distributed.initialize(more[0], 2, int(more[1]))
-    config = load_train([*WORDS, f"devices={devices}"])
+    config = load_train([*WORDS, *words.split(), f"devices={devices}"])
     program, schedule = programs.load(config)
     state = jax.jit(mesh.init(program))(schedule)
     call: Any = trainer.compile_chunk(program, schedule, state).call
