@@ -22,7 +22,7 @@ from jax import Array
 
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.sim import physics
-from swarmjax.task import env, observation
+from swarmjax.task import env
 from swarmjax.task.env import EnvState, TimeStep
 from swarmjax.training import program as programs
 from swarmjax.training import rollout
@@ -62,7 +62,7 @@ class SwarmEnv(Env):
     @property
     def observation_size(self) -> int:
         """Numbers that a robot observes."""
-        return observation.SIZE
+        return self.world.observation_size
 
     @property
     def action_size(self) -> int:

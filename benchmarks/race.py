@@ -39,7 +39,6 @@ from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import optimizer
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.run.settings import TrainConfig, load_train
-from swarmjax.task import observation
 from swarmjax.training import program as programs
 
 SHARES = (0.90, 0.95)
@@ -227,7 +226,7 @@ def as_learners(trained: TrainConfig, params: Any) -> LearnerState:
       critic is not Brax's.
     """
     moments, policy, _ = params
-    mine = ppo.init(jax.random.key(0), trained.algo, observation.SIZE, 2, 1)
+    mine = ppo.init(jax.random.key(0), trained.algo, moments.mean.shape[-1], 2, 1)
     layers = policy["params"]
     torso = {name: layers["MLP_0"][name] for name in mine.params["actor"]["torso"]}
     actor = {

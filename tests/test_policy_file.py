@@ -89,8 +89,13 @@ def _part(part: str, **changes: Any) -> dict[str, Any]:
     return {part: policies.meta()[part] | changes}
 
 
+def _history(count: int) -> dict[str, Any]:
+    return {"format": 4} | _part("observation", history=count)
+
+
 _GOOD = policies.arrays()
 _RECALLS = policies.remembering(_GOOD, 5)
+_STACKS = policies.stacked(_GOOD, 3)
 _MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
 
 
@@ -114,6 +119,28 @@ _MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
             _RECALLS,
             _MEMORY | {"memory": {"kind": "gru", "size": 4}},
             r"actor/mean/kernel has shape \[1, 8, 2\]: expected \[1, 7, 2\]",
+        ),
+        (
+            _GOOD,
+            _part("observation", history=0),
+            r"meta.observation.history is 0: expected 1 to 64",
+        ),
+        (_STACKS, _history(65), r"meta.observation.history is 65: expected 1 to 64"),
+        (
+            _STACKS,
+            _part("observation", history="3"),
+            r'meta.observation.history is "3": expected a',
+        ),
+        (
+            _STACKS,
+            _history(2),
+            rf"actor/hidden_0/kernel has shape \[1, {3 * SIZE}, 4\]: expected \[1, {2 * SIZE}, 4\]",
+        ),
+        (_STACKS, _history(3) | {"format": 2}, r"meta.format is 2, but this version reads 2, 3 w"),
+        (
+            _RECALLS,
+            _MEMORY | _history(3),
+            r"meta.observation.history is 3 beside meta.memory: expected one of them",
         ),
         (_RECALLS, _MEMORY | {"network": "mine"}, r"meta.memory is there beside meta.network"),
         (_without("actor/hidden_0/kernel"), {}, r"actor/hidden_0/kernel is missing"),
@@ -162,7 +189,7 @@ _MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
             _GOOD,
             {"format": 1},
             r"meta.format is 1, but this version reads 2, 3 with meta.network, and 4 with "
-            "meta.memory: export the policy",
+            "meta.memory or a history: export the policy",
         ),
         (_GOOD, {"activation": "gelu"}, r'meta.activation is "gelu": expected tanh or relu or sw'),
         (_GOOD, {"policy": "mine"}, r'meta.policy is "mine": expected shared or independent'),

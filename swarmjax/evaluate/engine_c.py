@@ -286,7 +286,7 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
     """
     task, before = judge.config.task, arenas.outcome.arrived
     if action is None:
-        if judge.policy.memory is not None:
+        if judge.policy.carried:
             raise PolicyError("the policy remembers: give the action, as `by_policy` chooses it.")
         _, action = by_policy(judge).act(None, arenas)
     memory, pose, impulse = _drive(judge, arenas, action, arrival.drives(task.arrival, before))

@@ -175,10 +175,9 @@ def play(
     run = _program(
         world,
         steps,
-        trained.encoding,
+        (trained.encoding, trained.history, trained.meta["observation"]["limit"]),
         (trained.max_speed, trained.max_turn_rate),
         trained.meta["activation"],
-        trained.meta["observation"]["limit"],
         sampled,
         None if trained.network is None else trained.network.module,
     )
@@ -197,18 +196,18 @@ def play(
 def _program(
     world: World,
     steps: int,
-    encoding: electronics.Encoding,
+    seen: tuple[electronics.Encoding, int, float],
     limits: tuple[float, float],
     activation: str,
-    limit: float,
     sampled: bool,
     network: Any,
 ) -> Callable[[Any, ArrayLike, Level], tuple[dict[str, Array], Array]]:
     """The compiled program of policies that differ in their weights alone."""
-    speed, turn_rate = limits
+    (encoding, history, limit), (speed, turn_rate) = seen, limits
     mine = replace(
         world,
         drive=world.drive._replace(max_speed=speed, max_turn_rate=turn_rate),
+        task=replace(world.task, history=history),
         electronics=replace(world.electronics, encoding=encoding),
     )
 

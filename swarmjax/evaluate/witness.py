@@ -22,6 +22,7 @@ from swarmjax.task.config import TaskConfig, describe
 _TASK = ("control_step", "target_radius", "arrival", "observations")
 BODY = "wheeled"  # of a judge, unless a word or a file names another
 _TOLD = ("robot", "task", "realism")  # what a line names that a word set otherwise
+_OWN = "task.history"  # each policy brings its own, as it does its network
 
 
 class Trained(NamedTuple):
@@ -60,6 +61,7 @@ def trained(meta: Mapping[str, Any], path: str) -> Trained:
     }
     task = {key: meta["task"][key] for key in _TASK if key in meta["task"]}
     task["sensor_range"] = meta["sensors"]["range"]
+    task["history"] = meta["observation"].get("history", 1)
     sensors = {"infrared": meta["sensors"]["response"], "name": meta["sensors"]["preset"]}
     realism = meta.get("realism") or config.get("realism") or sensors
     stages = meta.get("stages") or meta["config"].get("stage") or []
@@ -109,6 +111,7 @@ def load[C: Section](
     if stage is None and found and found[0].stages:
         stage = found[0].stages[-1]
     settings = stage_files.load_levels(cls, [*(words[0] if words else ()), *typed], stage)
+    _check_history(settings, dict(zip(metas, found, strict=True)))
     return settings, _say(settings, typed)
 
 
@@ -141,12 +144,27 @@ def _check_alike(
     for path, mine in zip(paths[1:], words[1:], strict=True):
         for word in sorted(set(mine) ^ set(words[0])):
             key = word.partition("=")[0]
-            if key not in told:
+            if key not in told and key != _OWN:
                 first, other = (_value(each, key) for each in (words[0], mine))
                 raise ConfigError(
                     f"{paths[0]} and {path} were trained differently, with {key} {first} and "
                     f"{other}: say by which to judge them, as in {word}."
                 )
+
+
+def _check_history(settings: Any, found: Mapping[str, Trained]) -> None:
+    """Refuses another history than a policy's: its network takes that one and no other.
+
+    Several policies may differ; the settings then have that of the first.
+    """
+    histories = {path: each.task.history for path, each in found.items()}
+    given = settings.task.history
+    if histories and given not in histories.values():
+        path, held = next(iter(histories.items()))
+        raise ConfigError(
+            f"{_OWN} is {given}, but {path} was trained with {held}: leave {_OWN} out, since "
+            "each policy is judged with its own."
+        )
 
 
 def _value(words: list[str], key: str) -> str:

@@ -23,7 +23,7 @@ _ACTIVATIONS = {
 
 _MEMORY_TYPE = """#define POLICY_MEMORY SIZE
 
-/* What a robot remembers. */
+/* WHAT */
 typedef struct {
     float recalled[POLICY_MEMORY];
 } PolicyMemory;
@@ -51,13 +51,32 @@ static void remember(unsigned learner, const float *features, float *recalled)
     }
 }
 
-void policy_begin(PolicyMemory *memory)
+"""
+# The observations of a history, newest first: zeros where an episode begins, as in `policy.step`.
+_HISTORY_CODE = """static void remember(const float *observation, float *recalled)
+{
+    for (unsigned i = POLICY_MEMORY; i-- > POLICY_OBSERVATIONS;) {
+        recalled[i] = recalled[i - POLICY_OBSERVATIONS];
+    }
+    for (unsigned i = 0; i < POLICY_OBSERVATIONS; i++) {
+        recalled[i] = observation[i];
+    }
+}
+
+"""
+_BEGIN_CODE = """void policy_begin(PolicyMemory *memory)
 {
     for (unsigned i = 0; i < POLICY_MEMORY; i++) {
         memory->recalled[i] = 0.0f;
     }
 }
 
+"""
+_HISTORY_CALL = """    for (unsigned i = 0; i < POLICY_MEMORY; i++) {
+        const unsigned entry = POLICY_OBSERVATIONS + i;
+        a[entry] = clip((memory->recalled[i] - MEAN[learner][entry]) / STD[learner][entry], LIMIT);
+    }
+    remember(observation, memory->recalled);
 """
 _MEMORY_RESET = """        if (i % (CASES / 2) < POLICY_LEARNERS) {
             policy_begin(&memory[i % POLICY_LEARNERS]);
@@ -105,7 +124,7 @@ def _about(trained: Policy) -> dict[str, str]:
         "control_step_f": number(task["control_step"]),
         "target_radius_f": number(task["target_radius"]),
         "holds": str(int(export_layout.holds(trained))),
-        "observations": str(sizes[0]),
+        "observations": str(_seen(trained)),
         "actions": str(sizes[-1]),
         "learners": str(learners),
         **{key: short(robot[key]) for key in ("wheel_radius", "track", "max_wheel_speed")},
@@ -116,12 +135,17 @@ def _about(trained: Policy) -> dict[str, str]:
 
 
 def _sizes(trained: Policy) -> list[int]:
-    """The sizes of the layers, from the observation to the action."""
+    """The sizes of the layers, from the observations to the action."""
     return [trained.mean.shape[1], *(bias.shape[1] for _, bias in trained.layers)]
 
 
+def _seen(trained: Policy) -> int:
+    """The size of one observation."""
+    return trained.mean.shape[1] // trained.history
+
+
 def _recalled(trained: Policy) -> int:
-    """How many numbers a robot remembers."""
+    """The size of the gated recurrent unit; 0 without one."""
     return 0 if trained.memory is None else trained.memory[2].shape[1]
 
 
@@ -133,17 +157,21 @@ def _widest(trained: Policy) -> int:
 
 def _memory(trained: Policy) -> dict[str, str]:
     """The parts of the files that are about a memory; empty for a policy without one."""
-    size = _recalled(trained)
+    size = trained.carried
     if not size:
         names = ("type", "parameter", "code", "begin", "reset", "argument", "word")
         return dict.fromkeys((f"memory_{name}" for name in names), "") | {
             "kept": "Nothing is kept in RAM between calls.",
             "memory_start": "",
         }
+    what, code = "What a robot remembers.", _MEMORY_CODE
+    if trained.history > 1:
+        what = f"The {trained.history - 1} observations before the last one, newest first."
+        code = _HISTORY_CODE
     return {
-        "memory_type": _MEMORY_TYPE.replace("SIZE", str(size)),
+        "memory_type": _MEMORY_TYPE.replace("SIZE", str(size)).replace("WHAT", what),
         "memory_parameter": "PolicyMemory *memory, ",
-        "memory_code": _MEMORY_CODE.replace("FEATURES", str(_sizes(trained)[-2])),
+        "memory_code": code.replace("FEATURES", str(_sizes(trained)[-2])) + _BEGIN_CODE,
         "memory_begin": "    PolicyMemory memory[POLICY_LEARNERS];\n",
         "memory_reset": _MEMORY_RESET,
         "memory_argument": "&memory[i % POLICY_LEARNERS], ",
@@ -170,15 +198,16 @@ def _layout(trained: Policy) -> dict[str, str]:
 def _code(trained: Policy) -> dict[str, str]:
     """What differs from policy to policy in its code."""
     robot, layout = trained.meta["robot"], trained.meta["observation"]
-    sizes = _sizes(trained)
+    sizes, limit = _sizes(trained), number(layout["limit"])
     return {
         "widest": str(_widest(trained)),
         "offset": _values(layout["offset"]),
         "scale": _values(layout["scale"]),
-        "limit": number(layout["limit"]),
+        "limit": limit,
         "arrays": "\n".join(_arrays(trained)),
         "tanh": ", and that not for relu" if trained.memory is None else "",
         "activation": _ACTIVATIONS[trained.meta["activation"]],
+        "history": _HISTORY_CALL.replace("LIMIT", limit) if trained.history > 1 else "",
         "layers": "\n".join(_calls(sizes, _recalled(trained))),
         "max_speed": number(trained.max_speed),
         "max_turn_rate": number(trained.max_turn_rate),
@@ -230,10 +259,11 @@ def _calls(sizes: Sequence[int], recalled: int) -> Iterable[str]:
 def _cases(trained: Policy) -> dict[str, str]:
     """Cases of the self-test, half of them beyond the clip, and what NumPy makes of them."""
     draw = np.random.default_rng(0)
-    shape = (CASES, *trained.mean.shape)
+    mean, std = (part[:, : _seen(trained)] for part in (trained.mean, trained.std))
+    shape = (CASES, *mean.shape)
     reach = np.where(np.arange(CASES) % 2, 1.5 * trained.meta["observation"]["limit"], 3.0)
     drawn = draw.uniform(-1, 1, shape) * reach[:, None, None]
-    observation = (trained.mean + trained.std * drawn).astype(np.float32)
+    observation = (mean + std * drawn).astype(np.float32)
     action = _play(trained, observation)
     normal = draw.standard_normal(action.shape, np.float32)
     sample = action + np.exp(trained.log_std) * normal

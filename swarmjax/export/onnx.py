@@ -57,8 +57,8 @@ def render(policy: Policy) -> bytes:
         The bytes of an ONNX file. Its input `observation` is [B, O] if the policy is shared, else
         [B, R, O] with R the number of learners, as `meta["observation"]` of the policy says; its
         outputs are `action` ([..., U], as `policy.act` without `normal`) and `command` (as
-        `policy.command`: m/s and rad/s). One that remembers takes `memory` [..., H] too, zeros
-        where an episode begins, and gives `memory_after`.
+        `policy.command`: m/s and rad/s). One that remembers takes `memory` [..., H] too, or of a
+        history [..., (k - 1) O], zeros where an episode begins, and gives `memory_after`.
 
     Raises:
         ConfigError: if the package `onnx` is not installed.
@@ -76,11 +76,14 @@ def render(policy: Policy) -> bytes:
         return helper.make_tensor_value_info(name, TensorProto.FLOAT, [*leading, size])
 
     actions = len(policy.meta["action"]["names"])
-    recalled = [] if policy.memory is None else [policy.memory[2].shape[1]]
+    recalled = [policy.carried] if policy.carried else []
     made = helper.make_graph(
         graph.nodes,
         "policy",
-        [port("observation", policy.mean.shape[1]), *(port("memory", n) for n in recalled)],
+        [
+            port("observation", policy.mean.shape[1] // policy.history),
+            *(port("memory", n) for n in recalled),
+        ],
         [
             port("action", actions),
             port("command", actions),
@@ -106,6 +109,8 @@ def _graph(policy: Policy) -> _Graph:
         """Adds what every row of a batch, robots first, is added to."""
         return graph.constant(array[0] if shared else array[:, None])
 
+    if policy.history > 1:
+        _stack(graph, policy.carried)
     if not shared:
         graph.then("Transpose", perm=[1, 0, 2])  # robots first, so that each meets its own matrix
     graph.then("Sub", rows(policy.mean))
@@ -126,6 +131,14 @@ def _graph(policy: Policy) -> _Graph:
     graph.then("Mul", graph.constant((high - low) / 2))
     graph.then("Add", graph.constant((high + low) / 2), name="command")
     return graph
+
+
+def _stack(graph: _Graph, size: int) -> None:
+    """Puts the observations before behind the newest, and hands on all but the oldest."""
+    stacked = graph.then("Concat", "memory", axis=-1)
+    bounds = (graph.constant([bound], np.int64) for bound in (0, size, -1))  # start, end, axis
+    graph.then("Slice", *bounds, name="memory_after")
+    graph.value = stacked
 
 
 def _remember(graph: _Graph, parts: tuple[np.ndarray, ...], *, shared: bool) -> None:

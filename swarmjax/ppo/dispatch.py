@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal
 
 import jax
@@ -91,14 +92,25 @@ def _fuses(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
             f"{_LEAST_GENERATION} or more: give auto or autodiff."
         )
     if config.update_backend == "fused" and not fitting:
-        raise ConfigError(
-            f"algo.update_backend is fused, but algo.hidden_sizes is {show(config.hidden_sizes)}, "
-            "which does not fit "
-            "the chip: give two layers of 16, 32 or 64, or algo.update_backend=auto."
-        )
+        raise _unfit(config, observation_size, action_size)
     if config.update_backend == "auto" and jax.config.jax_default_matmul_precision in _FULL:
         return False
     return fitting
+
+
+def _unfit(config: AlgoConfig, observation_size: int, action_size: int) -> ConfigError:
+    """Says what does not fit the chip: the layers, or already what is observed."""
+    narrow = replace(config, hidden_sizes=(16, 16))
+    if config.torso is None and not _fits(narrow, observation_size, action_size):
+        return ConfigError(
+            f"algo.update_backend is fused, but {observation_size} numbers are observed, which do "
+            "not fit the chip: give a smaller task.history, or algo.update_backend=auto."
+        )
+    return ConfigError(
+        f"algo.update_backend is fused, but algo.hidden_sizes is {show(config.hidden_sizes)}, "
+        "which does not fit "
+        "the chip: give two layers of 16, 32 or 64, or algo.update_backend=auto."
+    )
 
 
 def _fits(config: AlgoConfig, observation_size: int, action_size: int) -> bool:

@@ -73,7 +73,7 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
             "policy": trained.algo.policy,
             "learners": trained.learners,
             "activation": trained.algo.activation,
-            "observation": described | {"limit": ppo.OBSERVATION_LIMIT},
+            "observation": described | _history(trained) | {"limit": ppo.OBSERVATION_LIMIT},
             "action": {
                 "names": list(policy_file.ACTION_NAMES),
                 "units": list(policy_file.ACTION_UNITS),
@@ -115,6 +115,11 @@ def _memory(algo: AlgoConfig) -> dict[str, Any]:
     if algo.memory == "none":
         return {}
     return {"memory": {"kind": algo.memory, "size": algo.memory_size}}
+
+
+def _history(trained: TrainConfig) -> dict[str, int]:
+    """Says how many observations the policy takes, if it takes more than the last one."""
+    return {} if trained.task.history == 1 else {"history": trained.task.history}
 
 
 def seed_path(path: Path, trained: TrainConfig, seed: int) -> Path:

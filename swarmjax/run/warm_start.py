@@ -157,6 +157,12 @@ def _check_alike(init_from: str, stored: TrainConfig, settings: TrainConfig) -> 
             settings.algo.mean_activation,
             f"algo.mean_activation={output}",
         ),
+        (
+            "task.history",
+            stored.task.history,
+            settings.task.history,
+            f"task.history={stored.task.history}",
+        ),
         ("encoding of observations", seen, needed, f"task.encoding={seen}"),
     ):
         if held != wanted:

@@ -79,6 +79,10 @@ class TaskConfig(Section):
         default=None,
         metadata=about("of extensions, in their order; null: all of them"),
     )
+    history: int = field(
+        default=1,
+        metadata=about("observations that the policy takes: the last one and those before", 1, 64),
+    )
     reward: RewardConfig = field(default_factory=RewardConfig)
 
 

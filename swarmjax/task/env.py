@@ -60,8 +60,8 @@ class World:
 
     @property
     def observation_size(self) -> int:
-        """Entries of an observation, O."""
-        return self.electronics.layout.size
+        """Entries of what a policy takes, O: of `task.history` observations together."""
+        return self.task.history * self.electronics.layout.size
 
 
 @struct.dataclass
@@ -73,7 +73,7 @@ class EnvState:
       level: what the episode started from.
       factors: what realism makes of the episode; they follow from the level's seed.
       memory: what the robots' electronics carry along.
-      observation: [R, O] what the policy sees now.
+      observation: [R, O] what the policy sees now; by `task.history`, what it saw before follows.
       clock: [] control steps since the start, int32.
       arrived: [R] whether the robot has arrived; by `task.arrival=hold`, is within its target now.
       distance: [R] to the target, m.
@@ -203,12 +203,13 @@ def reset(world: World, level: Level) -> EnvState:
     sight = _look(world, level.start, level, factors)
     sight = _look_by_extension(world, sight, level.start, level, arrived, clock)
     memory, seen = task_electronics.begin(world.electronics, factors, sight, clock, jnp)
+    nothing = jnp.zeros((robots, world.observation_size), seen.dtype)
     return EnvState(
         sim=physics.rest(world.physics, level.start),
         level=level,
         factors=factors,
         memory=memory,
-        observation=seen,
+        observation=observation.stack(seen, nothing, jnp),
         clock=clock,
         arrived=arrived,
         distance=sight.distance,
@@ -277,6 +278,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     valid = active & sound
     gained = jnp.where(valid, gained, 0.0)
     # The step of an arena that broke is not learned from, and the critic need not see it either.
+    seen = observation.stack(seen, state.observation, jnp)
     seen = jnp.where(sound, seen, state.observation)
     episode = _tally(state.episode, gained, begins, earned, valid & ~state.arrived)
     timeout = clock >= world.task.step_limit

@@ -115,6 +115,36 @@ def layout(encoding: Encoding, own: Sequence[Observation] = ()) -> Layout:
     return Layout(*zip(*rows, strict=True))
 
 
+def stacked_names(names: Sequence[str], history: int) -> tuple[str, ...]:
+    """Names the entries of a policy that takes several observations.
+
+    Args:
+      names: [O] of one observation.
+      history: k, how many it takes.
+
+    Returns:
+      [k O] the names as they are of what is seen now, then those of 1, 2, ... control steps before,
+      as `target_distance[-1]`.
+    """
+    marks = ["", *(f"[-{age}]" for age in range(1, history))]
+    return tuple(f"{name}{mark}" for mark in marks for name in names)
+
+
+def stack(fresh: Array, before: Array, xp: Any) -> Array:
+    """Puts an observation before those that were seen before it, of which the oldest goes.
+
+    Args:
+      fresh: [..., O] what is seen now.
+      before: [..., k O] the stack one control step before; zeros where an episode begins.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [..., k O] newest first.
+    """
+    kept = before.shape[-1] - fresh.shape[-1]
+    return xp.concatenate([fresh, before[..., :kept]], axis=-1) if kept else fresh
+
+
 LAYOUTS = {encoding: layout(encoding) for encoding in ("metric", "webots")}
 NAMES = LAYOUTS["metric"].names
 SIZE = LAYOUTS["metric"].size

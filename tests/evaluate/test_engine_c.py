@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import policies
 import pytest
 import steering
 from entries import BEARING, DISTANCE, INFRARED, KNOWN, TARGET
@@ -92,6 +93,16 @@ def _draw_some(judge: Judge, episodes: Sequence[int]) -> list[Level]:
 
 def _pose(arenas: Arenas) -> np.ndarray:
     return np.stack([data.qpos.reshape(-1, 3) for data in arenas.data])
+
+
+@pytest.mark.parametrize("kind", ["gru", "history"])
+def test_a_step_needs_the_action_of_a_policy_that_remembers(kind: str, tmp_path: Path) -> None:
+    given, said = policies.recalling(kind, policies.arrays(), 3)
+    trained = policies.saved(tmp_path / "recalls.npz", given, **said)
+    judge = dataclasses.replace(_judge(tmp_path, _stage()), policy=trained)
+    arenas = _start(judge, [[-0.1, 0.2, 0.0]])
+    with pytest.raises(PolicyError, match=r"^the policy remembers: give the action, as `by_policy"):
+        engine_c.step(judge, arenas)
 
 
 def test_a_robot_drives_straight_to_its_target_and_stays(tmp_path: Path) -> None:

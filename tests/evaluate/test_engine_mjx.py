@@ -281,19 +281,25 @@ def test_the_engines_of_the_command_agree(
         np.testing.assert_array_equal(mjx.found[name][0, free], c.found[name][0, free])
 
 
-def test_the_engines_agree_on_a_policy_that_remembers(tmp_path: Path) -> None:
-    given = policies.remembering(_arrays((STEER,)), 6)
-    head = given["actor/mean/kernel"]
-    head[:, 2:] *= 0.3  # beside the steering, of as many numbers as the bearing has
+@pytest.mark.parametrize(("kind", "size"), [("gru", 6), ("history", 4)])
+def test_the_engines_agree_on_a_policy_that_remembers(tmp_path: Path, kind: str, size: int) -> None:
+    given, told = policies.recalling(kind, _arrays((STEER,)), size)
+    if kind == "gru":
+        given["actor/mean/kernel"][:, 2:] *= 0.3  # beside the steering, by as many numbers
+        none = {name: array * ("memory" not in name) for name, array in given.items()}
+    else:
+        kernel = given["actor/hidden_0/kernel"]
+        kernel[:, observation.SIZE :] *= 0.3
+        newest = np.arange(kernel.shape[1]) < observation.SIZE
+        none = given | {"actor/hidden_0/kernel": kernel * newest[:, None]}
     path = tmp_path / "policy.npz"
-    said = policies.meta(activation="relu", memory={"kind": "gru", "size": 6})
+    said = policies.meta(activation="relu", **told)
     policy_file.write(path, given | {"actor/log_std": np.full((1, 2), -3.0, np.float32)}, said)
     c, mjx = (_judge(path, STAGES[0], engine, episodes=8).trials[0] for engine in ("c", "mjx"))
     free = c.found["contacts_per_robot"][0] == 0.0
     assert free.sum() > 2
     np.testing.assert_allclose(mjx.found["spl"][0, free], c.found["spl"][0, free], atol=2e-3)
     # Without its memory it drives another way.
-    none = {name: array * ("memory" not in name) for name, array in given.items()}
     other = tmp_path / "other.npz"
     policy_file.write(other, none | {"actor/log_std": np.full((1, 2), -3.0, np.float32)}, said)
     forgetful = _judge(other, STAGES[0], "c", episodes=8).trials[0]

@@ -66,6 +66,32 @@ def test_policies_of_both_rules_are_not_compared_until_told(tmp_path: Path) -> N
     assert _load(*words, "task.arrival=hold").task.arrival == "hold"
 
 
+def _stacked(path: Path, history: int) -> str:
+    meta = policy_meta(load_train(["stage=s3", f"task.history={history}"]), update=1, seed=0)
+    policies.saved(path, policies.stacked(policies.arrays(), history), **meta)
+    return f"policy={path}"
+
+
+def test_the_history_is_that_of_training_and_no_other(tmp_path: Path) -> None:
+    word = _stacked(tmp_path / "three.npz", 3)
+    assert _load(word).task.history == 3
+    assert _load(word, "task.history=3").task.history == 3
+    for value in (1, 4):
+        assert refusal(_load, word, f"task.history={value}") == (
+            f"task.history is {value}, but {tmp_path / 'three.npz'} was trained with 3: leave "
+            "task.history out, since each policy is judged with its own."
+        )
+    assert "was trained with 1" in refusal(
+        _load, _policy(tmp_path / "one.npz", "stage=s3"), "task.history=3"
+    )
+
+
+def test_policies_of_several_histories_are_compared_each_with_its_own(tmp_path: Path) -> None:
+    _stacked(tmp_path / "three.npz", 3)
+    _policy(tmp_path / "one.npz", "stage=s3")
+    assert _load(f"compare={tmp_path / 'three.npz'},{tmp_path / 'one.npz'}").task.history == 3
+
+
 def test_the_body_is_on_wheels_unless_it_is_told(odd: str) -> None:
     assert _load(odd).robot.body == "wheeled"
     assert _load(odd, "robot=planar").robot.body == "planar"

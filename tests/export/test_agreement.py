@@ -98,7 +98,7 @@ def test_all_forms_of_a_policy_agree(activation: Activation, learners: int, tmp_
         np.testing.assert_allclose(action, expected, rtol=0, atol=TOLERANCE, err_msg=name)
 
 
-STEPS, MEMORY = 1_000, 16
+STEPS, MEMORY, HISTORY = 1_000, 16, 5
 
 
 def _by_flax_steps(arrays: Arrays, seen: np.ndarray, begins: np.ndarray) -> np.ndarray:
@@ -126,6 +126,16 @@ def _by_flax_steps(arrays: Arrays, seen: np.ndarray, begins: np.ndarray) -> np.n
     return np.asarray(mapped({name: jnp.asarray(array) for name, array in arrays.items()}, seen))
 
 
+def _by_flax_stacked(arrays: Arrays, seen: np.ndarray, begins: np.ndarray) -> np.ndarray:
+    """Likewise of observations that are stacked by hand, zeros before the episode."""
+    since = np.arange(len(seen)) - np.maximum.accumulate(np.where(begins, np.arange(len(seen)), 0))
+    looks = [
+        np.where((since >= age)[:, None, None], np.roll(seen, age, axis=0), 0.0)
+        for age in range(HISTORY)
+    ]
+    return _by_flax(arrays, "tanh", np.concatenate(looks, axis=-1).astype(np.float32))
+
+
 def _by_numpy_steps(trained: Policy, seen: np.ndarray, begins: np.ndarray) -> np.ndarray:
     found, memory = [], None
     for now, begun in zip(seen, begins, strict=True):
@@ -141,7 +151,7 @@ def _by_onnx_steps(trained: Policy, seen: np.ndarray, begins: np.ndarray) -> np.
     content = export_onnx.render(trained)
     session = runtime.InferenceSession(content, providers=["CPUExecutionProvider"])
     found, rows = [], (1,) if trained.is_shared else (1, seen.shape[1])
-    memory = np.zeros((*rows, MEMORY), np.float32)
+    memory = np.zeros((*rows, trained.carried), np.float32)
     for now, begun in zip(seen, begins, strict=True):
         fed = {"observation": now.reshape(*rows, -1), "memory": memory * np.float32(not begun)}
         action, memory = session.run(["action", "memory_after"], fed)
@@ -155,7 +165,7 @@ def _by_c_steps(trained: Policy, seen: np.ndarray, begins: np.ndarray, folder: P
     subprocess.run(["gcc", *flags, "policy.c", "-lm", "-o", "policy.so"], cwd=folder, check=True)
     library, into = ctypes.CDLL(str(folder / "policy.so")), ctypes.c_void_p
     action = np.zeros((*seen.shape[:2], 2), np.float32)
-    memory = np.ones((seen.shape[1], MEMORY), np.float32)
+    memory = np.ones((seen.shape[1], trained.carried), np.float32)
     for step, begun in enumerate(begins):
         for robot in range(seen.shape[1]):
             mine = into(memory[robot].ctypes.data)
@@ -168,18 +178,20 @@ def _by_c_steps(trained: Policy, seen: np.ndarray, begins: np.ndarray, folder: P
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs Debian's package gcc")
 @pytest.mark.parametrize("learners", [1, 3])
+@pytest.mark.parametrize("kind", ["gru", "history"])
 def test_all_forms_of_a_policy_that_remembers_agree_over_a_thousand_steps(
-    learners: int, tmp_path: Path
+    kind: str, learners: int, tmp_path: Path
 ) -> None:
     plain = policies.arrays(hidden=AlgoConfig().hidden_sizes, learners=learners)
-    arrays = policies.remembering(plain, MEMORY)
-    said = several(learners) | {"memory": {"kind": "gru", "size": MEMORY}}
+    size = MEMORY if kind == "gru" else HISTORY
+    arrays, said = policies.recalling(kind, plain, size, **several(learners))
+    by_flax = _by_flax_steps if kind == "gru" else _by_flax_stacked
     trained = saved(tmp_path / "policy.npz", arrays, **said)
     seen = policies.seen(trained, STEPS)
     begins = np.arange(STEPS) % 300 == 0
     expected = _by_numpy_steps(trained, seen, begins)
     found = {
-        "Flax": _by_flax_steps(arrays, seen, begins),
+        "Flax": by_flax(arrays, seen, begins),
         "ONNX": _by_onnx_steps(trained, seen, begins),
         "C": _by_c_steps(trained, seen, begins, tmp_path / "c"),
     }

@@ -57,19 +57,25 @@ def test_it_builds_without_warnings_and_its_self_test_passes(
 
 @needs_gcc
 @pytest.mark.parametrize("learners", [1, 3])
+@pytest.mark.parametrize(
+    ("kind", "changed"),
+    [
+        ("gru", ("(recalled[i] - fresh)", "(recalled[i])")),
+        ("history", ("recalled[i - POLICY_OBSERVATIONS]", "recalled[i]")),
+    ],
+)
 def test_one_that_remembers_builds_without_warnings_and_its_self_test_passes(
-    learners: int, tmp_path: Path
+    kind: str, changed: tuple[str, str], learners: int, tmp_path: Path
 ) -> None:
-    given = policies.remembering(policies.arrays(hidden=(16, 7), learners=learners), 5)
-    said = several(learners) | {"memory": {"kind": "gru", "size": 5}}
+    plain = policies.arrays(hidden=(16, 7), learners=learners)
+    given, said = policies.recalling(kind, plain, 5, **several(learners))
     folder = _written(tmp_path / "c", saved(tmp_path / "p.npz", given, **said))
     built = _run(folder, "gcc", *STRICT, "policy.c", "policy_test.c", "-lm", "-o", "self_test")
     assert (built.returncode, built.stdout, built.stderr) == (0, "", "")
     assert _run(folder, "./self_test").returncode == 0
     source = (folder / "policy.c").read_text()
-    changed = source.replace("(recalled[i] - fresh)", "(recalled[i])")
-    assert changed != source
-    (folder / "policy.c").write_text(changed)
+    assert source.count(changed[0]) == 1
+    (folder / "policy.c").write_text(source.replace(*changed))
     _run(folder, "gcc", "-std=c99", "policy.c", "policy_test.c", "-lm", "-o", "self_test")
     assert _run(folder, "./self_test").returncode != 0
 

@@ -264,13 +264,14 @@ def test_a_robot_that_holds_drives_on_at_its_target(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("learners", [1, 3])
+@pytest.mark.parametrize("kind", ["gru", "history"])
 def test_a_robot_remembers_until_it_has_another_target_or_number(
-    learners: int, tmp_path: Path
+    kind: str, learners: int, tmp_path: Path
 ) -> None:
     given = policies.arrays(hidden=(16, 16), learners=learners, names=NAMES)
-    said = several(learners) | {"memory": {"kind": "gru", "size": 4}, "observation": METRIC}
+    given, said = policies.recalling(kind, given, 4, **several(learners), observation=METRIC)
     path = tmp_path / "policy.npz"
-    saved(path, policies.remembering(given, 4), **said)
+    saved(path, given, **said)
     assert export.main([f"policy={path}", "format=webots"]) == 0
     folder = tmp_path / "swarmjax_epuck"
     still = {"counts": [67.19] * 8, "compass": [0.0, 1.0, 0.0], "gps": [-0.5, 0.0, 0.0]}

@@ -76,6 +76,19 @@ def test_fused_is_refused_where_it_cannot_be(monkeypatch: pytest.MonkeyPatch) ->
     )
 
 
+def test_a_history_that_does_not_fit_the_chip_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    _on(monkeypatch, compute_capability="9.0")
+    config = AlgoConfig(update_backend="fused")
+    # 12 observations of 10 numbers are padded to 128, the widest that the kernels take.
+    assert dispatch.resolve(AlgoConfig(), 13 * OBSERVATION, ACTION) != "fused"
+    with pytest.raises(ConfigError) as unfit:
+        dispatch.resolve(config, 13 * OBSERVATION, ACTION)
+    assert str(unfit.value) == (
+        "algo.update_backend is fused, but 130 numbers are observed, which do not fit the chip: "
+        "give a smaller task.history, or algo.update_backend=auto."
+    )
+
+
 def test_without_the_faster_ways_there_is_autodiff(monkeypatch: pytest.MonkeyPatch) -> None:
     assert dispatch.find("blocks") is not None
     assert dispatch.find("fused") is not None

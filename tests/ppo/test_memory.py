@@ -17,6 +17,7 @@ from swarmjax.ppo.gae import generalized_advantages
 from swarmjax.ppo.learner import Batch
 from swarmjax.ppo.losses import Minibatch
 from swarmjax.ppo.memory import Gru, Recall
+from swarmjax.task import observation
 
 STEPS, ROWS, WIDTH, SIZE = 6, 3, 4, 5
 
@@ -133,14 +134,18 @@ def test_the_gradient_through_time_is_that_of_finite_differences() -> None:
 _EPISODE, _WORLDS, _UPDATES = 21, 64, 150
 
 
-def _play(config: AlgoConfig, state: Any, key: jax.Array) -> tuple[Batch, jax.Array]:
-    """An episode each: a cue of -1 or 1 at its first step, and its sign asked for at the last."""
+def _play(config: AlgoConfig, state: Any, key: jax.Array, history: int) -> tuple[Batch, jax.Array]:
+    """An episode each: a cue of -1 or 1 at its first step, and its sign asked for at the last.
+
+    Of a `history` above 1 the networks see that many observations, as an environment stacks them.
+    """
     cue_key, noise_key = jax.random.split(key)
     cue = jax.random.rademacher(cue_key, (_WORLDS,), jnp.float32)
     clock = jnp.arange(_EPISODE)[:, None]
     shown = jnp.where(clock == 0, cue, 0.0)
     asked = jnp.broadcast_to(clock == _EPISODE - 1, shown.shape).astype(jnp.float32)
-    seen = jnp.stack([shown, asked], axis=-1)
+    looks = jnp.stack([shown, asked], axis=-1)
+    seen = jax.lax.scan(_stacked, jnp.zeros((_WORLDS, 2 * history)), looks)[1]
     noise = jax.random.normal(noise_key, (_EPISODE, _WORLDS, 1))
     memory = networks.begin_memory(config, (_WORLDS,))
 
@@ -168,12 +173,25 @@ def _play(config: AlgoConfig, state: Any, key: jax.Array) -> tuple[Batch, jax.Ar
     return batch, jnp.sum(reward) / _WORLDS
 
 
+def _stacked(before: jax.Array, fresh: jax.Array) -> tuple[jax.Array, jax.Array]:
+    after = observation.stack(fresh, before, jnp)
+    return after, after
+
+
 _FIELDS = ("observation", "action", "log_prob", "advantage", "return_", "valid")
 
 
-@pytest.mark.parametrize(("memory", "low", "high"), [("gru", 0.95, 1.0), ("none", 0.4, 0.6)])
+@pytest.mark.parametrize(
+    ("memory", "history", "low", "high"),
+    [
+        ("gru", 1, 0.95, 1.0),
+        ("none", 21, 0.95, 1.0),
+        ("none", 20, 0.4, 0.6),  # one too few
+        ("none", 1, 0.4, 0.6),
+    ],
+)
 def test_a_task_that_asks_for_what_was_seen_twenty_steps_ago(
-    memory: Any, low: float, high: float
+    memory: Any, history: int, low: float, high: float
 ) -> None:
     config = AlgoConfig(
         memory=memory,
@@ -188,13 +206,13 @@ def test_a_task_that_asks_for_what_was_seen_twenty_steps_ago(
         learning_rate_schedule="constant",
         bound_cost=0.0,
     )
-    state = learner.init(jax.random.key(3), config, 2, 1, _UPDATES)
+    state = learner.init(jax.random.key(3), config, 2 * history, 1, _UPDATES)
 
     @jax.jit
     def train(state: Any) -> tuple[Any, jax.Array]:
         def update(state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
             play_key, learn_key = jax.random.split(key)
-            batch, success = _play(config, state, play_key)
+            batch, success = _play(config, state, play_key, history)
             return learner.update(state, config, batch, learn_key, _UPDATES)[0], success
 
         return jax.lax.scan(update, state, jax.random.split(jax.random.key(4), _UPDATES))

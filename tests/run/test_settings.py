@@ -239,7 +239,11 @@ def test_import_needs_neither_jax_nor_hydra():
          "is [0.4,0.5], which leaves no cell: the smallest swarm with the fewest obstacles needs "
          "0.58."),
         (["stage.sequence=[s1,grid]"], "stage.sequence names grid, a grid: give single stages."),
+        (["task.history=0"], "task.history is 0: give 1 to 64."),
+        (["task.history=65"], "task.history is 65: give 1 to 64."),
         # Checks across keys.
+        (["task.history=4", "algo.memory=gru"], "task.history is 4, but algo.memory is gru: "
+         "choose one, task.history=1 or algo.memory=none."),
         (["robot.track=0.08"], "robot.track is 0.08, but hull_radius is 0.037 and the wheels lie "
          "inside the hull: give less than 0.074."),
         (["stage=s6", "stage.robots=6", "sim.max_robots=5"], "stage.robots is 6, but "

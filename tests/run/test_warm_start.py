@@ -273,6 +273,10 @@ def test_a_started_run_resumes_without_the_run_it_started_from(
             "algo.critic is observation, but here it is state: give algo.critic=observation",
         ),
         (
+            ["task.history=3"],
+            "task.history is 1, but here it is 3: give task.history=1",
+        ),
+        (
             ["algo.activation=relu"],
             "algo.activation is tanh, but here it is relu: give algo.activation=tanh",
         ),

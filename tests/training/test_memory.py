@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -9,12 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from swarmjax import policy, policy_file
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import losses, networks
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.run.checkpoint import digest, to_leaves
+from swarmjax.run.policy_export import write_policy
 from swarmjax.run.settings import TrainConfig
+from swarmjax.task import observation
+from swarmjax.task.env import World
 from swarmjax.training import loop, rollout
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
@@ -99,3 +104,58 @@ def test_a_memory_is_trained(trained: Trained) -> None:
         for side in ("actor", "critic"):
             name = f"learners/params/{side}/memory/{part}/kernel"
             assert np.abs(last[name] - first[name]).max() > 1e-4, name
+
+
+class Seen(NamedTuple):
+    """A rollout of robots with a history of three, by learners that have not learned."""
+
+    config: TrainConfig
+    state: TrainState
+    observation: np.ndarray  # [T + 1, A, R, 3 O]
+    over: np.ndarray  # [T, A] whether the episode ended with the step
+    action: np.ndarray  # [T, A, R, U] of the first steps, the most likely ones
+
+
+@pytest.fixture(scope="module")
+def stacked(tiny_config: TrainConfig, tiny_world: World) -> Seen:
+    task = replace(tiny_config.task, history=3)
+    world = replace(tiny_world, task=task)
+    program = Program(replace(tiny_config, task=task), world)
+    schedule = programs.schedule(program.config)
+    first = jax.jit(partial(loop.init, program))(schedule)
+    waiting = loop._draw_waiting(program, schedule, first.curriculum, jax.random.key(1))
+    # In the middle of their episodes, which end at 16 steps.
+    before = replace(first.arenas, clock=jnp.array([0, 0, 9, 10, 11, 12, 13, 0], jnp.int32))
+    collect = jax.jit(partial(rollout.collect, program))
+    after, found, ended = collect(first.learners, before, waiting, jax.random.key(2))
+    seen = np.concatenate([found.observation[:, 0], np.asarray(after.observation)[None]])
+    action, _ = ppo.recall_mode(_one(first.learners), program.config.algo, seen[:-1], None)
+    return Seen(program.config, first, seen, np.asarray(ended.episodes) > 0, np.asarray(action))
+
+
+def test_a_rollout_sees_what_was_seen_before_and_forgets_where_an_episode_begins(
+    stacked: Seen,
+) -> None:
+    assert stacked.state.learners.normalizer.mean.shape == (1, 3 * observation.SIZE)
+    looks = np.split(stacked.observation, 3, axis=-1)
+    over = stacked.over[..., None, None]
+    assert over.any()
+    for age in (1, 2):
+        # What is kept moves on by one place, and is gone where another episode has begun.
+        np.testing.assert_array_equal(looks[age][1:], np.where(over, 0.0, looks[age - 1][:-1]))
+    assert (np.abs(looks[2][-1]).max(axis=(1, 2)) > 0.0).sum() == 8 - over[-2:].any(axis=0).sum()
+
+
+def test_the_file_of_a_policy_with_a_history_keeps_it_by_itself(
+    stacked: Seen, tmp_path: Path
+) -> None:
+    """The file's policy is handed one observation after the other, as where it is deployed."""
+    leaves = {name: leaf[None] for name, leaf in to_leaves(stacked.state).items()}
+    write_policy(tmp_path / "policy.npz", leaves, stacked.config, update=0, seed=0)
+    trained = policy_file.read(tmp_path / "policy.npz")
+    memory = policy.begin(trained, stacked.observation.shape[1:3])
+    for step, expected in enumerate(stacked.action):
+        memory, action = policy.step(trained, memory, stacked.observation[step, ..., :10])
+        np.testing.assert_allclose(action, expected, atol=2e-6)  # float32, sums of thirty terms
+        assert memory is not None
+        memory = np.where(stacked.over[step][:, None, None], 0.0, memory)

@@ -56,7 +56,7 @@ ${memory_code}void policy_action(unsigned learner, const float observation[POLIC
     for (unsigned i = 0; i < POLICY_OBSERVATIONS; i++) {
         a[i] = clip((observation[i] - MEAN[learner][i]) / STD[learner][i], $limit);
     }
-$layers
+${history}$layers
 }
 
 void policy_sample(unsigned learner, const float normal[POLICY_ACTIONS],
