@@ -50,7 +50,7 @@ def jam() -> rub_sweeps.States:
 def at_rest(jam: rub_sweeps.States) -> np.ndarray:
     """Its accelerations, converged in float64."""
     contacts = rub_sweeps.contacts_of(jam)
-    return rub_sweeps.search(contacts, rub_sweeps.DESIGNS["plain"], 2000, np.float64)[0]
+    return rub_sweeps.search(contacts, rub_sweeps.DESIGNS["plain"], 2000, np.float64, 1e-13)[0]
 
 
 def _off(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
