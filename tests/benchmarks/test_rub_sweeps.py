@@ -110,6 +110,21 @@ def test_solvers_are_at_rest_where_plain_sweeps_are_far_from_it(
     assert _off(plain, at_rest).max() > 1e-3
 
 
+def test_hulls_that_are_grazed_at_speed_come_to_rest() -> None:
+    # Of 20,000 crowds those three that did not, where any change above 1e-6 of a push counted:
+    # their pushes are so small that accelerations of 100 m/s^2 round to more than that.
+    random, shape = np.random.default_rng(5), (20_000, ROBOTS, 3)
+    rows, turn = [10062, 10658, 14805], [1.0, 1.0, 10.0]
+    place = random.uniform(-0.5, 0.5, shape) * [0.6, 0.6, 6.0]
+    free = random.normal(0.0, 3.0, shape) * [1.0, 1.0, 20.0]
+    rate = (random.normal(0.0, 0.1, shape) * turn).astype(np.float32)
+    before = (random.normal(0.0, 3.0, shape) * [1.0, 1.0, 20.0]).astype(np.float32)
+    states = _states(place[rows], free[rows], 0.6)
+    moving: Any = states.robots._replace(rate=rate[rows], before=before[rows])
+    _, sweeps = rub_sweeps.built(states._replace(robots=moving))
+    assert sweeps.max() < 50
+
+
 def test_sweeps_of_a_warp_are_those_of_its_slowest_arena() -> None:
     sweeps = np.zeros(128, int)
     sweeps[[3, 40, 127]] = 10, 30, 60

@@ -30,11 +30,11 @@ from swarmjax.sim.fast import planar_jax
 from swarmjax.sim.fast.discs import TOLERANCE, DiscRobots, Discs, Rubbing, spring
 from swarmjax.sim.fast.planar_jax import Contact, DiscGap
 
-KEPT = 3  # sweeps that a leap is found by: with 4 s6 took as many (docs/performance.md)
+KEPT = 3  # sweeps that a leap is found by; one more saves 3 % in s6 (docs/performance.md)
 # Added to a sum of squares, as a share of it, that rounding may leave at 0: ten times float32's.
 ROUNDING = 1e-6
-# Share of an acceleration that two roundings in float32 may leave: with less, one sweep in a few
-# thousand never comes to rest where a hull is grazed, and all arenas wait for 400.
+# Share of an acceleration that two roundings in float32 may leave. Without it 3 of 20,000 random
+# crowds never came to rest, of hulls that are grazed at speed, and all arenas wait for these.
 FLOOR = 2.4e-7
 
 
