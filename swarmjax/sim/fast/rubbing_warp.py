@@ -16,8 +16,12 @@ from swarmjax.sim.engine import ROWS_PER_ROBOT
 from swarmjax.sim.fast import discs as sim_discs
 from swarmjax.sim.fast import planar_warp
 from swarmjax.sim.fast.discs import TOLERANCE, DiscRobots, Discs
+from swarmjax.sim.fast.rubbing_jax import FLOOR, KEPT, ROUNDING
 
 _TOLERANCE = wp.constant(TOLERANCE)
+_KEPT = wp.constant(KEPT)
+_ROUNDING = wp.constant(ROUNDING)
+_FLOOR = wp.constant(FLOOR)
 _WALLS = wp.constant(sim_model.WALLS)
 
 
@@ -47,8 +51,9 @@ def _solve(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Ar
     pairs = count * fixtures + count * (count - 1) // 2
     rows = min(pairs, ROWS_PER_ROBOT * count + fixtures), arenas
     numbers = np.array([discs.radius, *sim_discs.spring(discs), *discs.solimp], np.float32)
-    call = wp.jax_kernel(_push_apart, num_outputs=5, block_dim=planar_warp.BLOCK)
-    shapes = dict.fromkeys(("row", "asked", "force", "between"), rows) | {"found": (arenas, count)}
+    call = wp.jax_kernel(_push_apart, num_outputs=6, block_dim=planar_warp.BLOCK)
+    shapes = dict.fromkeys(("row", "asked", "force", "between"), rows)
+    shapes |= {"past": (KEPT, *rows), "found": (arenas, count)}
     given = *robots[:-1], *robots.rubbing, side, obstacle, jnp.asarray(numbers), discs.sweeps
     return call(*given, launch_dims=arenas, output_dims=shapes)[-1]
 
@@ -60,6 +65,7 @@ class WarpRubbingArena:
     Attributes:
       place: [A, R] x, y (m), yaw (rad).
       rate: [A, R] of it, 1/s.
+      free: [A, R] of the rate, 1/s^2, without contacts.
       before: [A, R] of the rate, 1/s^2, in the step before.
       mobility: [A, R] 1 / mass.
       weight: [A, R] inverse weight.
@@ -70,12 +76,15 @@ class WarpRubbingArena:
       asked: [K, A] aref of its push and of its rub, and J M^-1 J' + R of both.
       force: [K, A] its push and its rub, N.
       between: [K, A] the robot that is pushed along, and the one that is pushed back; -1: none.
+      past: [KEPT, K, A] push and rub that a sweep came to, N, and by how much it changed them;
+        sweep i is in row i modulo KEPT.
       found: [A, R] acceleration of x, y and yaw.
       index: of the thread, [A].
     """
 
     place: wp.array2d[wp.vec3]
     rate: wp.array2d[wp.vec3]
+    free: wp.array2d[wp.vec3]
     before: wp.array2d[wp.vec3]
     mobility: wp.array2d[float]
     weight: wp.array2d[float]
@@ -86,8 +95,35 @@ class WarpRubbingArena:
     asked: wp.array2d[wp.vec4]
     force: wp.array2d[wp.vec2]
     between: wp.array2d[wp.vec2i]
+    past: wp.array3d[wp.vec4]
     found: wp.array2d[wp.vec3]
     index: int
+
+
+@wp.struct
+class WarpSwept:
+    """What a sweep came to, with sums over contacts that the next leap is found by.
+
+    With r the changes of this sweep, a what they differ by from those of the last one, and b what
+    those differ by from the ones before:
+
+    Attributes:
+      moves: whether a force changed.
+      size: r . r.
+      newer: a . a.
+      both: a . b.
+      older: b . b.
+      by_newer: r . a.
+      by_older: r . b.
+    """
+
+    moves: bool
+    size: float
+    newer: float
+    both: float
+    older: float
+    by_newer: float
+    by_older: float
 
 
 @wp.kernel(enable_backward=False)
@@ -108,12 +144,14 @@ def _push_apart(  # noqa: PLR0913  # JAX hands arrays over one by one
     asked: wp.array2d[wp.vec4],
     force: wp.array2d[wp.vec2],
     between: wp.array2d[wp.vec2i],
+    past: wp.array3d[wp.vec4],
     found: wp.array2d[wp.vec3],
 ) -> None:
     """Finds the forces of an arena's contacts and what comes of them."""
     arena = WarpRubbingArena()
     arena.place = place
     arena.rate = rate
+    arena.free = free
     arena.before = before
     arena.mobility = mobility
     arena.weight = weight
@@ -123,10 +161,11 @@ def _push_apart(  # noqa: PLR0913  # JAX hands arrays over one by one
     arena.asked = asked
     arena.force = force
     arena.between = between
+    arena.past = past
     arena.found = found
     arena.index = wp.tid()
     arena.friction = friction[arena.index]
-    _let_go(arena, free)
+    _let_go(arena)
     count = wp.int32(0)
     for m in range(obstacle.shape[1]):
         count = _touch_box(arena, count, planar_warp.obstacle_box(obstacle, arena.index, m))
@@ -134,20 +173,16 @@ def _push_apart(  # noqa: PLR0913  # JAX hands arrays over one by one
         count = _touch_box(arena, count, planar_warp.wall_box(side[arena.index], k))
     for i in range(place.shape[1]):
         count = _touch_robots(arena, count, i)
-    done = wp.int32(0)
-    moves = count > 0
-    while moves and done < sweeps:
-        moves = _sweep(arena, count)
-        done += 1
     if count > 0:
-        _finish(arena, free, count)
+        _solve_contacts(arena, count, sweeps)
+        _finish(arena, count)
 
 
 @wp.func
-def _let_go(arena: WarpRubbingArena, free: wp.array2d[wp.vec3]) -> None:
+def _let_go(arena: WarpRubbingArena) -> None:
     """Sets accelerations to those without contacts."""
-    for i in range(free.shape[1]):
-        arena.found[arena.index, i] = free[arena.index, i]
+    for i in range(arena.free.shape[1]):
+        arena.found[arena.index, i] = arena.free[arena.index, i]
 
 
 @wp.func
@@ -213,12 +248,19 @@ def _slide(
     arena: WarpRubbingArena, motion: wp.array2d[wp.vec3], row: wp.vec4, between: wp.vec2i
 ) -> wp.vec2:
     """J a: how fast the two sides of a contact move apart, and along each other."""
+    apart = _apart(arena, motion, between)
+    along = row[0] * apart[1] - row[1] * apart[0] - row[2] * apart[2]
+    return wp.vec2(row[0] * apart[0] + row[1] * apart[1], along)
+
+
+@wp.func
+def _apart(arena: WarpRubbingArena, motion: wp.array2d[wp.vec3], between: wp.vec2i) -> wp.vec3:
+    """How one side of a contact moves against the other."""
     apart = motion[arena.index, between[0]]
     if between[1] >= 0:
         other = motion[arena.index, between[1]]
         apart = wp.vec3(apart[0] - other[0], apart[1] - other[1], apart[2] + other[2])
-    along = row[0] * apart[1] - row[1] * apart[0] - row[2] * apart[2]
-    return wp.vec2(row[0] * apart[0] + row[1] * apart[1], along)
+    return apart
 
 
 @wp.func
@@ -253,8 +295,37 @@ def _project(force: wp.vec2, push: float, rub: float, friction: float) -> wp.vec
 
 
 @wp.func
-def _sweep(arena: WarpRubbingArena, count: int) -> bool:
-    """Sets all forces to their best, the others given; says whether that changed any."""
+def _solve_contacts(arena: WarpRubbingArena, count: int, sweeps: int) -> None:
+    """Sweeps until no force changes, and leaps in between (`rubbing_jax.solve`)."""
+    done = wp.int32(0)
+    size = wp.float32(0.0)
+    moves = done < sweeps
+    least = _least_change(arena, count)
+    while moves and done < sweeps:
+        swept = _sweep(arena, count, done, least)
+        moves = swept.moves
+        done += 1
+        if moves and done >= _KEPT and 2 * done <= sweeps and swept.size <= size:
+            _leap(arena, count, done - 1, _weights(swept))
+        size = swept.size
+
+
+@wp.func
+def _least_change(arena: WarpRubbingArena, count: int) -> float:
+    """The force, N, that rounding may ask for (`rubbing_jax`): less is no change."""
+    largest = wp.float32(0.0)
+    for k in range(count):
+        apart = _apart(arena, arena.free, arena.between[k, arena.index])
+        turn = arena.row[k, arena.index][2] * wp.abs(apart[2])
+        size = wp.abs(apart[0]) + wp.abs(apart[1]) + turn
+        largest = wp.max(largest, size / arena.asked[k, arena.index][2])
+    return _FLOOR * largest
+
+
+@wp.func
+def _sweep(arena: WarpRubbingArena, count: int, index: int, least: float) -> WarpSwept:
+    """Sets all forces to their best, the others given."""
+    swept = WarpSwept()
     largest = wp.float32(0.0)
     change = wp.float32(0.0)
     for k in range(count):
@@ -272,13 +343,66 @@ def _sweep(arena: WarpRubbingArena, count: int) -> bool:
         _push(arena, row, between, more)
         largest = wp.max(largest, best[0])
         change = wp.max(change, wp.max(wp.abs(more[0]), wp.abs(more[1])))
-    return change > _TOLERANCE * largest
+        swept = _remember(arena, swept, k, index, more)
+    swept.moves = change > wp.max(_TOLERANCE * largest, least)
+    return swept
 
 
 @wp.func
-def _finish(arena: WarpRubbingArena, free: wp.array2d[wp.vec3], count: int) -> None:
+def _remember(
+    arena: WarpRubbingArena, swept: WarpSwept, k: int, index: int, more: wp.vec2
+) -> WarpSwept:
+    """Writes down what a contact came to in a sweep, and adds to its sums."""
+    force = arena.force[k, arena.index]
+    last = arena.past[(index + 2) % _KEPT, k, arena.index]
+    before = arena.past[(index + 1) % _KEPT, k, arena.index]
+    arena.past[index % _KEPT, k, arena.index] = wp.vec4(force[0], force[1], more[0], more[1])
+    newer = wp.vec2(more[0] - last[2], more[1] - last[3])
+    older = wp.vec2(last[2] - before[2], last[3] - before[3])
+    swept.size += wp.dot(more, more)
+    swept.newer += wp.dot(newer, newer)
+    swept.both += wp.dot(newer, older)
+    swept.older += wp.dot(older, older)
+    swept.by_newer += wp.dot(more, newer)
+    swept.by_older += wp.dot(more, older)
+    return swept
+
+
+@wp.func
+def _weights(swept: WarpSwept) -> wp.vec2:
+    """How far to go back on the newer and the older step (`rubbing_jax`)."""
+    if not (swept.older > 0.0):
+        return wp.vec2(0.0, 0.0)
+    both = swept.both / swept.older
+    left = swept.newer * (1.0 + _ROUNDING) - both * swept.both
+    if not (left > 0.0):
+        return wp.vec2(0.0, 0.0)
+    newer = (swept.by_newer - both * swept.by_older) / left
+    return wp.vec2(newer, (swept.by_older - newer * swept.both) / swept.older)
+
+
+@wp.func
+def _leap(arena: WarpRubbingArena, count: int, index: int, weights: wp.vec2) -> None:
+    """Goes on from the mix of the last three sweeps' forces that would change least."""
+    for k in range(count):
+        row = arena.row[k, arena.index]
+        asked = arena.asked[k, arena.index]
+        force = arena.force[k, arena.index]
+        last = arena.past[(index + 2) % _KEPT, k, arena.index]
+        before = arena.past[(index + 1) % _KEPT, k, arena.index]
+        push = weights[0] * (force[0] - last[0]) + weights[1] * (last[0] - before[0])
+        rub = weights[0] * (force[1] - last[1]) + weights[1] * (last[1] - before[1])
+        wanted = wp.vec2(force[0] - push, force[1] - rub)
+        mixed = _project(wanted, asked[2], asked[3], arena.friction)
+        arena.force[k, arena.index] = mixed
+        more = wp.vec2(mixed[0] - force[0], mixed[1] - force[1])
+        _push(arena, row, arena.between[k, arena.index], more)
+
+
+@wp.func
+def _finish(arena: WarpRubbingArena, count: int) -> None:
     """Works everything out once more from the forces, without the sweeps' rounding."""
-    _let_go(arena, free)
+    _let_go(arena)
     for k in range(count):
         between = arena.between[k, arena.index]
         _push(arena, arena.row[k, arena.index], between, arena.force[k, arena.index])
