@@ -41,7 +41,7 @@ class Policy(NamedTuple):
     max_turn_rate: float  # rad/s, to either side
     meta: dict[str, Any]
     digest: str  # SHA-256 of all else in the file, in hexadecimal
-    network: Any = None  # of format 3: normalised [..., R, O] to features
+    network: Any = None  # with `meta["network"]`: normalised [..., R, k O] to features
     # of format 4: kernel [L, F, 3 H] and bias [L, 3 H] of what is seen, and of what is recalled
     memory: tuple[np.ndarray, ...] | None = None
 
@@ -69,7 +69,9 @@ def load(path: str | Path | IO[bytes]) -> Policy:
         if sum(map(text.count, "[{,:")) > MAX_ENTRIES:
             raise ValueError(f"meta has more than {MAX_ENTRIES} entries")
         meta = json.loads(text)
-        history = meta.get("observation", {}).get("history", 1)
+        history, size = meta["observation"].get("history", 1), arrays["normalizer/mean"].shape[1]
+        if type(history) is not int or history < 1 or size % history:
+            raise ValueError(f"meta.observation.history is {json.dumps(history)[:80]}")
         wanted = MEMORY_FORMAT if "memory" in meta or history > 1 else FORMAT
         if meta["format"] == MEMORY_FORMAT and "network" in meta:
             raise ValueError("its network is code of an extension")

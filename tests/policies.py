@@ -84,8 +84,10 @@ def stacked(given: Arrays, history: int, seed: int = 2) -> Arrays:
     more = draw.normal(size=(learners, (history - 1) * size, width)) / np.sqrt(history * size)
     found = dict(given)
     found["actor/hidden_0/kernel"] = np.concatenate([kernel, more.astype(np.float32)], axis=1)
+    # Each age has a normaliser of its own.
+    aged = np.repeat(np.linspace(1.0, 1.5, history, dtype=np.float32), size)
     for name in ("normalizer/mean", "normalizer/std"):
-        found[name] = np.tile(given[name], (1, history))
+        found[name] = np.tile(given[name], (1, history)) * aged
     return found
 
 

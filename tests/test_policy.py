@@ -390,6 +390,20 @@ def test_a_history_is_handed_in_and_out(tmp_path: Path) -> None:
         policy.step(plain, policy.begin(loaded, (5, 2)), seen)
 
 
+@pytest.mark.parametrize("history", [0, -1, 2.5, 7, "3", None])
+def test_a_history_that_is_none_is_named(tmp_path: Path, history: Any) -> None:
+    path = tmp_path / "policy.npz"
+    said = {"observation": policies.observed() | {"history": 3}}
+    saved(path, policies.stacked(policies.arrays(), 3), **said)
+    with np.load(path) as file:
+        members = dict(file)
+    meta = json.loads(str(members["meta"]))
+    meta["observation"]["history"] = history
+    np.savez(path, **(members | {"meta": np.array(json.dumps(meta))}))
+    with pytest.raises(PolicyError, match=rf"meta\.observation\.history is {json.dumps(history)}"):
+        policy.load(path)
+
+
 @pytest.mark.parametrize(("history", "number"), [(1, 2), (2, 4)])
 def test_a_file_with_a_history_is_of_format_4(tmp_path: Path, history: int, number: int) -> None:
     given = policies.stacked(policies.arrays(), history) if history > 1 else policies.arrays()

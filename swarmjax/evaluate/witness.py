@@ -153,18 +153,17 @@ def _check_alike(
 
 
 def _check_history(settings: Any, found: Mapping[str, Trained]) -> None:
-    """Refuses another history than a policy's: its network takes that one and no other.
+    """Refuses another history than the first policy's, which is in the settings unless typed.
 
-    Several policies may differ; the settings then have that of the first.
+    Each policy is judged with its own: its network takes that one and no other.
     """
-    histories = {path: each.task.history for path, each in found.items()}
     given = settings.task.history
-    if histories and given not in histories.values():
-        path, held = next(iter(histories.items()))
-        raise ConfigError(
-            f"{_OWN} is {given}, but {path} was trained with {held}: leave {_OWN} out, since "
-            "each policy is judged with its own."
-        )
+    for path, held in [(path, each.task.history) for path, each in found.items()][:1]:
+        if given != held:
+            raise ConfigError(
+                f"{_OWN} is {given}, but {path} was trained with {held}: leave {_OWN} out, since "
+                "each policy is judged with its own."
+            )
 
 
 def _value(words: list[str], key: str) -> str:

@@ -104,7 +104,8 @@ def _unfit(config: AlgoConfig, observation_size: int, action_size: int) -> Confi
     if config.torso is None and not _fits(narrow, observation_size, action_size):
         return ConfigError(
             f"algo.update_backend is fused, but {observation_size} numbers are observed, which do "
-            "not fit the chip: give a smaller task.history, or algo.update_backend=auto."
+            "not fit the chip: give a smaller task.history, fewer task.observations, or "
+            "algo.update_backend=auto."
         )
     return ConfigError(
         f"algo.update_backend is fused, but algo.hidden_sizes is {show(config.hidden_sizes)}, "

@@ -39,7 +39,6 @@ class LearnerState:
         optimizer_state: Of the optimiser that `init` was given.
         normalizer: Moments of the valid observations of all updates so far; those of a learner
             that does not normalise stay 0 and 1.
-        state_normalizer: Likewise, of the states that the critic sees; None if it sees none.
         explored: [], int32, control steps that the schedule of exploration has counted; None if
             exploration is learned.
     """
@@ -47,7 +46,6 @@ class LearnerState:
     params: Params
     optimizer_state: optax.OptState
     normalizer: Normalizer
-    state_normalizer: Normalizer | None = None
     explored: jax.Array | None = None
 
 
@@ -66,7 +64,7 @@ class Batch:
         memory: [G, S, H] before the rollout of the S robots of a group, whose N samples are ordered
             by step, [T S]; None without memory.
         begins: [G, N], whether an episode begins with the step; None without memory.
-        state: [G, N, P], raw, what the critic sees besides; None if nothing.
+        state: [G, N, P], of order 1, what the critic sees besides; None if nothing.
     """
 
     observation: jax.Array
@@ -106,7 +104,6 @@ def init(
         params=params,
         optimizer_state=optimizer.make(config, updates).init(params),
         normalizer=normalizer.init(observation_size),
-        state_normalizer=normalizer.init(state_size) if state_size else None,
         explored=jnp.zeros((), jnp.int32) if config.exploration == "scheduled" else None,
     )
 
@@ -178,7 +175,7 @@ def mode(learner: LearnerState, config: AlgoConfig, observation: jax.Array) -> j
 
 
 def values(learner: LearnerState, config: AlgoConfig, observation: jax.Array) -> jax.Array:
-    """Returns the expected discounted return, [...], for raw observations, without memory."""
+    """Returns the expected discounted return, [...], of a critic of raw observations alone."""
     return recall_values(learner, config, observation, None)[0]
 
 
@@ -232,21 +229,15 @@ def recall_values(
         config: The config that made the learner.
         observation: [..., O], raw.
         memory: [..., H] of the critic before; None without memory.
-        state: [..., P], raw, what the critic sees besides; None if nothing.
+        state: [..., P], of order 1, what the critic sees besides; None if nothing.
 
     Returns:
         The expected discounted return, [...], and the memory after.
     """
     seen = normalize(learner, observation)
     if state is not None:
-        seen = jnp.concatenate([seen, _normalize_state(learner, state)], axis=-1)
+        seen = jnp.concatenate([seen, state], axis=-1)
     return networks.recall_value(learner.params, config, seen, memory)
-
-
-def _normalize_state(learner: LearnerState, state: jax.Array) -> jax.Array:
-    """Normalises what the critic sees besides, [..., P]."""
-    assert learner.state_normalizer is not None  # `init` was told its size
-    return normalizer.normalize(learner.state_normalizer, state, OBSERVATION_LIMIT)
 
 
 def update(
@@ -291,28 +282,18 @@ def update(
     metrics["skipped_steps"] = jnp.where(lost, 1.0, metrics["skipped_steps"])
     metrics = optimizer.mean_of_taken(metrics)
     metrics["std"] = jnp.mean(jnp.exp(params["actor"]["log_std"]))
-    learned = replace(learner, params=params, optimizer_state=optimizer_state)
-    return _take_in(learned, config, batch, shards), metrics
-
-
-def _take_in(
-    learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Shards
-) -> LearnerState:
-    """Adds what a batch saw to the moments by which the learner normalises."""
-    if not config.normalize_observations:
-        return learner
-    seen = normalizer.update(learner.normalizer, batch.observation, batch.valid, shards)
-    learner = replace(learner, normalizer=seen)
-    if batch.state is None or learner.state_normalizer is None:
-        return learner
-    state = normalizer.update(learner.state_normalizer, batch.state, batch.valid, shards)
-    return replace(learner, state_normalizer=state)
+    moments = learner.normalizer
+    if config.normalize_observations:
+        moments = normalizer.update(moments, batch.observation, batch.valid, shards)
+    learned = replace(learner, params=params, optimizer_state=optimizer_state, normalizer=moments)
+    return learned, metrics
 
 
 def _is_finite(batch: Batch) -> jax.Array:
     """Tells which samples, [G, N], hold finite numbers alone."""
     numbers = (batch.log_prob, batch.advantage, batch.return_)
-    vectors = (batch.observation, batch.action)
+    vectors = [batch.observation, batch.action]
+    vectors += [] if batch.state is None else [batch.state]
     found = [jnp.isfinite(x) for x in numbers]
     found += [jnp.all(jnp.isfinite(x), axis=-1) for x in vectors]
     return functools.reduce(jnp.logical_and, found)
@@ -338,7 +319,7 @@ def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Sh
         advantage=advantage,
         return_=batch.return_,
         valid=valid,
-        state=None if batch.state is None else _normalize_state(learner, batch.state),
+        state=batch.state,
     )
     # A NaN in an invalid sample would pass through the networks into every gradient.
     masked = jax.tree.map(

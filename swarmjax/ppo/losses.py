@@ -27,7 +27,7 @@ class Minibatch:
         memory: [B', H] before the first step of B' sequences; None without memory. Samples are then
             ordered by step, [T B'].
         begins: [B], whether an episode begins with the step; None without memory.
-        state: [B, P], normalised, what the critic sees besides; None if nothing.
+        state: [B, P], of order 1, what the critic sees besides; None if nothing.
     """
 
     observation: jax.Array

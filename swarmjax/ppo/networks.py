@@ -294,13 +294,16 @@ def _check_input(network: Params, observation: jax.Array) -> None:
         chex.assert_axis_dimension(observation, -1, first["kernel"].shape[-2])
 
 
-def bind(config: AlgoConfig, networks: Sequence[Network], observation_size: int) -> AlgoConfig:
+def bind(
+    config: AlgoConfig, networks: Sequence[Network], observation_size: int, state_size: int = 0
+) -> AlgoConfig:
     """Gives a config the module that it names.
 
     Args:
         config: Names a network, or leaves it to the extension.
         networks: Of an extension.
         observation_size: O.
+        state_size: P, what the critic sees besides.
 
     Returns:
         The config with the module as its `torso`; as it is where that is `mlp`.
@@ -314,13 +317,15 @@ def bind(config: AlgoConfig, networks: Sequence[Network], observation_size: int)
         return config
     bound = replace(config, network=name, torso=found[name].function)
     _check_torso(bound, observation_size)
+    if state_size:
+        _check_torso(bound, observation_size + state_size, " for a critic of the state")
     return bound
 
 
-def _check_torso(config: AlgoConfig, observation_size: int) -> None:
+def _check_torso(config: AlgoConfig, observation_size: int, whose: str = "") -> None:
     """Refuses a network that fails, or does not turn [B, O] into [B, F]."""
     seen = jax.ShapeDtypeStruct((3, observation_size), jnp.float32)
-    where = f"network {config.network}"
+    where = f"network {config.network}{whose}"
     try:
         made = config.torso()
         found, variables = jax.eval_shape(made.init_with_output, jax.random.key(0), seen)

@@ -20,7 +20,7 @@ from swarmjax.run.settings import TrainConfig, from_stored, read_config
 from swarmjax.task.config import resolve_encoding
 from swarmjax.training.loop import TrainState
 
-_CARRIED = ("params", "normalizer", "state_normalizer")  # of a learner
+_CARRIED = ("params", "normalizer")  # of a learner
 _EXPLORED = "explored"  # likewise, of one whose exploration is scheduled
 _MET = "curriculum/met"  # robots that have trained: a promotion copies nobody over them
 

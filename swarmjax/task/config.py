@@ -81,7 +81,7 @@ class TaskConfig(Section):
     )
     history: int = field(
         default=1,
-        metadata=about("observations that the policy takes: the last one and those before", 1, 64),
+        metadata=about("observations that the policy takes: the current and earlier ones", 1, 64),
     )
     reward: RewardConfig = field(default_factory=RewardConfig)
 

@@ -73,7 +73,8 @@ class EnvState:
       level: what the episode started from.
       factors: what realism makes of the episode; they follow from the level's seed.
       memory: what the robots' electronics carry along.
-      observation: [R, O] what the policy sees now; by `task.history`, what it saw before follows.
+      observation: [R, O] what the policy takes: what it sees now, then earlier observations
+        (`task.history`).
       clock: [] control steps since the start, int32.
       arrived: [R] whether the robot has arrived; by `task.arrival=hold`, is within its target now.
       distance: [R] to the target, m.

@@ -16,7 +16,10 @@ from swarmjax.task.level import Level
 
 NEAREST_ROBOTS = 8
 NEAREST_RECTANGLES = 12  # boxes, and walls inside and around the arena
-REACH = 2.0  # m; the largest arena of the stage files is as wide, and what is farther is as good
+# m; what is farther is shown in its direction at this distance. Arenas of the stage files are up to
+# as wide. Nothing here is normalised: a running deviation of rows that are mostly 0 would magnify
+# what first fills them.
+REACH = 2.0
 
 _OWN = 3  # target x, y; arrived
 _ROBOT = 8  # there, x, y, heading x, y, target x, y, arrived
@@ -35,23 +38,29 @@ def look(pose: Array, level: Level, arrived: Array) -> Array:
 
     Returns:
       [R, P] in the robots' frames, x forward: m, within +-2; directions, within +-1; and marks, 0
-      or 1. All of what is absent is 0.
+      or 1. Rows of absent things are 0.
     """
-    target = _into_frame(pose, level.target)
+    target = _shown(*_into_frame(pose, level.target))
     own = [*target, arrived.astype(jnp.float32)]
     parts = [jnp.stack(own, axis=-1), _robots(pose, level, arrived), _rectangles(pose, level)]
     found = jnp.concatenate(parts, axis=-1)
     # An arena whose physics broke is not learned from; its critic sees numbers all the same.
-    return jnp.clip(jnp.where(jnp.isfinite(found), found, 0.0), -REACH, REACH)
+    return jnp.where(jnp.isfinite(found), found, 0.0)
+
+
+def _shown(x: Array, y: Array) -> tuple[Array, Array]:
+    """Puts what is farther than `REACH` at that distance."""
+    scale = jnp.minimum(1.0, REACH / jnp.maximum(jnp.hypot(x, y), REACH))
+    return scale * x, scale * y
 
 
 def _robots(pose: Array, level: Level, arrived: Array) -> Array:
     """Lists the other robots, [R, N * _ROBOT]."""
     yaw = pose[None, :, 2] - pose[:, None, 2]
     x, y = _into_frame(pose[:, None], pose[None, :, :2])
-    target = _into_frame(pose[:, None], level.target[None])
+    target = _shown(*_into_frame(pose[:, None], level.target[None]))
     is_there = level.present & ~jnp.eye(len(pose), dtype=bool)
-    rows = (1.0, x, y, jnp.cos(yaw), jnp.sin(yaw), *target, arrived)
+    rows = (1.0, *_shown(x, y), jnp.cos(yaw), jnp.sin(yaw), *target, arrived)
     return _nearest(jnp.hypot(x, y), is_there, rows, NEAREST_ROBOTS)
 
 
@@ -70,10 +79,10 @@ def _rectangles(pose: Array, level: Level) -> Array:
     viewer = pose[:, None]
     one, other = (_into_frame(viewer, centre[:, :2] + sign * end) for sign in (-1.0, 1.0))
     is_left = one[0] * other[1] - one[1] * other[0] >= 0.0  # the other, seen from the robot
-    right = [jnp.where(is_left, a, b) for a, b in zip(one, other, strict=True)]
-    left = [jnp.where(is_left, b, a) for a, b in zip(one, other, strict=True)]
+    right = _shown(*(jnp.where(is_left, a, b) for a, b in zip(one, other, strict=True)))
+    left = _shown(*(jnp.where(is_left, b, a) for a, b in zip(one, other, strict=True)))
     thin = jnp.minimum(half_x, half_y)
-    rows = (1.0, *_into_frame(viewer, nearest), *right, *left, thin)
+    rows = (1.0, *_shown(*_into_frame(viewer, nearest)), *right, *left, thin)
     is_there = jnp.concatenate([level.obstacle_present, jnp.ones(model.WALLS, bool)])
     return _nearest(gap, is_there, rows, NEAREST_RECTANGLES)
 

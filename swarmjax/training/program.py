@@ -53,7 +53,7 @@ class Program[C: ProgramConfig]:
     @property
     def state_size(self) -> int:
         """Entries of what a critic sees besides the observation, P; 0 if nothing."""
-        return surroundings.SIZE if self.config.algo.critic == "state" else 0
+        return _state_size(self.config)
 
     @property
     def mode(self) -> Mode:
@@ -76,10 +76,15 @@ def load[C: ProgramConfig](config: C, *, by_robot: bool = False) -> tuple[Progra
         piece of an extension does not fit.
     """
     world, pieces = load_world(config), extension.load(config.extensions)
-    algo = networks.bind(config.algo, pieces.networks, world.observation_size)
+    size = world.observation_size
+    algo = networks.bind(config.algo, pieces.networks, size, _state_size(config))
     config = replace(config, algo=algo)
-    backend = dispatch.resolve(algo, world.observation_size, ACTION_SIZE)
+    backend = dispatch.resolve(algo, size, ACTION_SIZE)
     return Program(config, world, backend, by_robot), schedule(config)
+
+
+def _state_size(config: ProgramConfig) -> int:
+    return surroundings.SIZE if config.algo.critic == "state" else 0
 
 
 def load_world(config: ProgramConfig) -> World:

@@ -9,7 +9,6 @@ from jax import Array
 
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
-from swarmjax.ppo.normalizer import Normalizer
 from swarmjax.training.config import ProgramConfig
 
 
@@ -39,7 +38,9 @@ def carry_over(
     if options.optimizer == "reset":
         carried = replace(carried, optimizer_state=_forgotten(carried.optimizer_state))
     if options.normalizer == "relearn":
-        carried = _unweighted(carried)
+        # With a count of 0 the next batch's moments replace these, which normalise it meanwhile.
+        unweighted = replace(carried.normalizer, count=jnp.zeros_like(carried.normalizer.count))
+        carried = replace(carried, normalizer=unweighted)
     if options.exploration == "reset":
         carried = ppo.explore_anew(carried, config.algo)
     if carried is learners:
@@ -53,17 +54,6 @@ def _copied(learners: LearnerState, before: Array, after: Array) -> LearnerState
     new = (index >= before) & (index < after)
     source = jnp.where(new, index % before, index)
     return jax.tree.map(lambda x: x[source], learners)
-
-
-def _unweighted(learners: LearnerState) -> LearnerState:
-    """Lets the next batch's moments replace those so far, which normalise it meanwhile."""
-
-    def unweigh(moments: Normalizer) -> Normalizer:
-        return replace(moments, count=jnp.zeros_like(moments.count))
-
-    seen, state = unweigh(learners.normalizer), learners.state_normalizer
-    state = None if state is None else unweigh(state)
-    return replace(learners, normalizer=seen, state_normalizer=state)
 
 
 def _forgotten(state: optax.OptState) -> optax.OptState:

@@ -63,7 +63,7 @@ class Trajectory(NamedTuple):
       truncated: the time ran out for the robot.
       valid: a transition to learn from.
       over: the episode ended with the step; None where nothing is remembered.
-      state: [.., P], raw, what the critic sees besides the observation; None if nothing.
+      state: [.., P], what the critic sees besides the observation; None if nothing.
     """
 
     observation: Array
@@ -267,7 +267,7 @@ class _Judged(NamedTuple):
     Attributes:
       value: of it.
       memory: [.., H] of the critic after it; None if nothing is remembered.
-      state: [.., P], raw, what the critic sees besides the observation; None if nothing.
+      state: [.., P], what the critic sees besides the observation; None if nothing.
     """
 
     value: Array

@@ -89,7 +89,9 @@ def test_the_history_is_that_of_training_and_no_other(tmp_path: Path) -> None:
 def test_policies_of_several_histories_are_compared_each_with_its_own(tmp_path: Path) -> None:
     _stacked(tmp_path / "three.npz", 3)
     _policy(tmp_path / "one.npz", "stage=s3")
-    assert _load(f"compare={tmp_path / 'three.npz'},{tmp_path / 'one.npz'}").task.history == 3
+    word = f"compare={tmp_path / 'three.npz'},{tmp_path / 'one.npz'}"
+    assert _load(word).task.history == 3
+    assert "task.history is 1, but" in refusal(_load, word, "task.history=1")
 
 
 def test_the_body_is_on_wheels_unless_it_is_told(odd: str) -> None:

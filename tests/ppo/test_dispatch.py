@@ -85,8 +85,14 @@ def test_a_history_that_does_not_fit_the_chip_is_named(monkeypatch: pytest.Monke
         dispatch.resolve(config, 13 * OBSERVATION, ACTION)
     assert str(unfit.value) == (
         "algo.update_backend is fused, but 130 numbers are observed, which do not fit the chip: "
-        "give a smaller task.history, or algo.update_backend=auto."
+        "give a smaller task.history, fewer task.observations, or algo.update_backend=auto."
     )
+
+
+def test_a_critic_that_sees_the_state_has_autodiff(monkeypatch: pytest.MonkeyPatch) -> None:
+    _on(monkeypatch, compute_capability="9.0")
+    assert dispatch.resolve(AlgoConfig(), OBSERVATION, ACTION) == "fused"
+    assert dispatch.resolve(AlgoConfig(critic="state"), OBSERVATION, ACTION) == "autodiff"
 
 
 def test_without_the_faster_ways_there_is_autodiff(monkeypatch: pytest.MonkeyPatch) -> None:

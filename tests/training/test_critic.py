@@ -8,29 +8,34 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import linen as nn
 
 from swarmjax.config import ConfigError
+from swarmjax.extension import Network
 from swarmjax.ppo import dispatch, networks
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.run.checkpoint import digest, to_leaves
 from swarmjax.run.settings import TrainConfig
+from swarmjax.sim import physics
 from swarmjax.task import env
+from swarmjax.task.env import EnvState
 from swarmjax.training import loop, rollout, seeds
 from swarmjax.training import program as programs
-from swarmjax.training.loop import TrainState
 from swarmjax.training.program import Program
-from swarmjax.training.rollout import Trajectory
+from swarmjax.training.rollout import Arena, Trajectory
 
 UPDATES = 3
 
 
 class Trained(NamedTuple):
-    """A run of some updates, and the rollout that comes next."""
+    """A run of some updates, and the rollout that comes next, in which episodes end."""
 
     program: Program
-    last: TrainState
+    learners: LearnerState
+    before: Arena
+    waiting: Arena
     trajectory: Trajectory
 
 
@@ -51,52 +56,87 @@ def trained(tiny_config: TrainConfig) -> Trained:
     at_once, _ = chunk(schedule, first, np.int32(UPDATES))
     assert digest(to_leaves(at_once)) == digest(to_leaves(last))  # any chunk size
     waiting = loop._draw_waiting(program, schedule, last.curriculum, jax.random.key(1))
+    # In the middle of their episodes, which end at 16 steps.
+    before = replace(last.arenas, clock=jnp.array([0, 0, 9, 10, 11, 12, 13, 0], jnp.int32))
     collect = jax.jit(partial(rollout.collect, program))
-    _, trajectory, _ = collect(last.learners, last.arenas, waiting, jax.random.key(2))
-    return Trained(program, last, trajectory)
+    _, trajectory, _ = collect(last.learners, before, waiting, jax.random.key(2))
+    return Trained(program, last.learners, before, waiting, trajectory)
 
 
-def _look(trained: Trained) -> np.ndarray:
-    """What is around the robots before the rollout, [A, R, P]."""
-    look = jax.vmap(partial(env.look_around, trained.program.world))
-    return np.asarray(look(trained.last.arenas))
+def _look(trained: Trained, arenas: EnvState) -> np.ndarray:
+    """What is around robots, as learners have it, [L, A, N, P]."""
+    around = jax.vmap(partial(env.look_around, trained.program.world))(arenas)
+    return np.asarray(rollout.to_learners(around, trained.program.config.learners))
+
+
+def _value(trained: Trained, arenas: Arena, memory: jax.Array) -> np.ndarray:
+    """What critics make of arenas, put together by hand, [L, A, N]; `memory` [A, R, H]."""
+    config = trained.program.config.algo
+    seen, mine = (
+        rollout.to_learners(x, trained.program.config.learners)
+        for x in (arenas.observation, memory)
+    )
+    normal = jax.vmap(ppo.normalize)(trained.learners, seen)
+    both = np.concatenate([normal, _look(trained, arenas)], axis=-1)
+    value, _ = jax.vmap(lambda p, s, m: networks.recall_value(p, config, s, m))(
+        trained.learners.params, both, mine
+    )
+    return np.asarray(value)
+
+
+def _stepped(trained: Trained) -> Arena:
+    """The arenas after the first step of the rollout, before any reset."""
+    world = trained.program.world
+    unpack = jax.vmap(partial(physics.unpack, world.physics))
+    arenas = replace(trained.before, sim=unpack(trained.before.sim))
+    action = rollout.to_arenas(trained.trajectory.action[0])
+    return jax.vmap(partial(env.step, world))(arenas, action)[0]
 
 
 def test_the_critic_is_shown_what_is_around_each_robot(trained: Trained) -> None:
     seen = trained.trajectory.state
     assert seen is not None
     assert seen.shape[-1] == trained.program.state_size
-    learners = trained.trajectory.value.shape[1]
-    now = rollout.to_learners(jnp.asarray(_look(trained)), learners)
-    np.testing.assert_array_equal(seen[0], now)
-    assert np.isfinite(seen).all()
-    assert np.ptp(np.asarray(seen), axis=0).max() > 0.0  # robots move
+    np.testing.assert_array_equal(seen[0], _look(trained, trained.before))
+    # float32: single steps are another program than the scan.
+    np.testing.assert_allclose(seen[1], _look(trained, _stepped(trained)), atol=1e-5)
+
+
+def test_where_an_episode_ends_it_is_shown_the_next_one(trained: Trained) -> None:
+    seen, over = trained.trajectory.state, trained.trajectory.over
+    assert seen is not None
+    assert over is not None
+    first = _look(trained, trained.waiting)
+    steps, arenas = np.nonzero(np.asarray(over)[:-1, 0, :, 0])
+    assert len(steps) > 2
+    for step, arena in zip(steps, arenas, strict=True):
+        np.testing.assert_array_equal(seen[step + 1, :, arena], first[:, arena])
 
 
 def test_its_value_is_that_of_observation_and_state(trained: Trained) -> None:
-    config, learners = trained.program.config.algo, trained.last.learners
-    moments = learners.state_normalizer
-    assert moments is not None
-    assert trained.trajectory.state is not None
-    assert (np.asarray(moments.count) > 0).any()
-    count = trained.trajectory.value.shape[1]
-    state = np.asarray(trained.trajectory.state[0])
-    mean, std = (np.asarray(x)[:, None, None] for x in (moments.mean, moments.std))
-    normal = np.clip((state - mean) / std, -10.0, 10.0)
-    observation = jax.vmap(ppo.normalize)(learners, trained.trajectory.observation[0])
-    both = np.concatenate([observation, normal], axis=-1)
-    recall = trained.last.arenas.recall
-    memory = None if recall is None else rollout.to_learners(recall.critic, count)
-    value, _ = jax.vmap(lambda p, s, m: networks.recall_value(p, config, s, m))(
-        learners.params, both, memory
-    )
+    recall = trained.before.recall
+    assert recall is not None
+    value = _value(trained, trained.before, recall.critic)
     # float32; a product that is batched in another way.
     np.testing.assert_allclose(trained.trajectory.value[0], value, atol=1e-5)
 
 
+def test_the_next_value_is_of_what_the_step_reached(trained: Trained) -> None:
+    found, over = trained.trajectory, trained.trajectory.over
+    assert over is not None
+    going = ~np.asarray(over)[:-1]
+    assert not going.all()
+    np.testing.assert_array_equal(
+        np.asarray(found.next_value)[:-1][going], np.asarray(found.value)[1:][going]
+    )
+    # Where the episode ended, of its end and not of the next one's beginning.
+    ends = np.asarray(found.next_value)[:-1][~going], np.asarray(found.value)[1:][~going]
+    assert np.abs(ends[0] - ends[1]).min() > 1e-6
+
+
 def test_the_actor_sees_nothing_of_it(trained: Trained) -> None:
     """Its first layer takes the observation alone; the critic's takes both."""
-    params: Any = trained.last.learners.params
+    params: Any = trained.learners.params
     size, more = trained.program.world.observation_size, trained.program.state_size
     layer = {side: params[side]["torso"]["hidden_0"]["kernel"] for side in params}
     assert layer["actor"].shape[1] == size
@@ -189,6 +229,18 @@ def test_a_state_changes_nothing_of_the_policy(backend: dispatch.Backend) -> Non
     assert np.abs(kernels[0] - kernels[1]).max() > 0.0
 
 
+def test_a_state_that_is_not_finite_is_left_out() -> None:
+    learner = ppo.init(jax.random.key(0), CONFIG, SIZE, 2, 100, STATE)
+    batch = _batch(learner, 0)
+    assert batch.state is not None
+    spoilt = replace(batch, state=batch.state.at[0, 0, 0].set(jnp.nan))
+    without = replace(batch, valid=batch.valid.at[0, 0].set(False))
+    found, expected = (
+        ppo.update(learner, CONFIG, each, jax.random.key(0), 100)[0] for each in (spoilt, without)
+    )
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+
+
 def test_what_is_not_valid_may_hold_nan() -> None:
     learner = ppo.init(jax.random.key(0), CONFIG, SIZE, 2, 100, STATE)
     batch = _batch(learner, 0)
@@ -205,7 +257,18 @@ def test_what_is_not_valid_may_hold_nan() -> None:
 # --- where it goes, and what it does not go with
 
 
-def test_kernels_of_the_policy_alone_are_not_chosen() -> None:
-    assert dispatch.resolve(CONFIG, SIZE, 2) == "autodiff"
+def test_kernels_that_know_the_observation_alone_are_refused() -> None:
     with pytest.raises(ConfigError, match="update_backend is fused, but critic is state"):
         AlgoConfig(critic="state", update_backend="fused")
+
+
+def test_a_network_that_takes_the_observation_alone_is_refused() -> None:
+    class Fixed(nn.Module):
+        @nn.compact
+        def __call__(self, observation: jax.Array) -> jax.Array:
+            return observation.reshape(-1, SIZE)
+
+    own = [Network(name="fixed", function=Fixed)]
+    assert networks.bind(replace(CONFIG, network="fixed"), own, SIZE).torso is Fixed
+    with pytest.raises(ConfigError, match="network fixed for a critic of the state fails"):
+        networks.bind(replace(CONFIG, network="fixed"), own, SIZE, STATE)
