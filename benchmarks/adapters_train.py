@@ -96,6 +96,7 @@ def train_sb3(given: AdapterTrainConfig) -> tuple[float, int, float]:
     env.reset()
     env.step(np.zeros((env.num_envs, 2), np.float32))
     recent: list[bool] = []
+    peers.find("torch", "the extra sb3").set_num_threads(1)  # beside JAX's, more are slower
 
     def look(values: dict[str, Any], _: Any) -> bool:
         ended = [info for info in values["infos"] if info]

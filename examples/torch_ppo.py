@@ -92,6 +92,7 @@ def train(updates: int) -> tuple[float, int, float]:
         That share, robot steps, and seconds without those of the first step, which compiles.
     """
     torch.manual_seed(0)
+    torch.set_num_threads(1)  # more cost more than they save networks this small, beside JAX's
     env = SwarmTorchEnv(swarmjax.make_env("s1", arenas=ARENAS))
     seen = env.reset(seed=0)
     model = ActorCritic(seen.shape[1]).eval()

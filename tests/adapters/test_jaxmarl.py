@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,9 @@ from courses import ARENA_SEED, LIMIT, Course, assert_close, drawn_key
 
 from swarmjax.environment import Swarm
 
-with contextlib.redirect_stdout(io.StringIO()):  # it says which of its environments it lacks
+# It says which of its environments it lacks; JAXopt, which it imports, that nobody keeps it up.
+with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+    warnings.simplefilter("ignore")
     from jaxmarl.environments.multi_agent_env import MultiAgentEnv
     from jaxmarl.wrappers.baselines import LogWrapper
 
