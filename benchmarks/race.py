@@ -9,7 +9,7 @@ Brax's own: one learning rate for actor and critic, which does not fall (`learni
 our actor unless given), Adam's epsilon, a critic whose last layer begins as large as the others
 (Brax takes one initialisation for all), minibatches of robots instead of arenas or tiles of
 samples, no bound on normalised observations, no options of XLA's (`loop.compiler_options`), and no
-mask, so that robots that have arrived stay in its batch (benchmarks/brax_env.py). All of its robot
+mask, so that robots that have arrived stay in its batch (docs/adapters.md). All of its robot
 steps are counted as transitions, of ours those that were learned from.
 
 `settings=playground` gives Brax what MuJoCo Playground sets for its walking robots (`PLAYGROUND`)
@@ -33,13 +33,13 @@ from flax import linen
 
 from benchmarks import curriculum, key_value, peers, steps_per_second, timing
 from benchmarks.curriculum_arms import StudyConfig
+from swarmjax import environment
 from swarmjax.config import ConfigError, Section, about, to_dict
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import optimizer
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.run.settings import TrainConfig, load_train
-from swarmjax.training import program as programs
 
 SHARES = (0.90, 0.95)
 # MuJoCo Playground 0.2.0, `config/locomotion_params.py`, `brax_ppo_config`, of whose 8,192 robots a
@@ -245,7 +245,7 @@ def as_learners(trained: TrainConfig, params: Any) -> LearnerState:
 def run_brax(race: RaceConfig, trained: TrainConfig) -> Course:
     """Trains with Brax's PPO; raises MissingPeerError where Brax is not installed."""
     brax_ppo = peers.find("brax.training.agents.ppo.train", "the extra brax")
-    adapter = peers.find("benchmarks.brax_env", "the extra brax")
+    adapter = peers.find("swarmjax.adapters.brax_env", "the extra brax")
     judge, given = load_judge(race, trained), brax_settings(race, trained)
     shares: list[float] = []
     seconds: list[float] = []
@@ -254,17 +254,18 @@ def run_brax(race: RaceConfig, trained: TrainConfig) -> Course:
         """Judges; the first time, before training, is for compiling the judge."""
         shares.append(judge(as_learners(trained, params)))
 
-    _mend_jax()
-    brax_ppo.train(
-        environment=adapter.SwarmEnv(*programs.load(trained)),
-        wrap_env=False,
-        max_devices_per_host=1,
-        run_evals=False,
-        network_factory=network_factory(trained),
-        policy_params_fn=look,
-        progress_fn=lambda _, metrics: seconds.append(metrics["training/walltime"]),
-        **given,
-    )
+    with adapter.mended_jax():
+        brax_ppo.train(
+            environment=adapter.SwarmBraxEnv(environment.load(trained)),
+            wrap_env=False,
+            max_devices_per_host=1,
+            run_evals=False,
+            num_eval_envs=given["num_envs"],
+            network_factory=network_factory(trained),
+            policy_params_fn=look,
+            progress_fn=lambda _, metrics: seconds.append(metrics["training/walltime"]),
+            **given,
+        )
     calls = np.diff(seconds, prepend=0.0)
     usual = np.median(calls[_COMPILING:])
     compile_s = np.sum(calls[:_COMPILING] - usual)
@@ -277,19 +278,6 @@ def run_brax(race: RaceConfig, trained: TrainConfig) -> Course:
         arena_steps=transitions / trained.sim.robots,
         compile_s=float(compile_s),
     )
-
-
-def _mend_jax() -> None:
-    """Gives JAX back `device_put_replicated`, which Brax 0.14.2 calls and JAX 0.10 has dropped.
-
-    It put a copy on each device, behind a new first axis, as `pmap` does.
-    """
-
-    def replicate(tree: Any, devices: Sequence[Any]) -> Any:
-        copy = jax.pmap(lambda _, one: one, axis_name="i", in_axes=(0, None), devices=devices)
-        return copy(np.arange(len(devices)), tree)
-
-    setattr(jax, "device_put_replicated", replicate)  # noqa: B010  # JAX's types do not have it
 
 
 # Both

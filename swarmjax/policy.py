@@ -69,8 +69,8 @@ def load(path: str | Path | IO[bytes]) -> Policy:
         if sum(map(text.count, "[{,:")) > MAX_ENTRIES:
             raise ValueError(f"meta has more than {MAX_ENTRIES} entries")
         meta = json.loads(text)
-        history, size = meta["observation"].get("history", 1), arrays["normalizer/mean"].shape[1]
-        if type(history) is not int or history < 1 or size % history:
+        history = meta.get("observation", {}).get("history", 1)
+        if type(history) is not int or history < 1:
             raise ValueError(f"meta.observation.history is {json.dumps(history)[:80]}")
         wanted = MEMORY_FORMAT if "memory" in meta or history > 1 else FORMAT
         if meta["format"] == MEMORY_FORMAT and "network" in meta:

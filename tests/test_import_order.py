@@ -23,6 +23,7 @@ ROOMS = {
     "export": SHARED | {"sim", "run"},
     "replay": SHARED | {"sim", "task", "evaluate", "export"},
     "report": SHARED | {"task", "run", "evaluate"},
+    "adapters": {"environment"},
     "reproduce": SHARED | {"sim", "task", "run", "evaluate", "report"},
 }
 # The engine on the device judges by what trains; the cache of its programs is a run's.

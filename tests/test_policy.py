@@ -390,7 +390,7 @@ def test_a_history_is_handed_in_and_out(tmp_path: Path) -> None:
         policy.step(plain, policy.begin(loaded, (5, 2)), seen)
 
 
-@pytest.mark.parametrize("history", [0, -1, 2.5, 7, "3", None])
+@pytest.mark.parametrize("history", [0, -1, 2.5, "3", None])
 def test_a_history_that_is_none_is_named(tmp_path: Path, history: Any) -> None:
     path = tmp_path / "policy.npz"
     said = {"observation": policies.observed() | {"history": 3}}

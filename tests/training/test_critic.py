@@ -270,5 +270,5 @@ def test_a_network_that_takes_the_observation_alone_is_refused() -> None:
 
     own = [Network(name="fixed", function=Fixed)]
     assert networks.bind(replace(CONFIG, network="fixed"), own, SIZE).torso is Fixed
-    with pytest.raises(ConfigError, match="network fixed for a critic of the state fails"):
+    with pytest.raises(ConfigError, match="network fixed for a critic of the state turns"):
         networks.bind(replace(CONFIG, network="fixed"), own, SIZE, STATE)

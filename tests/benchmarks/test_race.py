@@ -1,8 +1,6 @@
-"""The adapter to Brax steps, rewards, ends and restarts as the environment itself does."""
+"""Brax is raced with the numbers that it is said to have, and judged by its own policy."""
 
 import dataclasses
-import warnings
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,65 +9,9 @@ import pytest
 
 from benchmarks import race
 from swarmjax.ppo import learner as ppo
-from swarmjax.ppo.config import AlgoConfig
 from swarmjax.run.settings import TrainConfig
-from swarmjax.sim.config import SimConfig
-from swarmjax.task import env
-from swarmjax.task.config import TaskConfig
 from swarmjax.task.observation import SIZE
-from swarmjax.task.stage_config import StageConfig
-from swarmjax.training import program as programs
-from swarmjax.training.program import Program
 from tests.sentences import refusal
-
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # JAXopt, which Brax imports, says that nobody keeps it up
-    brax_env = pytest.importorskip("benchmarks.brax_env", exc_type=ImportError)
-
-STEPS = 20  # the step limit is 16, so that every arena begins anew once
-
-
-@pytest.fixture(scope="module")
-def program() -> Program:
-    """Two robots where three are compiled in; one solver iteration, which compiles sooner."""
-    stage = StageConfig(name="pair", robots=2, side=0.5)
-    sim = SimConfig(impl="jax", max_robots=3, max_obstacles=0, iterations=1, ls_iterations=1)
-    task, algo = TaskConfig(step_limit=16), AlgoConfig(rollout_length=8, num_minibatches=2)
-    config = TrainConfig(stage=(stage,), task=task, algo=algo, sim=sim, arenas=4, budget=32)
-    return Program(config, programs.load_world(config))
-
-
-@pytest.mark.slow  # 22 s of compiling, for a peer of a benchmark
-def test_it_is_the_environment_robot_by_robot(program: Program) -> None:
-    world, swarm = program.world, brax_env.SwarmEnv(program, programs.schedule(program.config))
-    state = jax.jit(swarm.reset)(jax.random.split(jax.random.PRNGKey(0), 4 * 3))
-
-    @jax.jit
-    def step(state, action):
-        alone = jax.vmap(partial(env.step, world))
-        _, came = alone(state.pipeline_state.now, action.reshape(4, 3, 2))
-        return swarm.step(state, action), came
-
-    random, ended, drawn = np.random.default_rng(0), 0, []
-    for number in range(1, STEPS + 1):
-        before = state.pipeline_state
-        np.testing.assert_array_equal(state.obs, before.now.observation.reshape(12, SIZE))
-        state, came = step(state, random.uniform(-1.0, 1.0, (12, 2)).astype(np.float32))
-        over = np.asarray(came.done)[:, None, None]
-        seen = np.where(over, before.starts.observation, came.observation)
-        # The same numbers twice in one program, which XLA may add up in another order.
-        np.testing.assert_allclose(state.obs, seen.reshape(12, SIZE), rtol=0.0, atol=1e-5)
-        np.testing.assert_allclose(state.reward, came.reward.ravel(), rtol=0.0, atol=1e-5)
-        idle = np.asarray(came.truncated | ~came.valid).ravel()
-        np.testing.assert_array_equal(state.info["truncation"], idle)
-        np.testing.assert_array_equal(state.done, idle | np.asarray(came.terminated).ravel())
-        # Of three robots two are there: Brax learns nothing from the third.
-        assert idle.reshape(4, 3)[:, 2].all()
-        ended += int(np.sum(came.done))
-        if np.any(before.starts.level.start != state.pipeline_state.starts.level.start):
-            drawn.append(number)
-    assert ended >= 4
-    assert drawn == [8, 16]  # once a rollout of 8 control steps
 
 
 def test_brax_is_given_our_numbers(tiny_config: TrainConfig) -> None:

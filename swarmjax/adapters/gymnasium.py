@@ -1,0 +1,104 @@
+"""Gymnasium: the robots of all arenas as one `gymnasium.vector.VectorEnv`."""
+
+from typing import Any
+
+import numpy as np
+
+from swarmjax.adapters.library import find
+from swarmjax.adapters.robots import line_up
+from swarmjax.adapters.session import Session, errors, spaces
+from swarmjax.environment import Swarm
+
+_vector: Any = find("gymnasium.vector", "gymnasium")
+_modes: Any = find("gymnasium.vector", "gymnasium", "AutoresetMode")
+_batch_space: Any = find("gymnasium.vector.utils", "gymnasium", "batch_space")
+
+
+class SwarmVectorEnv(_vector.VectorEnv):
+    """Each robot is a sub-environment; all may share a policy.
+
+        envs = SwarmVectorEnv(swarmjax.make_env("s1", arenas=64))
+        observation, info = envs.reset(seed=0)
+        observation, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
+
+    The robots of an arena end together, when its episode does. One that has arrived stands until
+    then: its reward is 0, `info["valid"]` is False, and what it is told is ignored. In the last
+    step it is `terminated`; robots whose time ran out are `truncated`.
+
+    Autoreset is `SAME_STEP`: where an episode ends, the observation is that of the next one, and
+    `info["final_obs"]` holds the last one of the old. Absent robots are left out.
+
+    Attributes:
+        arena: [N] the arena of each sub-environment.
+    """
+
+    metadata = {  # noqa: RUF012  # Gymnasium's own form
+        "autoreset_mode": _modes.SAME_STEP,
+        "render_modes": [],
+    }
+
+    def __init__(self, swarm: Swarm) -> None:
+        robots = line_up(swarm)
+        self._session = Session(robots)
+        self.arena = robots.arena
+        self.num_envs = len(robots)
+        self.single_observation_space, self.single_action_space = spaces(robots)
+        self.observation_space = _batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = _batch_space(self.single_action_space, self.num_envs)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Starts an episode in every arena.
+
+        Args:
+            seed: of all levels to come; None goes on with those of the last one.
+            options: none are known; `reset_mask` is refused, since arenas reset themselves.
+
+        Returns:
+            [N, O] observations, and no info.
+
+        Raises:
+            Error: the seed is no whole number, or some sub-environments alone are to be reset.
+            ClosedEnvironmentError: it was closed.
+        """
+        if seed is not None and not isinstance(seed, int | np.integer):
+            raise errors.Error(f"seed is {seed!r}: all arenas share one seed, a whole number.")
+        if "reset_mask" in (options or {}):
+            raise errors.Error("options has reset_mask: arenas reset themselves, all or none.")
+        super().reset(seed=None if seed is None else int(seed))
+        return self._session.reset(int(self.np_random.integers(2**31))), {}
+
+    def step(
+        self, actions: Any
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Makes a control step.
+
+        Args:
+            actions: [N, 2] speed and turn rate, floats; what is beyond -1..1 is clipped.
+
+        Returns:
+            [N, O] observations, [N] rewards, terminations and truncations, and the info.
+
+        Raises:
+            InvalidAction: the actions have a wrong shape or dtype.
+            ResetNeeded: it was never reset.
+            ClosedEnvironmentError: it was closed.
+        """
+        came = self._session.step(actions)
+        every = np.ones(self.num_envs, bool)
+        info: dict[str, Any] = {"valid": came.valid, "_valid": every}
+        if came.over.any():
+            final = np.full(self.num_envs, None, object)
+            for i in np.flatnonzero(came.over):
+                final[i] = came.last[i]
+            valid = {"valid": came.valid & came.over, "_valid": came.over}
+            info |= {"final_obs": final, "_final_obs": came.over}
+            info |= {"final_info": valid, "_final_info": came.over}
+        terminated = came.over & ~came.truncated
+        reward = came.reward.astype(np.float64)  # as Gymnasium's own vector environments
+        return came.observation, reward, terminated, came.truncated, info
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Ends the session; `close` calls this."""
+        self._session.close()

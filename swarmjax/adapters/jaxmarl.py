@@ -1,0 +1,117 @@
+"""JaxMARL: the robots of one arena as a `MultiAgentEnv`, for `vmap` over arenas."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from swarmjax.adapters.library import fault, find
+from swarmjax.adapters.robots import RobotStep, line_up_arena
+from swarmjax.environment import Swarm, SwarmState
+
+_base: Any = find("jaxmarl.environments.multi_agent_env", "jaxmarl", "MultiAgentEnv")
+_box: Any = find("jaxmarl.environments.spaces", "jaxmarl", "Box")
+_ByAgent = dict[str, Array]
+
+
+class SwarmMultiAgentEnv(_base):
+    """Each robot is an agent, `agent_0`, `agent_1` and so on.
+
+        env = SwarmMultiAgentEnv(swarmjax.make_env("s1", arenas=1))
+        observations, state = jax.vmap(env.reset)(jax.random.split(key, 64))
+        observations, state, rewards, dones, info = jax.vmap(env.step)(keys, state, actions)
+
+    A robot that arrives is done, and stays so until all are or the time runs out, when `__all__`
+    is. Meanwhile it stands: its reward is 0, `info["valid"]` is False, and none of its actions is
+    available. `info` has arrays [N] over agents: `valid`, `terminated` (the robot arrived in this
+    step) and `truncated` (the time ran out on its way). `step` starts the next episode by itself.
+    """
+
+    def __init__(self, swarm: Swarm) -> None:
+        """Raises ValueError if the swarm has several arenas."""
+        self.robots = line_up_arena(swarm)
+        super().__init__(num_agents=len(self.robots))
+        seen, action = swarm.observation_space, swarm.action_space
+        endless = _box(-jnp.inf, jnp.inf, seen.shape)
+        bounded = _box(action.low, action.high, action.shape)
+        self.observation_spaces = dict.fromkeys(self.agents, endless)
+        self.action_spaces = dict.fromkeys(self.agents, bounded)
+
+    @property
+    def agent_classes(self) -> dict[str, list[str]]:
+        """All are robots of one kind."""
+        return {"robot": self.agents}
+
+    @partial(jax.jit, static_argnums=0)
+    def reset(self, key: Array) -> tuple[_ByAgent, SwarmState]:
+        """Starts an episode; returns [O] observations by agent, and the state."""
+        state = self.robots.swarm.reset(key)
+        return self.get_obs(state), state
+
+    @partial(jax.jit, static_argnums=0)
+    def step(
+        self,
+        key: Array,
+        state: SwarmState,
+        actions: _ByAgent,
+        reset_state: SwarmState | None = None,
+    ) -> tuple[_ByAgent, SwarmState, _ByAgent, _ByAgent, _ByAgent]:
+        """Makes a control step, and starts the next episode where this one ends.
+
+        Args:
+            key: unused; the state has its own.
+            state: before.
+            actions: [2] floats by agent; what is beyond -1..1 is clipped.
+            reset_state: what to start from; None: a fresh level.
+
+        Returns:
+            [O] observations by agent (of the next episode where `__all__` is done), the state,
+            rewards and dones by agent, and the info.
+
+        Raises:
+            ValueError: an action is missing or has a wrong shape.
+            TypeError: an action is of a wrong dtype.
+        """
+        _, state, rewards, dones, info = self.step_env(key, state, actions)
+        if reset_state is not None:
+            again = partial(jnp.where, dones["__all__"])
+            state = jax.tree.map(again, reset_state, state)
+        return self.get_obs(state), state, rewards, dones, info
+
+    def step_env(
+        self, key: Array, state: SwarmState, actions: _ByAgent
+    ) -> tuple[_ByAgent, SwarmState, _ByAgent, _ByAgent, _ByAgent]:
+        """As `step`, but the observation is the last one of the episode where that ends."""
+        state, came = self.robots.step(state, self._stack(actions))
+        info = {name: getattr(came, name) for name in ("valid", "terminated", "truncated")}
+        dones = self._by_agent(_is_done(came)) | {"__all__": came.over[0]}
+        return self._by_agent(came.last), state, self._by_agent(came.reward), dones, info
+
+    def get_obs(self, state: SwarmState) -> _ByAgent:
+        """[O] what to act on, by agent."""
+        return self._by_agent(self.robots.observe(state))
+
+    def get_avail_actions(self, state: SwarmState) -> _ByAgent:
+        """[2] by agent: False where the robot stands and does not act."""
+        arrived = state.arenas.arrived[0, self.robots.index]
+        free = ~arrived | (self.robots.swarm.world.task.arrival == "hold")
+        return self._by_agent(jnp.repeat(free[:, None], 2, axis=1))
+
+    def _by_agent(self, x: Array) -> _ByAgent:
+        return {agent: x[i] for i, agent in enumerate(self.agents)}
+
+    def _stack(self, actions: _ByAgent) -> Array:
+        """[N, 2]."""
+        if missing := sorted(set(self.agents) - set(actions)):
+            raise ValueError(f"actions lack {missing}: give one of each agent.")
+        for agent in self.agents:
+            if sentence := fault(actions[agent], (2,)):
+                raise (TypeError if "dtype" in sentence else ValueError)(f"{agent}: {sentence}")
+        return jnp.stack([actions[agent] for agent in self.agents])
+
+
+def _is_done(came: RobotStep) -> Array:
+    """[N] who has ended: arrived now or before, or ran out of time."""
+    return came.terminated | came.truncated | ~came.valid | came.over

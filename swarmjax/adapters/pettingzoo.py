@@ -1,0 +1,118 @@
+"""PettingZoo: the robots of one arena as a `pettingzoo.ParallelEnv`."""
+
+from typing import Any
+
+import numpy as np
+
+from swarmjax.adapters.library import fault, find
+from swarmjax.adapters.robots import line_up_arena
+from swarmjax.adapters.session import Session, errors, spaces
+from swarmjax.environment import Swarm
+
+_base: Any = find("pettingzoo", "pettingzoo", "ParallelEnv")
+_Floats = dict[str, np.ndarray]
+
+
+class SwarmParallelEnv(_base):
+    """Each robot is an agent, `robot_0`, `robot_1` and so on.
+
+        env = SwarmParallelEnv(swarmjax.make_env("s1", arenas=1))
+        observations, infos = env.reset(seed=0)
+        while env.agents:
+            actions = {agent: env.action_space(agent).sample() for agent in env.agents}
+            observations, rewards, terminations, truncations, infos = env.step(actions)
+
+    A robot that arrives is terminated and leaves `agents`; it stands where it is, and the others
+    drive on around it. When the time runs out, those that are left are truncated. With
+    `task.arrival=hold` all robots leave in the same step. Nothing resets by itself.
+
+    Attributes:
+        agents: those that are on their way.
+        possible_agents: all robots.
+    """
+
+    metadata = {"name": "swarmjax_v0", "render_modes": []}  # noqa: RUF012  # PettingZoo's own form
+
+    def __init__(self, swarm: Swarm) -> None:
+        """Raises ValueError if the swarm has several arenas."""
+        robots = line_up_arena(swarm)
+        self._session = Session(robots)
+        self._random = np.random.default_rng()
+        self.possible_agents = [f"robot_{i}" for i in range(len(robots))]
+        self.agents: list[str] = []
+        made = {agent: spaces(robots) for agent in self.possible_agents}
+        self.observation_spaces = {agent: seen for agent, (seen, _) in made.items()}
+        self.action_spaces = {agent: action for agent, (_, action) in made.items()}
+        self.render_mode = None
+
+    def observation_space(self, agent: str) -> Any:  # noqa: D102
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Any:  # noqa: D102
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[_Floats, dict[str, dict[str, Any]]]:
+        """Starts an episode; raises ClosedEnvironmentError if it was closed.
+
+        Args:
+            seed: of all levels to come; None goes on with those of the last one.
+            options: none are known.
+
+        Returns:
+            [O] observations and no infos, by agent.
+        """
+        if seed is not None:
+            self._random = np.random.default_rng(seed)
+        seen = self._session.reset(int(self._random.integers(2**31)))
+        self.agents = list(self.possible_agents)
+        return dict(zip(self.agents, seen, strict=True)), {agent: {} for agent in self.agents}
+
+    def step(self, actions: dict[str, Any]) -> tuple[Any, Any, Any, Any, Any]:
+        """Makes a control step.
+
+        Args:
+            actions: [2] floats by agent, of all in `agents`; those of robots that left are ignored.
+
+        Returns:
+            Observations [O], rewards, terminations, truncations and infos, of the agents that
+            acted.
+
+        Raises:
+            InvalidAction: an action is missing, of nobody, or of a wrong shape or dtype.
+            ResetNeeded: no agent is left.
+            ClosedEnvironmentError: it was closed.
+        """
+        self._session.check_open()
+        if not self.agents:
+            raise errors.ResetNeeded("No agent is left: call reset first.")
+        came = self._session.step(self._stack(actions))
+        acted = self.agents
+        number = {agent: self.possible_agents.index(agent) for agent in acted}
+        ended = came.terminated | came.truncated
+        self.agents = [agent for agent in acted if not ended[number[agent]]]
+        return (
+            {agent: came.last[i] for agent, i in number.items()},
+            {agent: float(came.reward[i]) for agent, i in number.items()},
+            {agent: bool(came.terminated[i]) for agent, i in number.items()},
+            {agent: bool(came.truncated[i]) for agent, i in number.items()},
+            {agent: {} for agent in acted},
+        )
+
+    def close(self) -> None:
+        """Ends the session."""
+        self.agents = []
+        self._session.close()
+
+    def _stack(self, actions: dict[str, Any]) -> np.ndarray:
+        """[N, 2] what all robots are told; 0 for those that stand."""
+        stacked = np.zeros((len(self.possible_agents), 2), np.float32)
+        if wrong := (set(self.agents) - set(actions)) | (set(actions) - set(self.possible_agents)):
+            raise errors.InvalidAction(f"actions lack, or have too many, {sorted(wrong)}.")
+        for agent in self.agents:
+            action = np.asarray(actions[agent])
+            if sentence := fault(action, (2,)):
+                raise errors.InvalidAction(f"{agent}: {sentence}")
+            stacked[self.possible_agents.index(agent)] = action
+        return stacked

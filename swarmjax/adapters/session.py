@@ -1,0 +1,90 @@
+"""Steps the robots of a swarm from the host, in NumPy, for libraries that live there.
+
+They have Gymnasium's errors, which Gymnasium, PettingZoo and Stable-Baselines3 raise alike.
+"""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from swarmjax.adapters.library import fault, find
+from swarmjax.adapters.robots import RobotRow, RobotStep
+from swarmjax.environment import SwarmState
+
+errors: Any = find("gymnasium.error", "gymnasium")
+
+
+def spaces(robots: RobotRow) -> tuple[Any, Any]:
+    """Makes Gymnasium's spaces of one robot's observation [O] and action [2]."""
+    box = find("gymnasium.spaces", "gymnasium").Box
+    seen, action = robots.swarm.observation_space, robots.swarm.action_space
+    return box(-np.inf, np.inf, seen.shape, np.float32), box(action.low, action.high)
+
+
+class Session:
+    """What is stepped, and whether it was reset and closed."""
+
+    def __init__(self, robots: RobotRow) -> None:
+        self._robots = robots
+        self._reset, self._step = jax.jit(robots.swarm.reset), jax.jit(robots.step)
+        self._state: SwarmState | None = None
+        self._closed = False
+
+    def reset(self, seed: int) -> np.ndarray:
+        """Starts an episode in every arena.
+
+        Args:
+            seed: of the levels, not negative.
+
+        Returns:
+            [N, O] what to act on.
+
+        Raises:
+            ClosedEnvironmentError: it was closed.
+        """
+        self.check_open()
+        state: SwarmState = self._reset(jax.random.key(seed))
+        self._state = state
+        return np.array(self._robots.observe(state))
+
+    def begin(self, action: Any) -> RobotStep:
+        """Starts a control step, and does not wait for it.
+
+        Args:
+            action: [N, 2] floats; what is beyond -1..1 is clipped.
+
+        Returns:
+            What it comes to, on the device.
+
+        Raises:
+            ClosedEnvironmentError: it was closed.
+            ResetNeeded: it was never reset.
+            InvalidAction: the action has a wrong shape or dtype.
+        """
+        self.check_open()
+        if self._state is None:
+            raise errors.ResetNeeded("step was called before reset: call reset first.")
+        action = np.asarray(action)
+        if sentence := fault(action, (len(self._robots), 2)):
+            raise errors.InvalidAction(sentence)
+        self._state, came = self._step(self._state, action.astype(np.float32))
+        return came
+
+    def step(self, action: Any) -> RobotStep:
+        """Makes a control step, as `begin` does; returns arrays of NumPy's, the caller's own."""
+        return fetch(self.begin(action))
+
+    def close(self) -> None:
+        """Lets go of the state; nothing else may be called afterwards."""
+        self._state, self._closed = None, True
+
+    def check_open(self) -> None:
+        """Raises ClosedEnvironmentError if it was closed."""
+        if self._closed:
+            raise errors.ClosedEnvironmentError("The environment was closed: make another one.")
+
+
+def fetch(came: RobotStep) -> RobotStep:
+    """Copies what a step came to from the device."""
+    return RobotStep(*(np.array(each) for each in jax.device_get(came)))

@@ -1,0 +1,28 @@
+"""Small swarms, and courses of theirs that every adapter has to follow."""
+
+import pytest
+from courses import ARENA_SEED, ONE, PAIR, SEED, TASK, Course, drawn_key, follow
+
+import swarmjax
+from swarmjax.environment import Swarm
+
+
+@pytest.fixture(scope="session")
+def swarm() -> Swarm:
+    """Four arenas, with two robots and one in turn: six robots on eight places."""
+    return swarmjax.make_env([PAIR, ONE], task=TASK, arenas=4)
+
+
+@pytest.fixture(scope="session")
+def arena() -> Swarm:
+    return swarmjax.make_env(PAIR, task=TASK, arenas=1)
+
+
+@pytest.fixture(scope="session")
+def course(swarm: Swarm) -> Course:
+    return follow(swarm, drawn_key(SEED))
+
+
+@pytest.fixture(scope="session")
+def arena_course(arena: Swarm) -> Course:
+    return follow(arena, drawn_key(ARENA_SEED))

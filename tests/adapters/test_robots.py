@@ -1,0 +1,75 @@
+"""Robots in a row are those of the arenas, and only those that are there."""
+
+import jax
+import numpy as np
+import pytest
+from courses import ARENAS, PLACES, SEED, Course, assert_close, drawn_key, robots
+
+from swarmjax.adapters import library
+from swarmjax.adapters.robots import line_up, line_up_arena
+from swarmjax.environment import Swarm
+
+
+def test_absent_robots_are_left_out(swarm: Swarm) -> None:
+    found = line_up(swarm)
+    np.testing.assert_array_equal(found.index, PLACES)
+    np.testing.assert_array_equal(found.arena, ARENAS)
+    present = jax.jit(swarm.reset)(jax.random.key(0)).present
+    np.testing.assert_array_equal(np.flatnonzero(present), PLACES)
+
+
+def test_the_course_has_all_that_can_happen(course: Course) -> None:
+    came, over = course.came, course.came.done[..., None]
+    assert (came.terminated & ~over).any()  # one arrives and waits
+    assert (came.terminated & over).any()  # the last arrives
+    assert came.truncated.any()
+    assert (over.all(axis=-1).sum(axis=0) > 1).any()  # an arena ends twice
+
+
+def test_robots_follow_the_course(swarm: Swarm, course: Course) -> None:
+    row, state = line_up(swarm), jax.jit(swarm.reset)(drawn_key(SEED))
+    step = jax.jit(row.step)
+    np.testing.assert_array_equal(row.observe(state), robots(course.seen[0]))
+    for t, action in enumerate(course.action):
+        state, found = step(state, robots(action))
+        then = jax.tree.map(lambda x: x[t], course.came)  # noqa: B023
+        assert_close(found.observation, robots(course.after[t]))
+        assert_close(found.last, robots(then.observation))
+        assert_close(found.reward, robots(then.reward))
+        for name in ("terminated", "truncated", "valid"):
+            np.testing.assert_array_equal(getattr(found, name), robots(getattr(then, name)))
+        np.testing.assert_array_equal(found.over, then.done[ARENAS])
+
+
+def test_several_arenas_are_refused(swarm: Swarm) -> None:
+    with pytest.raises(ValueError, match=r"^arenas is 4, but this adapter steps one: make_env"):
+        line_up_arena(swarm)
+
+
+@pytest.mark.parametrize(
+    ("action", "sentence"),
+    [
+        (np.zeros((3, 2), np.float32), "action has the shape (3, 2): give (4, 2), speed and turn"),
+        (np.zeros((4, 2), np.int32), "action is of dtype int32: give float32, -1 to 1."),
+    ],
+)
+def test_a_wrong_action_is_told(action: np.ndarray, sentence: str) -> None:
+    assert (library.fault(action, (4, 2)) or "").startswith(sentence)
+
+
+def test_a_right_action_is_not() -> None:
+    assert library.fault(np.zeros((4, 2)), (4, 2)) is None
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "reason"),
+    [
+        ("absent_library", None, "No module named 'absent_library'"),
+        ("json", "Newer", "module 'json' has no attribute 'Newer'"),
+    ],
+)
+def test_a_library_that_is_missing_or_too_old(module: str, name: str | None, reason: str) -> None:
+    with pytest.raises(ImportError) as caught:
+        library.find(module, "extra", name)
+    expected = f"{module} cannot be used here ({reason}): pip install swarmjax[extra]."
+    assert str(caught.value) == expected
