@@ -14,6 +14,7 @@ import pytest
 import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from packaging.version import Version
 
 import swarmjax
 
@@ -127,6 +128,26 @@ def test_what_is_asked_for_is_pinned_within_its_range(asked: Requirement) -> Non
 def test_a_range_has_both_ends(asked: Requirement) -> None:
     operators = {each.operator for each in asked.specifier}
     assert operators in ({">=", "<"}, {"=="})
+
+
+@pytest.mark.parametrize(
+    ("name", "called"),
+    [
+        ("chex", "Chex"),
+        ("flax", "Flax"),
+        ("jax", "JAX"),
+        ("numpy", "NumPy"),
+        ("optax", "Optax"),
+        ("orbax-checkpoint", "Orbax checkpoint"),
+    ],
+)
+def test_the_page_names_the_oldest_and_the_newest_version(name: str, called: str) -> None:
+    page = (ROOT / "docs" / "install.md").read_text().splitlines()
+    (row,) = (line for line in page if line.startswith(f"| {called} |"))
+    oldest, newest = (Version(cell.strip()) for cell in row.split("|")[2:4])
+    (asked,) = (each for each in USERS if each.name == name)
+    ends = {each.operator: Version(each.version) for each in asked.specifier}
+    assert ends[">="] == oldest <= newest < ends["<"]
 
 
 def _imported(path: Path) -> set[str]:
