@@ -1,7 +1,9 @@
-"""Writes the version of every transitive dependency into pyproject.toml.
+"""Writes the version of every dependency, direct and transitive, into pyproject.toml.
 
-`python .ci/pin.py` keeps to the constraints that stand there; `python .ci/pin.py --upgrade`
-resolves afresh. The lock file names the registry's host, so it is not committed.
+What users install has ranges there; these constraints, which no wheel holds, make this tree's
+environment the same everywhere. `python .ci/pin.py` keeps to those that stand there;
+`python .ci/pin.py --upgrade` takes the newest that the ranges allow: run `.ci/versions.py` then.
+The lock file names the registry's host, so it is not committed.
 """
 
 import re

@@ -11,7 +11,7 @@ from swarmjax.config.section import Section
 from swarmjax.exit_codes import INTERRUPTED, USER_ERROR
 from swarmjax.policy import PolicyError
 
-_HELP = {"-h", "--help"}
+HELP = {"-h", "--help"}
 _ALL = "all"  # topic of the help that is every key
 # By the command's module, what to type after `python -m` and it, and what that does.
 EXAMPLES: dict[str, dict[str, str]] = {
@@ -92,8 +92,8 @@ def run(
     arguments = sys.argv[1:]
     module = _module(name)
     try:
-        if _HELP & set(arguments):
-            topics = [word for word in arguments if word not in _HELP and "=" not in word]
+        if HELP & set(arguments):
+            topics = [word for word in arguments if word not in HELP and "=" not in word]
             sys.stdout.write(help_text(settings, module, topics) + "\n")
             return 0
         return main(arguments)

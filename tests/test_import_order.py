@@ -25,6 +25,7 @@ ROOMS = {
     "report": SHARED | {"task", "run", "evaluate"},
     "adapters": {"environment"},
     "reproduce": SHARED | {"sim", "task", "run", "evaluate", "report"},
+    "shell": SHARED,
 }
 # The engine on the device judges by what trains; the cache of its programs is a run's.
 ALSO = {

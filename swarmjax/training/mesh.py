@@ -71,7 +71,8 @@ def make(devices: int, axis: str = AXIS) -> Mesh:
         raise ConfigError(
             f"devices is {devices}, but JAX sees {found} ({kind}): give at most {found}."
         )
-    return jax.make_mesh((devices,), (axis,), (AxisType.Auto,), devices=jax.devices()[:devices])
+    kinds = (AxisType.Auto,)
+    return jax.make_mesh((devices,), (axis,), axis_types=kinds, devices=jax.devices()[:devices])
 
 
 def init(program: Program) -> Callable[[Schedule], TrainState]:

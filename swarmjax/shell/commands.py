@@ -1,0 +1,45 @@
+"""The commands of the console script."""
+
+import importlib
+from typing import NamedTuple
+
+from swarmjax.config.section import Section
+
+
+class Command(NamedTuple):
+    """A command of the package, which `python -m swarmjax.NAME` runs as well.
+
+    Attributes:
+        settings: module and name of the dataclass of its keys, which importing must need no JAX.
+        meaning: what it does, in one sentence without a quote, which scripts of shells put it in.
+    """
+
+    settings: str
+    meaning: str
+
+
+# One line a command.
+COMMANDS: dict[str, Command] = {
+    "train": Command("swarmjax.run.settings:TrainConfig", "Train a swarm."),
+    "evaluate": Command("swarmjax.evaluate.config:EvaluateConfig", "Judge policies in MuJoCo C."),
+    "replay": Command("swarmjax.replay.config:ReplayConfig", "Show episodes on a page."),
+    "report": Command("swarmjax.report.config:ReportConfig", "Draw what runs came to."),
+    "export": Command(
+        "swarmjax.export.config:ExportConfig", "Write a policy for ONNX, C or Webots."
+    ),
+    "reproduce": Command(
+        "swarmjax.reproduce.config:ReproduceConfig", "Repeat the study of the paper."
+    ),
+    "suite": Command("swarmjax.suite:SuiteConfig", "Draw the levels that policies are judged on."),
+    "verify": Command("swarmjax.verify:VerifyConfig", "Train a run again and compare it."),
+}
+
+
+def settings(name: str) -> type[Section]:
+    """Import the dataclass of a command's keys.
+
+    Args:
+        name: one of `COMMANDS`.
+    """
+    module, _, cls = COMMANDS[name].settings.partition(":")
+    return getattr(importlib.import_module(module), cls)

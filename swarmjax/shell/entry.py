@@ -1,0 +1,74 @@
+"""What the console script `swarmjax` runs."""
+
+import difflib
+import runpy
+import sys
+from collections.abc import Sequence
+
+import swarmjax
+from swarmjax import command, provenance
+from swarmjax.config import ConfigError, show
+from swarmjax.exit_codes import USER_ERROR
+from swarmjax.shell import completion
+from swarmjax.shell.commands import COMMANDS, settings
+
+_TOLD = ("jax", "mujoco", "mujoco-mjx", "python")  # what `--version` names besides swarmjax
+
+
+def main() -> int:
+    """Run what the command line asks for.
+
+    Returns:
+        The exit code, 2 for an error of the user's; a command ends the process with its own.
+    """
+    name, *rest = sys.argv[1:] or ["--help"]
+    try:
+        return _run(name, rest)
+    except ConfigError as error:
+        sys.stderr.write(f"swarmjax: error: {error}\n")
+        return USER_ERROR
+
+
+def _run(name: str, rest: Sequence[str]) -> int:
+    if name in COMMANDS:
+        return _command(name, rest)
+    if name in command.HELP:
+        sys.stdout.write(help_text() + "\n")
+    elif name == "--version":
+        sys.stdout.write(_versions() + "\n")
+    elif name == "--completion":
+        sys.stdout.write(completion.script(rest[0] if rest else ""))
+    else:
+        near = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"give one of {', '.join(COMMANDS)}."
+        raise ConfigError(f"{show(name)} is no command: {hint}")
+    return 0
+
+
+def _command(name: str, rest: Sequence[str]) -> int:
+    """Run a command as `python -m` does, but for its help, which needs no more than its keys."""
+    sys.argv = [sys.argv[0], *rest]
+    if command.HELP & set(rest):
+        return command.run(name, lambda _: 0, settings(name))
+    runpy.run_module(f"swarmjax.{name}", run_name="__main__", alter_sys=True)
+    return 0
+
+
+def help_text() -> str:
+    """List the commands, without a newline at the end."""
+    lines = ["usage: swarmjax COMMAND key=value ...", "", "Commands:"]
+    lines += [f"  {name:<10}  {each.meaning}" for name, each in COMMANDS.items()]
+    lines += [
+        "",
+        "swarmjax COMMAND --help gives examples and keys; so does python -m swarmjax.COMMAND.",
+        f"swarmjax --completion {'|'.join(completion.SHELLS)} prints a script of completions.",
+        "swarmjax --version names the versions of swarmjax, JAX and MuJoCo.",
+    ]
+    return "\n".join(lines)
+
+
+def _versions() -> str:
+    """Name the versions installed, on one line."""
+    found = provenance.versions()
+    told = [f"{name} {found[name]}" for name in _TOLD if name in found]
+    return ", ".join([f"swarmjax {swarmjax.__version__}", *told])
