@@ -232,8 +232,8 @@ def _loggers(given: Any) -> "list[Logger]":
     wrong = [each for each in every if not isinstance(each, Logger) and not callable(each)]
     if wrong:
         raise ConfigError(
-            f"log is {show(wrong[0])}: give a function of a row, a Logger of swarmjax.run.loggers, or "
-            "a list of these."
+            f"log is {show(wrong[0])}: give a function of a row, a Logger of "
+            "swarmjax.run.loggers, or a list of these."
         )
     return [each if isinstance(each, Logger) else Calls(each) for each in every]
 
