@@ -24,6 +24,7 @@ ROOMS = {
     "replay": SHARED | {"sim", "task", "evaluate", "export"},
     "report": SHARED | {"task", "run", "evaluate"},
     "reproduce": SHARED | {"sim", "task", "run", "evaluate", "report"},
+    "watch": SHARED | {"task", "run", "evaluate", "report", "replay"},
 }
 # The engine on the device judges by what trains; the cache of its programs is a run's.
 ALSO = {
