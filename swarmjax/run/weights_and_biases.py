@@ -1,6 +1,8 @@
 """Weights & Biases: a run of theirs for each seed of a run, on their server or in files alone."""
 
+import importlib
 import importlib.util
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +34,8 @@ def check(settings: TrainConfig) -> None:
 
 
 def _sign_in() -> None:
-    import wandb
-
     try:
-        signed = wandb.login(verify=False, prompt=False)
+        signed = _wandb().login(verify=False, prompt=False)
     except Exception:  # of a type of W&B's own
         signed = False
     if not signed:
@@ -60,7 +60,7 @@ class WandbRuns:
         self._settings, self._run = settings, run
         self._open: dict[int, Any] = {}
 
-    def write(self, rows: list[Row], speeds: Row) -> None:
+    def write(self, rows: Sequence[Row], speeds: Row) -> None:
         """Writes the numbers of each row, and the speeds of a call with the first seed's last."""
         runs = self._runs()
         mine = [row for row in rows if row["seed"] in runs]
@@ -71,8 +71,7 @@ class WandbRuns:
 
     def attach(self, name: str, path: Path, arena_steps: int) -> None:
         """Writes a PNG as a picture and a page as a page, with the first seed."""
-        import wandb
-
+        wandb = _wandb()
         made = wandb.Image(str(path)) if path.suffix == ".png" else wandb.Html(path.read_text())
         next(iter(self._runs().values())).log({name: made, "arena_steps": arena_steps})
 
@@ -88,8 +87,7 @@ class WandbRuns:
 
     def _start(self, seed: int) -> Any:
         """Starts or goes on with the run of a seed."""
-        import wandb
-
+        wandb = _wandb()
         asked, online = self._settings.run, self._settings.run.wandb_mode == "online"
         run = wandb.init(
             project=asked.wandb,
@@ -113,6 +111,11 @@ class WandbRuns:
         )
         run.define_metric("*", step_metric="arena_steps")
         return run
+
+
+def _wandb() -> Any:
+    """Imports the library, which is an extra and takes seconds."""
+    return importlib.import_module("wandb")
 
 
 def _numbers(row: Row) -> Row:

@@ -32,7 +32,7 @@ NAMES = {
 }
 
 
-class Drawn(NamedTuple):
+class DrawnFigures(NamedTuple):
     """Figures of a run.
 
     Attributes:
@@ -73,7 +73,7 @@ class Views:
         """
         self.settings, self.run = settings, Path(settings.run)
         self.trained = rows.read_config(self.run)
-        self.drawn, self.replayed = Drawn(), Replayed()
+        self.drawn, self.replayed = DrawnFigures(), Replayed()
         self._asked = -LOOKED_AT_S
         self._seen: tuple[int, float] | None = None
         self._tried: int | None = None
@@ -110,7 +110,7 @@ class Views:
         try:
             self.trained = rows.read_config(self.run)
             history = rows.read(self.run)
-            self.drawn = Drawn(self.drawn.version + 1, history, figures(history))
+            self.drawn = DrawnFigures(self.drawn.version + 1, history, figures(history))
         except ConfigError as error:
             self.drawn = self.drawn._replace(trouble=str(error))
         self._seen = found

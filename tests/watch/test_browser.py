@@ -26,8 +26,8 @@ TRAINED = replace(CONFIG, seeds=2, run=RunConfig(id="0123456789abcdef"))
 
 @pytest.fixture(scope="module")
 def views(tmp_path_factory: pytest.TempPathFactory) -> Views:
-    """What is shown of a run of two seeds that has ended, whose directory has an evil name."""
-    rows = [row(update, seed) for update in range(TRAINED.updates) for seed in (0, 1)]
+    """What is shown of a run of two seeds that was killed, whose directory has an evil name."""
+    rows = [row(update, seed) for update in range(TRAINED.updates - 1) for seed in (0, 1)]
     run = write(tmp_path_factory.mktemp("runs") / HOSTILE, rows, trained=TRAINED)
     _, _, state = lifecycle.begin(TRAINED)
     with Checkpoints(run, keep=1) as checkpoints:
@@ -75,7 +75,7 @@ def test_the_page_follows_a_run_and_asks_nobody_else(browser: Any, server: Serve
     drawn = "return document.querySelectorAll('figure:not([hidden])').length"
     wait.until(lambda _: browser.execute_script(drawn) == 4)
     standing = browser.find_element("id", "standing")
-    assert standing.text == "It has ended: all 20 updates are done."
+    assert standing.text.startswith("It was killed, or broke, after 19 of 20 updates; ")
     assert "seeds\n0 to 1" in browser.find_element("id", "facts").text
     assert "by the policy of seed 1" in browser.find_element("id", "seen").text
     browser.switch_to.frame("replay")
