@@ -58,32 +58,32 @@ class WandbRuns:
     def __init__(self, settings: TrainConfig, run: Path) -> None:
         """Opens nothing yet: W&B takes seconds."""
         self._settings, self._run = settings, run
+        self._seeds = settings.numbers[:BOARDS]
         self._open: dict[int, Any] = {}
 
     def write(self, rows: Sequence[Row], speeds: Row) -> None:
         """Writes the numbers of each row, and the speeds of a call with the first seed's last."""
-        runs = self._runs()
-        mine = [row for row in rows if row["seed"] in runs]
-        first = next(iter(runs))
-        last = [row for row in mine if row["seed"] == first][-1]
+        mine = [row for row in rows if row["seed"] in self._seeds]
+        last = [row for row in mine if row["seed"] == self._seeds[0]][-1]
         for row in mine:
-            runs[row["seed"]].log(_numbers(row | speeds if row is last else row))
+            self._of(row["seed"]).log(_numbers(row | speeds if row is last else row))
 
     def attach(self, name: str, path: Path, arena_steps: int) -> None:
         """Writes a PNG as a picture and a page as a page, with the first seed."""
         wandb = _wandb()
         made = wandb.Image(str(path)) if path.suffix == ".png" else wandb.Html(path.read_text())
-        next(iter(self._runs().values())).log({name: made, "arena_steps": arena_steps})
+        self._of(self._seeds[0]).log({name: made, "arena_steps": arena_steps})
 
     def close(self) -> None:
         """Waits until everything is written, and sent."""
         for each in self._open.values():
             each.finish()
 
-    def _runs(self) -> dict[int, Any]:
-        if not self._open:
-            self._open = {k: self._start(k) for k in self._settings.numbers[:BOARDS]}
-        return self._open
+    def _of(self, seed: int) -> Any:
+        """Returns the run of a seed, which is started if it is not there."""
+        if seed not in self._open:
+            self._open[seed] = self._start(seed)
+        return self._open[seed]
 
     def _start(self, seed: int) -> Any:
         """Starts or goes on with the run of a seed."""
@@ -106,6 +106,7 @@ class WandbRuns:
                 disable_code=True,
                 host="",
                 x_disable_meta=True,
+                x_save_requirements=False,
                 x_disable_stats=True,
             ),
         )

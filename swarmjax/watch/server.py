@@ -6,6 +6,7 @@ refused; it cannot read answers otherwise, since none allows another origin.
 """
 
 import json
+import sys
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
@@ -42,6 +43,11 @@ class Server(ThreadingHTTPServer):
                 f"port is {port}, which cannot be had ({error.strerror}): give another, or 0 for "
                 "any that is free."
             ) from None
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Says nothing of a browser that has gone before it had its answer."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)  # pyright: ignore[reportArgumentType]
 
     @property
     def url(self) -> str:

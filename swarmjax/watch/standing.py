@@ -23,8 +23,8 @@ class Standing(NamedTuple):
 
     Attributes:
         state: `trains` or `elsewhere` while it goes on; `ended`, with its budget spent; `stopped`,
-            with all saved; `killed`, or broken, with the rest of its budget open; `silent`: on
-            another machine, which has not been heard of.
+            with all saved; `killed`, or broken, with the rest of its budget open; `silent`: gone,
+            or on another machine and not heard of.
         sentence: says so to a person.
     """
 
@@ -70,6 +70,8 @@ def stand(run: Path, trained: TrainConfig) -> Standing:
         run: its directory.
         trained: its config.
     """
+    if not (run / directory.CONFIG).exists():
+        return Standing("silent", f"{run} is gone.")
     found, writer, age = progress(run, trained.seeds), directory.writer(run), _age(run)
     so_far = f"{found.done:,} of {words.count(trained.updates, 'update')}"
     if writer is not None and writer.is_here and directory.is_writing(writer):

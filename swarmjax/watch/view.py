@@ -1,6 +1,6 @@
 """Keeps what a page shows as new as it should be, in threads, while somebody looks at it."""
 
-import contextlib
+import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -111,7 +111,7 @@ class Views:
             self.trained = rows.read_config(self.run)
             history = rows.read(self.run)
             self.drawn = DrawnFigures(self.drawn.version + 1, history, figures(history))
-        except ConfigError as error:
+        except (ConfigError, OSError) as error:  # such as of a run that is removed meanwhile
             self.drawn = self.drawn._replace(trouble=str(error))
         self._seen = found
         return (time.perf_counter() - began) * (1.0 - SHARE) / SHARE
@@ -127,7 +127,7 @@ class Views:
         try:
             found = newest.record(self.settings, self.drawn.history)
             self.replayed = Replayed(self.replayed.version + 1, found)
-        except (ConfigError, CheckpointError, PolicyError) as error:
+        except (ConfigError, CheckpointError, PolicyError, OSError) as error:
             self.replayed = self.replayed._replace(trouble=str(error))
         return self.settings.seconds
 
@@ -136,8 +136,11 @@ class Views:
         while True:
             rest = 0.0
             if time.monotonic() - self._asked < LOOKED_AT_S:
-                with contextlib.suppress(OSError):  # a run that is moved or removed meanwhile
+                try:
                     rest = renew()
+                except Exception as error:  # nobody foresaw it, and the page goes on
+                    sys.stderr.write(f"swarmjax.watch: {type(error).__name__}: {error}\n")
+                    rest = LOOKED_AT_S
             time.sleep(PAUSE_S + rest)
 
 

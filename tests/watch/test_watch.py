@@ -230,6 +230,10 @@ def test_a_run_whose_summary_is_of_an_earlier_stop_was_killed(tmp_path: Path) ->
     assert _state(run)[0] == "killed"
 
 
+def test_a_run_that_was_removed_is_gone(tmp_path: Path) -> None:
+    assert _state(tmp_path / "run") == ("silent", f"{tmp_path / 'run'} is gone.")
+
+
 def test_a_run_whose_budget_is_spent_has_ended(tmp_path: Path) -> None:
     run = write(tmp_path / "run", [row(update) for update in range(UPDATES)])
     assert _state(run) == ("ended", "It has ended: all 20 updates are done.")
