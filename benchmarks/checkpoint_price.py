@@ -60,7 +60,7 @@ class Clock(Display):
     def say(self, sentence: str) -> None:
         """Shows nothing."""
 
-    def hear(self, rows: Sequence[Row]) -> None:
+    def hear(self, rows: Sequence[Row], speeds: Row) -> None:
         """Notes the end of a call."""
         self.ends.append((time.perf_counter(), rows[-1]["update"]))
 

@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from swarmjax import extension, policy_file
-from swarmjax.config import ConfigError, Section, inherit, to_dict
+from swarmjax.config import ConfigError, Section, inherit, show, to_dict
 from swarmjax.policy import Policy, PolicyError
 from swarmjax.run.errors import CheckpointError, TrainingError
 
 if TYPE_CHECKING:
     from swarmjax.environment import Swarm
+    from swarmjax.run.loggers import Logger
     from swarmjax.run.settings import TrainConfig
 
 Row = dict[str, Any]
@@ -119,6 +120,7 @@ def train_policy(
     settings: "Settings | TrainConfig" = (),
     *,
     on_update: Callable[[Row], object] | None = None,
+    log: Any = (),
     extensions: Any = None,
 ) -> TrainResult:
     """Trains a swarm, as `python -m swarmjax.train` does, and writes a run directory.
@@ -130,6 +132,9 @@ def train_policy(
             `["algo.discount=0.995"]`; `stage` may also be a `StageConfig` or a list of them.
         on_update: is called with each row of `metrics.jsonl`; the run saves and stops when it
             returns True. So it does at Ctrl-C.
+        log: is called with each row too, in a thread of its own: the run does not wait, and goes on
+            without it if it raises, which a sentence on standard error says. Or a `Logger` of
+            `swarmjax.run.loggers`, which also hears speeds and is closed at the end; or a list.
         extensions: pieces of your own: a file, a module, or a list of them.
 
     Returns:
@@ -146,7 +151,9 @@ def train_policy(
     else:
         more = {} if extensions is None else {"extensions": extensions}
         config, auto = load_run(*_given({**_mapping(settings), **more}))
-    run, files = quiet.train(config, on_update or (lambda row: None), _signals, auto=auto)
+    run, files = quiet.train(
+        config, on_update or (lambda row: None), _signals, loggers=_loggers(log), auto=auto
+    )
     policies = [policy_file.read(file, config.extensions) for file in files]
     lines = (run / "metrics.jsonl").read_text().splitlines()
     return TrainResult(policies[0], policies, [json.loads(line) for line in lines], run)
@@ -215,6 +222,20 @@ def load_policy(path: str | Path, extensions: Any = None) -> Policy:
         SwarmjaxError: the file is missing, damaged or inconsistent.
     """
     return policy_file.read(path, extension.hand_over(extensions))
+
+
+def _loggers(given: Any) -> "list[Logger]":
+    """Makes loggers of functions, and of one a list."""
+    from swarmjax.run.loggers import Calls, Logger
+
+    every = list(given) if isinstance(given, list | tuple) else [given]
+    wrong = [each for each in every if not isinstance(each, Logger) and not callable(each)]
+    if wrong:
+        raise ConfigError(
+            f"log is {show(wrong[0])}: give a function of a row, a Logger of "
+            "swarmjax.run.loggers, or a list of these."
+        )
+    return [each if isinstance(each, Logger) else Calls(each) for each in every]
 
 
 def _is_one(policy: Any) -> bool:

@@ -43,7 +43,13 @@ EXAMPLES: dict[str, dict[str, str]] = {
     "swarmjax.report": {
         "run=runs/first": "into runs/first/report",
         "run=runs/first out=reports/first": "into a folder of your choice",
+        "run=runs/first send=true": "and into the run's TensorBoard or W&B",
         "runs=runs/first,runs/array,'runs/cell*'": "a table of several runs, arrays and sweeps",
+    },
+    "swarmjax.watch": {
+        "run=runs/first": "a page on this machine, whose address is printed",
+        "run=runs/first port=8000 seconds=10": "on a port of your choice, with more replays",
+        "run=runs/first level=7 seed=1": "another level, by another seed's policy",
     },
     "swarmjax.replay": {
         "policy=runs/first/policy.npz": "level 0 of its last stage, into replay.html",

@@ -20,6 +20,7 @@ from swarmjax.run.settings import TrainConfig, load_run, load_train
 from swarmjax.suite import SuiteConfig
 from swarmjax.task.stage_files import load_levels
 from swarmjax.verify import VerifyConfig
+from swarmjax.watch.config import WatchConfig
 
 # The loader of each command and its settings.
 COMMANDS: dict[str, tuple[Callable[[Sequence[str]], object], type[Section]]] = {
@@ -31,6 +32,7 @@ COMMANDS: dict[str, tuple[Callable[[Sequence[str]], object], type[Section]]] = {
     "swarmjax.reproduce": (load_reproduce, ReproduceConfig),
     "swarmjax.suite": (partial(files.load, SuiteConfig), SuiteConfig),
     "swarmjax.verify": (partial(files.load, VerifyConfig), VerifyConfig),
+    "swarmjax.watch": (partial(files.load, WatchConfig), WatchConfig),
 }
 EVERY_EXAMPLE = [(name, words) for name, of in command.EXAMPLES.items() for words in of]
 

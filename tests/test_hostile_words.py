@@ -25,6 +25,7 @@ SOUND = {
     "swarmjax.reproduce": [],
     "swarmjax.suite": ["suite=dev"],
     "swarmjax.verify": ["run=a"],
+    "swarmjax.watch": ["run=a"],
 }
 TEXTS = [
     (name, key)

@@ -26,6 +26,7 @@ ROOMS = {
     "adapters": {"environment"},
     "reproduce": SHARED | {"sim", "task", "run", "evaluate", "report"},
     "shell": SHARED,
+    "watch": SHARED | {"task", "run", "evaluate", "report", "replay"},
 }
 # The engine on the device judges by what trains; the cache of its programs is a run's.
 ALSO = {

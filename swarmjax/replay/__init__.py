@@ -2,5 +2,5 @@
 
 Imports `evaluate`, whose engine steps them, settings and geometry of `task` and `sim`, and
 `export.folder` to replace files. `record.py` keeps what happened, `pack.py` makes it
-small, `page.py` and `video.py` show it. Start with `__main__.replay`.
+small, `page.py` and `video.py` show it. Start with `episodes.replay`.
 """

@@ -11,150 +11,21 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
-import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
 from swarmjax import command
-from swarmjax.config import ConfigError, show
-from swarmjax.evaluate import cells, witness
-from swarmjax.evaluate import judge as evaluate_judge
+from swarmjax.config import ConfigError
 from swarmjax.evaluate import trials as evaluate_trials
-from swarmjax.evaluate.cells import Cell
-from swarmjax.evaluate.trials import Entrant, Trial
+from swarmjax.evaluate import witness
+from swarmjax.evaluate.trials import Entrant
 from swarmjax.export import folder as export_folder
 from swarmjax.replay import page as replay_page
 from swarmjax.replay import record
 from swarmjax.replay import video as replay_video
 from swarmjax.replay.config import ReplayConfig
-from swarmjax.replay.record import ReplayEpisode
-
-
-class Pick(NamedTuple):
-    """An episode to replay: the index of its cell, and its row there."""
-
-    cell: int
-    row: int
-
-
-def replay(
-    settings: ReplayConfig, entrants: Sequence[Entrant], progress: Progress
-) -> list[ReplayEpisode]:
-    """Records the episodes that are asked for.
-
-    Args:
-        settings: Of the replay.
-        entrants: Who drives.
-        progress: Shows how far it is.
-
-    Returns:
-        What became of each level, in the order in which they were named, or the worst first.
-
-    Raises:
-        PolicyError: If a policy does not fit a level's stage.
-        ConfigError: If there is no such level, or the physics breaks down.
-    """
-    chosen = _cells(settings)
-    _check_worst(settings, sum(len(cell.episodes) for cell in chosen))
-    for cell in chosen:
-        for each in entrants:
-            evaluate_judge.check_policy(settings.evaluation, cell.stage, *each)
-    picks = _named(settings, chosen)
-    if settings.worst is not None:
-        bar = progress.add_task("episodes", total=sum(len(cell.episodes) for cell in chosen))
-        report = partial(progress.advance, bar)
-        trials = evaluate_trials.run(settings.evaluation, chosen, entrants[:1], report)
-        picks = worst(trials, settings.worst)
-    used = [chosen[row] for row in {pick.cell for pick in picks}]
-    limits = [evaluate_trials.specialise(settings.evaluation, cell).step_limit for cell in used]
-    bar = progress.add_task("steps", total=sum(limits) * len(entrants))
-    return _record(settings, entrants, chosen, picks, partial(progress.advance, bar))
-
-
-def _cells(settings: ReplayConfig) -> list[Cell]:
-    """Draws the levels that there are to choose from; of a stage no more than are named."""
-    if settings.suite is None and settings.worst is None:
-        return [cells.draw_stage(settings.evaluation, settings.levels)]
-    suite = cells.load(settings.evaluation)
-    if settings.cell is None:
-        return list(suite.cells)
-    found = [cell for cell in suite.cells if cell.name == settings.cell]
-    if not found:
-        names = ", ".join(cell.name for cell in suite.cells)
-        raise ConfigError(f"cell is {show(settings.cell)}: give one of {names}.")
-    return found
-
-
-def _check_worst(settings: ReplayConfig, count: int) -> None:
-    """Refuses to choose more levels than there are."""
-    if settings.worst is not None and settings.worst > count:
-        where = f"suite {settings.suite}" + (f", cell {settings.cell}," if settings.cell else "")
-        raise ConfigError(
-            f"worst is {settings.worst}, but {where} has {count} levels: give 1 to {count}."
-        )
-
-
-def _named(settings: ReplayConfig, chosen: Sequence[Cell]) -> list[Pick]:
-    """Finds the levels that are named; those of the first cell, which is the only one."""
-    if settings.worst is not None:
-        return []
-    if len(chosen) > 1:
-        names = ", ".join(cell.name for cell in chosen)
-        raise ConfigError(
-            f"suite {settings.suite} has several cells: give worst=5, or cell=NAME of {names}."
-        )
-    rows = {number: row for row, number in enumerate(chosen[0].episodes.tolist())}
-    for number in settings.levels:
-        if number not in rows:
-            raise ConfigError(
-                f"level is {number}, but cell {chosen[0].name} has the {len(rows)} levels "
-                f"{min(rows)} to {max(rows)}: give one of them."
-            )
-    return [Pick(0, rows[number]) for number in settings.levels]
-
-
-def worst(trials: Sequence[Trial], count: int) -> list[Pick]:
-    """Chooses the episodes that went worst for the first policy.
-
-    Args:
-        trials: What became of it on each cell.
-        count: How many to choose.
-
-    Returns:
-        Fewest targets reached first, then most contacts a robot, then longest, then the first.
-    """
-    picks = [Pick(i, j) for i, each in enumerate(trials) for j in range(len(each.cell.episodes))]
-    reached, contacts, time = (
-        np.concatenate([each.found[name][0] for each in trials])
-        for name in ("targets_reached", "contacts_per_robot", "episode_time_s")
-    )
-    return [picks[i] for i in np.lexsort([-time, -contacts, reached])[:count]]
-
-
-def _record(
-    settings: ReplayConfig,
-    entrants: Sequence[Entrant],
-    chosen: Sequence[Cell],
-    picks: Sequence[Pick],
-    report: Callable[[int], None],
-) -> list[ReplayEpisode]:
-    """Records episodes, those of one cell side by side."""
-    found = {}
-    for i in sorted({pick.cell for pick in picks}):
-        cell, mine = chosen[i], [pick for pick in picks if pick.cell == i]
-        levels = cells.split(cell.levels)
-        runs = []
-        for each in entrants:
-            judged = evaluate_trials.specialise(settings.evaluation, cell, each.path)
-            judge = evaluate_judge.load(judged, each.policy, cell.half)
-            runs.append(record.record(judge, [levels[pick.row] for pick in mine], report))
-        for pick, by_policy in zip(mine, zip(*runs, strict=True), strict=True):
-            number = int(cell.episodes[pick.row])
-            label = f"level {number}" if len(chosen) == 1 else f"{cell.name}, level {number}"
-            found[pick] = ReplayEpisode(label, number, list(by_policy))
-    return [found[pick] for pick in picks]
+from swarmjax.replay.episodes import replay
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -69,18 +69,25 @@ def fill(title: str, packed: bytes) -> str:
     style = (files / "replay.css").read_text(encoding="utf-8")
     script = "\n".join((files / name).read_text(encoding="utf-8") for name in _SCRIPTS)
     script = f'(() => {{\n"use strict";\n{script}}})();\n'
-    allowed = f"default-src 'none'; img-src data:; style-src {_hash(style)}; "
+    allowed = f"default-src 'none'; img-src data:; style-src {source_hash(style)}; "
     return Template((files / "replay.html").read_text(encoding="utf-8")).substitute(
         title=escape(title),
-        policy=f"{allowed}script-src {_hash(script)}; base-uri 'none'; form-action 'none'",
+        policy=f"{allowed}script-src {source_hash(script)}; base-uri 'none'; form-action 'none'",
         style=style,
         script=script,
         data=base64.b64encode(packed).decode("ascii"),
     )
 
 
-def _hash(text: str) -> str:
-    """Names a text in a policy of the page."""
+def source_hash(text: str) -> str:
+    """Names a style or a script in a page's policy of what it may load or run.
+
+    Args:
+        text: all of it.
+
+    Returns:
+        A hash source (W3C, Content Security Policy Level 3, 2.3.1).
+    """
     digest = hashlib.sha256(text.encode()).digest()
     return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 

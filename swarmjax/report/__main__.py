@@ -18,35 +18,40 @@ from swarmjax import command, words
 from swarmjax.config import ConfigError, files
 from swarmjax.report import page as report_page
 from swarmjax.report import rows, table
+from swarmjax.report import send as report_send
 from swarmjax.report.config import ReportConfig
 
 PAGE, TABLE = "report.html", "report.json"
 
 
-def write(run: Path, out: Path, made_by: str) -> list[Path]:
+def write(run: Path, out: Path, made_by: str, *, send: bool = False) -> list[Path]:
     """Writes the report of a run.
 
     Args:
       run: the run directory.
       out: directory of the report, which is made.
       made_by: the command that makes it, for the page.
+      send: whether the run's loggers are told it too, and the pages that lie in the run directory.
 
     Returns:
       The files.
 
     Raises:
-      ConfigError: if the run cannot be read, or `out` not be written.
+      ConfigError: if the run cannot be read, or `out` not be written, or there is no logger.
     """
     history = rows.read(run)
+    loggers = report_send.of_run(run, history) if send else []
     from swarmjax.report import (
         figures as report_figures,
     )  # Matplotlib takes a second, which no refusal should
 
     figures = report_figures.draw(history)
     page = report_page.page(f"Report of {run}", made_by, history, figures)
-    return _write(
+    written = _write(
         out, {f"{name}.png": png for name, png in figures.items()} | {PAGE: page.encode()}
     )
+    report_send.send(history, [*written, *sorted(run.glob("*.html"))], loggers)
+    return written
 
 
 def write_table(lines: Sequence[table.TableLine], out: Path, made_by: str) -> list[Path]:
@@ -91,7 +96,7 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     run = Path(settings.run or "")
     out = Path(settings.out) if settings.out else run / "report"
-    written = write(run, out, made_by)
+    written = write(run, out, made_by, send=settings.send)
     figures = words.count(len(written) - 1, "figure")
     sys.stdout.write(f"{written[-1]}: the report of {run}, with {figures}.\n")
     return 0

@@ -24,8 +24,17 @@ class ReportConfig(Section):
         default=None,
         metadata=about("directory; null: <run>/report, or with runs what is printed alone"),
     )
+    send: bool = field(
+        default=False,
+        metadata=about(
+            "hand figures, and links of the report and of replays in the run directory, to the "
+            "run's TensorBoard and W&B [run]"
+        ),
+    )
 
     def _check(self) -> None:
         if (self.run is None) == (self.runs is None):
             both = "is missing" if self.run is None else "and runs are given"
             raise ConfigError(f"run {both}: give run=DIR, or runs=DIR,DIR,... for a table.")
+        if self.send and self.run is None:
+            raise ConfigError("send is true, but runs are given: give run=DIR, or leave it out.")

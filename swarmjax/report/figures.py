@@ -26,6 +26,7 @@ from swarmjax.task.stage_config import StageConfig
 _DOTS = 110  # an inch
 _POINTS, _STRETCHES = 600, 200  # of a curve and of a band: about what the dots can show
 _NAMED = 24  # stages named along a strip of colours; more would touch
+SMALL = (5.4, 3.2)  # inches
 _SEED, _ALL, _LIMIT = "0.62", "#0b4f9e", "#c04000"
 _STEPS = "arena control steps of a seed"
 _CURVES = {
@@ -49,20 +50,67 @@ def draw(history: History) -> dict[str, bytes]:
     files = {}
     makers = {"mix": mix, "success": success, "curves": curves, "grid": grid}
     for name, make in makers.items():
-        figure, content = make(history), io.BytesIO()
+        figure = make(history)
         if figure is not None:
-            figure.savefig(content, format="png", dpi=_DOTS, metadata={"Software": None})
-            files[name] = content.getvalue()
+            files[name] = png(figure)
     return files
 
 
-def mix(history: History) -> Figure:
-    """Draws on which stages the arenas were, stacked, as the mean over seeds."""
+def png(figure: Figure) -> bytes:
+    """Makes a PNG file of a figure, without Matplotlib's version."""
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=_DOTS, metadata={"Software": None})
+    return content.getvalue()
+
+
+def by_stage(history: History) -> dict[str, Figure]:
+    """Draws each stage's newest verdict over time, a colour a stage, small enough for a phone.
+
+    A line is the interquartile mean of the seeds, where every one has a value; it is dotted where
+    the stage was left behind.
+
+    Returns:
+      A figure each of `targets`, `contacts` and `return`.
+    """
+    measures = {
+        "targets": (report_rows.measure(history), history.success),
+        "contacts": ("contacts per robot", history.by_stage["contacts_by_stage"]),
+        "return": ("return per robot", history.by_stage["return_by_stage"]),
+    }
+    return {key: _of_stages(history, *each) for key, each in measures.items()}
+
+
+def _of_stages(history: History, title: str, values: np.ndarray) -> Figure:
+    """Draws values [N, T, S] of all stages into one panel."""
+    at = _at(len(history.updates), _POINTS)
+    steps = history.arena_steps[at]
+    lately = report_rows.trained_lately(history)[:, at].any(axis=0)
+    mean = report_rows.together(values)[at]
+    figure = Figure(figsize=SMALL, layout="constrained")
+    axes = figure.subplots()
+    for i, colour in enumerate(colormaps["viridis"](np.linspace(0.0, 1.0, len(history.names)))):
+        _curve(axes, steps, mean[:, i], lately[:, i], color=colour, lw=1.6)
+    axes.set(xlim=(0, steps[-1]), xlabel=_STEPS)
+    axes.set_title(title, loc="left", fontsize=10, pad=3)
+    axes.grid(visible=True, alpha=0.25)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    if values is history.success:
+        axes.set_ylim(0, 1.02)
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+    if np.isnan(mean).all():
+        axes.text(0.5, 0.5, "not measured yet", transform=axes.transAxes, ha="center")
+    if len(history.names) > 1:
+        _name_colours(figure, axes, history.names)
+    return figure
+
+
+def mix(history: History, size: tuple[float, float] = (8.6, 4.2)) -> Figure:
+    """Draws on which stages the arenas were, stacked, as the mean over seeds; `size` in inches."""
     shares = history.mix.mean(axis=0)
     steps, bands = _stretches(history.arena_steps, shares)
     names = history.names
     colours = colormaps["viridis"](np.linspace(0.0, 1.0, len(names)))
-    figure = Figure(figsize=(8.6, 4.2), layout="constrained")
+    figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots()
     # What an update was trained on holds from the end of the one before.
     axes.stackplot(

@@ -17,14 +17,15 @@ from swarmjax.report.table import TableLine
 GOOD = 0.9  # success from which on a stage is counted as learned
 _TOP = 5  # stages named of a reweighing
 
-_STYLE = """
+STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #1a1a1a; margin: 1.2rem auto;
        max-width: 1500px; padding: 0 1.2rem; }
 h1 { font-size: 1.35rem; margin: 0 0 .6rem; overflow-wrap: anywhere; }
 h2 { font-size: 1.05rem; margin: 1.4rem 0 .4rem; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .1rem 1rem; margin: 0; }
 dt { color: #555; } dd { margin: 0; overflow-wrap: anywhere; }
-.figures { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fit, minmax(480px, 1fr)); }
+.figures { display: grid; gap: 1rem;
+           grid-template-columns: repeat(auto-fit, minmax(min(480px, 100%), 1fr)); }
 .wide { grid-template-columns: 1fr; }
 figure { margin: 1rem 0 0; } img { max-width: 100%; } figcaption { color: #444; }
 .scroll { max-height: 26rem; overflow: auto; border: 1px solid #ddd; }
@@ -60,13 +61,13 @@ def page(title: str, command: str, history: History, figures: Mapping[str, bytes
     """
     name = escape(title)
     layout = "figures" if len(history.names) <= report_rows.MANY else "figures wide"
-    facts = "".join(
-        f"<dt>{escape(what)}</dt><dd>{escape(text)}</dd>\n" for what, text in _facts(history)
+    told = "".join(
+        f"<dt>{escape(what)}</dt><dd>{escape(text)}</dd>\n" for what, text in facts(history)
     )
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f"<title>{name}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n<h1>{name}</h1>\n"
-        f"<dl>\n{facts}<dt>made by</dt><dd><code>{escape(command)}</code></dd>\n</dl>\n"
+        f"<title>{name}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<h1>{name}</h1>\n"
+        f"<dl>\n{told}<dt>made by</dt><dd><code>{escape(command)}</code></dd>\n</dl>\n"
         f'<div class="{layout}">\n{"".join(_figure(*each) for each in figures.items())}</div>\n'
         f"<h2>Decisions of the curriculum</h2>\n{_decisions(history)}"
         f"<h2>Stages</h2>\n{_stages(history)}</body>\n</html>\n"
@@ -86,15 +87,22 @@ def table_page(title: str, command: str, lines: Sequence[TableLine]) -> str:
     """
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f"<title>{escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
+        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
         f"<h1>{escape(title)}</h1>\n{_table(report_table.HEADS, report_table.cells(lines))}"
         f"<p>{escape(report_table.note(lines))} Made by <code>{escape(command)}</code>.</p>\n"
         "</body>\n</html>\n"
     )
 
 
-def _facts(history: History) -> list[tuple[str, str]]:
-    """What the run is and what came of it, a line each."""
+def facts(history: History) -> list[tuple[str, str]]:
+    """Says what the run is and what came of it, a line each.
+
+    Args:
+      history: of the run.
+
+    Returns:
+      What a line is about, and its text.
+    """
     trained, names = history.config, history.names
     options = to_dict(trained.curriculum).items()
     seeds = f"{history.seeds[0]}" + (f" to {history.seeds[-1]}" if len(history.seeds) > 1 else "")

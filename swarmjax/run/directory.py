@@ -14,9 +14,10 @@ import hashlib
 import json
 import os
 import secrets
+import socket
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 from swarmjax.atomic_file import replacing
 from swarmjax.config import ConfigError
@@ -74,7 +75,7 @@ def _lock(run: Path, file: IO[str]) -> None:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         file.seek(0)
-        holder = file.read().strip() or "another process"
+        holder = file.readline().strip() or "another process"
         raise ConfigError(
             f"run.dir is {run}, which {holder} is writing: wait for its end, or give another "
             "directory."
@@ -91,6 +92,52 @@ def _is_same(file: IO[str], path: Path) -> bool:
         return False
 
 
+class Writer(NamedTuple):
+    """The process that wrote a run directory last.
+
+    Attributes:
+      process: its number there.
+      host: its machine; this one where the lock, of an older version, does not say.
+    """
+
+    process: int
+    host: str
+
+    @property
+    def is_here(self) -> bool:
+        """Whether it ran on this machine."""
+        return self.host == socket.gethostname()
+
+
+def writer(run: Path) -> Writer | None:
+    """Reads who holds or held the lock of a run directory, which is left alone; None if unknown."""
+    try:
+        process, *host = (run / LOCK).read_text().splitlines()
+        return Writer(int(process.removeprefix("process ")), (*host, socket.gethostname())[0])
+    except (OSError, ValueError, IndexError):
+        return None
+
+
+def is_writing(found: Writer) -> bool:
+    """Tells whether a process of this machine is still there.
+
+    Where Linux lists locks, it has to hold one: its number may be another's by now. Trying the lock
+    would keep a run out that begins in the same moment.
+    """
+    try:
+        lines = Path("/proc/locks").read_text().splitlines()
+        return any(line.split()[1:5:3] == ["FLOCK", str(found.process)] for line in lines)
+    except OSError:
+        pass
+    try:
+        os.kill(found.process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # of somebody else's
+        return True
+    return True
+
+
 def _make(run: Path) -> list[Path]:
     """Makes a directory; returns what had to be made, the innermost first."""
     missing = [path for path in (run, *run.parents) if not path.exists()]
@@ -105,7 +152,7 @@ def _sign(file: IO[str]) -> None:
     """Writes down who holds the lock, for the sentence that refuses the next one."""
     try:
         file.truncate(0)
-        file.write(f"process {os.getpid()}")
+        file.write(f"process {os.getpid()}\n{socket.gethostname()}\n")
         file.flush()
     except OSError:  # a full disk: the lock holds without a name
         pass

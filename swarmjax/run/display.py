@@ -165,8 +165,8 @@ class Display:
         with working(what, self._console):
             yield
 
-    def hear(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Takes the rows of a call; whoever listens to a run overrides it."""
+    def hear(self, rows: Sequence[Row], speeds: Row) -> None:
+        """Takes the rows and speeds of a call; whoever listens to a run overrides it."""
 
     def show(self, summary: Row, speeds: Row, seconds_left: float) -> None:
         """Shows where the run stands."""

@@ -17,7 +17,7 @@ from swarmjax.curriculum import engine as curriculum
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.policy import PolicyError
 from swarmjax.ppo import optimizer
-from swarmjax.run import checkpoint, directory, hosts, memory, warm_start
+from swarmjax.run import checkpoint, directory, hosts, memory, warm_start, weights_and_biases
 from swarmjax.run.checkpoint import Checkpoints, Kept, Leaves
 from swarmjax.run.display import Display, working
 from swarmjax.run.errors import DivergedError, TrainingError
@@ -279,7 +279,12 @@ def _first_state(
 
 
 def find_run(settings: TrainConfig) -> Path:
-    """Finds a run directory that can be written and holds no other run; writes nothing."""
+    """Finds a run directory that can be written and holds no other run; writes nothing.
+
+    Raises:
+      ConfigError: if there is none, or a library that the run asks for is missing.
+    """
+    weights_and_biases.check(settings)
     every = seeds.numbers(settings)
     seed = f"seed{every[0]}" if len(every) == 1 else f"seeds{every[0]}-{every[-1]}"
     name = f"{datetime.now():%Y%m%d-%H%M%S}-{settings.stage_name}-{seed}"
@@ -338,6 +343,7 @@ def dry_run(settings: TrainConfig, stop: Stop, display: Display) -> int:
       ConfigError: as `carry_out`.
       StoppedError: if somebody asked to stop.
     """
+    weights_and_biases.check(settings)
     with working("building the arenas"):
         warm_start.read(settings)
         program, schedule, _, template = _load(settings)

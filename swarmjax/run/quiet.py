@@ -1,7 +1,7 @@
 """A training run without a terminal, for Python programs that call it."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,7 @@ from swarmjax.config import ConfigError
 from swarmjax.run import compile_cache, execute, memory
 from swarmjax.run.display import Display, Row
 from swarmjax.run.lifecycle import carry_out, find_run
+from swarmjax.run.loggers import Guarded, Logger
 from swarmjax.run.policy_export import POLICY, seed_path
 from swarmjax.run.settings import TrainConfig
 from swarmjax.run.signals import Stop
@@ -18,10 +19,14 @@ class _Listener(Display):
     """Prints nothing, and hands on the rows of each call."""
 
     def __init__(
-        self, updates: int, on_update: Callable[[dict[str, Any]], object], stop: Stop
+        self,
+        updates: int,
+        on_update: Callable[[dict[str, Any]], object],
+        stop: Stop,
+        loggers: Sequence[Guarded],
     ) -> None:
         super().__init__(updates)
-        self._on_update, self._stop = on_update, stop
+        self._on_update, self._stop, self._loggers = on_update, stop, loggers
 
     def say(self, sentence: str) -> None:
         """Prints nothing."""
@@ -31,8 +36,10 @@ class _Listener(Display):
         """Shows nothing."""
         yield
 
-    def hear(self, rows: Sequence[Mapping[str, Any]]) -> None:
+    def hear(self, rows: Sequence[Row], speeds: Row) -> None:
         """Hands each row on, and asks the run to stop where the answer is True."""
+        for logger in self._loggers:
+            logger.write([dict(row) for row in rows], dict(speeds))
         for row in rows:
             if self._on_update(dict(row)) is True:
                 self._stop.signalled = True
@@ -46,6 +53,7 @@ def train(
     on_update: Callable[[dict[str, Any]], object],
     listen: Callable[[Stop], AbstractContextManager[object]],
     *,
+    loggers: Sequence[Logger] = (),
     auto: bool = False,
 ) -> tuple[Path, list[Path]]:
     """Trains as a config says.
@@ -54,6 +62,7 @@ def train(
       settings: the config.
       on_update: is called with each row of `metrics.jsonl`; True stops the run.
       listen: what to be in while it trains, such as `Stop` itself, which notices signals.
+      loggers: are told the rows too, and closed when the run is written.
       auto: whether its number of arenas is still to be chosen.
 
     Returns:
@@ -64,10 +73,11 @@ def train(
     """
     if settings.run.dry:
         raise ConfigError("run.dry is true, which is for the command line: leave it out.")
-    with compile_cache.use(settings.run.compile_cache):
+    with ExitStack() as told, compile_cache.use(settings.run.compile_cache):
+        guarded = [told.enter_context(closing(Guarded(each))) for each in loggers]
         settings = execute.fill(settings)[0] if auto else settings
         with memory.refusal(settings):
             run, stop = find_run(settings), Stop()
-            with listen(stop), _Listener(settings.updates, on_update, stop) as display:
+            with listen(stop), _Listener(settings.updates, on_update, stop, guarded) as display:
                 carry_out(settings, run, stop, display)
     return run, [seed_path(run / POLICY, settings, seed) for seed in settings.numbers]

@@ -70,6 +70,14 @@ class RunConfig(Section):
         metadata=about("updates after which the run saves and stops", 0, MAX_COUNT),
     )
     tensorboard: bool = field(default=True, metadata=about("write TensorBoard events"))
+    wandb: str | None = field(
+        default=None,
+        metadata=about("project of Weights & Biases that is logged to; needs the extra wandb"),
+    )
+    wandb_mode: Literal["offline", "online"] = field(
+        default="offline",
+        metadata=about("offline: into the run directory, for `wandb sync`; online: to W&B"),
+    )
     episodes: bool = field(
         default=False, metadata=about("write episodes.jsonl: each episode, robot by robot")
     )

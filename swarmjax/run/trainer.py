@@ -26,6 +26,7 @@ from swarmjax.run.errors import CheckpointError, DivergedError
 from swarmjax.run.recorder import Recorder
 from swarmjax.run.settings import TrainConfig
 from swarmjax.run.signals import Stop
+from swarmjax.run.weights_and_biases import WandbRuns
 from swarmjax.sim import physics
 from swarmjax.sim.config import physics_substeps
 from swarmjax.training import episodes, loop, mesh, seeds
@@ -383,6 +384,7 @@ def _recorder(run: Path, program: Built, done: int, kept: Kept | None) -> Record
         update=done,
         arena_steps=done * settings.arenas * settings.algo.rollout_length,
         logs=None if kept is None else kept.logs,
+        loggers=[WandbRuns(settings, run)] if settings.run.wandb and hosts.is_first() else [],
     )
 
 
@@ -452,7 +454,7 @@ def _report(
         if "to" in entry:  # the rest is many, and stands in the log
             display.say(_sentence(settings, entry))
     pace = tally.seconds / (tally.update - tally.first)
-    display.hear(rows)
+    display.hear(rows, speeds)
     display.show(summarize(rows, names), speeds, pace * (settings.updates - tally.update))
 
 

@@ -21,6 +21,7 @@ from swarmjax.report.config import ReportConfig
 from swarmjax.reproduce.config import ReproduceConfig
 from swarmjax.run.settings import TrainConfig
 from swarmjax.suite import SuiteConfig
+from swarmjax.watch.config import WatchConfig
 
 STAGE = {"name": "s1", "robots": 1, "side": 1.0}
 CELL = {"name": "c", "stage": STAGE, "levels": 2, "seed": 1_000_000}
@@ -30,6 +31,7 @@ COMMANDS: dict[type[Section], dict[str, Any]] = {
     ReplayConfig: {"policy": "a.npz", "stage": STAGE},
     ExportConfig: {"run": "a"},
     ReportConfig: {"run": "a"},
+    WatchConfig: {"run": "a"},
     ReproduceConfig: {},
     SuiteConfig: {"suite": "dev"},
     SuiteFileConfig: {"name": "mine", "cells": [CELL]},

@@ -20,8 +20,8 @@ from swarmjax.evaluate.suite_config import SUITE_SEED, CellConfig
 from swarmjax.policy import PolicyError
 from swarmjax.replay import __main__ as replay
 from swarmjax.replay import video
-from swarmjax.replay.__main__ import Pick
 from swarmjax.replay.config import ReplayConfig
+from swarmjax.replay.episodes import Pick, worst
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.task.stage_files import load_levels
 
@@ -49,8 +49,8 @@ def test_the_worst_reached_least_then_touched_most_then_took_longest():
         _trial([0.4, 0.2], [1.0, 0.0], [48.0, 48.0]),
     ]
     order = [Pick(1, 1), Pick(0, 2), Pick(0, 1), Pick(1, 0), Pick(0, 3), Pick(0, 0)]
-    assert replay.worst(judged, 6) == order
-    assert replay.worst(judged, 2) == order[:2]
+    assert worst(judged, 6) == order
+    assert worst(judged, 2) == order[:2]
 
 
 def _labels(capsys: pytest.CaptureFixture[str]) -> str:

@@ -3,14 +3,17 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from runs import row, write
+from runs import CONFIG, row, write
 
 from swarmjax import command
+from swarmjax.config import ConfigError
 from swarmjax.report import __main__ as report
 from swarmjax.report.config import ReportConfig
+from swarmjax.run.settings import RunConfig
 
 
 def _run(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
@@ -66,7 +69,7 @@ def test_a_report_of_a_run_that_was_killed_leaves_its_unfinished_line_out(
             ["run=good", "runs=good"],
             "run and runs are given: give run=DIR, or runs=DIR,DIR,... for",
         ),
-        (["run=good", "step=1"], "step is not a key: give one of run, runs, out."),
+        (["run=good", "step=1"], "step is not a key: give one of run, runs, out, send."),
         (["runs=good,gone"], "runs is 'good,gone', and 'gone' is and holds no run."),
         (["runs=g*,none*"], "runs is 'g*,none*', and 'none*' is and holds no run."),
         (["runs=good,good"], "runs is 'good,good', which names good twice: give it once."),
@@ -109,3 +112,22 @@ def test_matplotlib_is_loaded_to_draw_only_and_jax_never(tmp_path: Path) -> None
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_figures_and_pages_are_sent_to_the_loggers_of_the_run(tmp_path: Path) -> None:
+    run = write(tmp_path / "run", [row(0), row(1)])
+    (run / "replay.html").write_text("<p>a replay</p>")
+    report.main([f"run={run}", "send=true"])
+    (events,) = (run / "tensorboard").iterdir()
+    content = events.read_bytes()
+    for name in ("report/mix", "report/success", "page/report", "page/replay"):
+        assert name.encode() in content
+    assert (run / "report" / "mix.png").read_bytes() in content
+
+
+def test_figures_of_a_run_without_loggers_are_not_sent(tmp_path: Path) -> None:
+    trained = replace(CONFIG, run=RunConfig(tensorboard=False))
+    run = write(tmp_path / "run", [row(0)], trained=trained)
+    with pytest.raises(ConfigError, match=r"^send is true, but the run logs to nothing"):
+        report.main([f"run={run}", "send=true"])
+    assert not (run / "report").exists()

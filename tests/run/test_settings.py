@@ -100,7 +100,7 @@ def test_configurations_are_frozen_and_hashable():
 
 
 def test_import_needs_neither_jax_nor_hydra():
-    rooms = ("evaluate", "export", "replay", "report", "reproduce")
+    rooms = ("evaluate", "export", "replay", "report", "reproduce", "watch")
     modules = ", ".join(["swarmjax.run.settings", *(f"swarmjax.{room}.config" for room in rooms)])
     code = f"import sys, {modules}; print({{'jax', 'hydra', 'omegaconf'}} & set(sys.modules))"
     done = subprocess.run(

@@ -1,0 +1,124 @@
+"""TensorBoard's events, by tensorboardX: a folder for each seed of a run."""
+
+import contextlib
+import struct
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from swarmjax.run.directory import Row
+
+FOLDER = "tensorboard"
+BOARDS = 16  # seeds that TensorBoard is written for: a board holds three files open
+
+
+class Boards:
+    """Folders of TensorBoard, by seed; a `Logger`.
+
+    TensorBoardX takes seconds to import where there is PyTorch, which it brings along, so that it
+    is left to the first rows, when the logger's thread has them to spare.
+    """
+
+    name = "TensorBoard"
+
+    def __init__(self, run: Path, seeds: Sequence[int], purge: int | None = None) -> None:
+        """Opens nothing yet; what lies at arena step `purge` and after is to be hidden.
+
+        Of several seeds the first `BOARDS` have a folder each.
+        """
+        folder = run / FOLDER
+        several = len(seeds) > 1
+        self._folders = {k: folder / f"seed{k}" if several else folder for k in seeds[:BOARDS]}
+        self._purge = purge
+        self._open: dict[int, Board] = {}
+
+    def write(self, rows: Sequence[Row], speeds: Row) -> None:
+        """Writes rows, and the speeds to the first board.
+
+        Of N boards each is given every N-th update, so that they cost no more time than one:
+        a row takes it a millisecond, as much as an update of a few arenas.
+        """
+        boards = self._boards()
+        for row in rows:
+            if row["seed"] in boards and row["update"] % len(boards) == 0:
+                boards[row["seed"]].add(row, row["arena_steps"])
+        next(iter(boards.values())).add(speeds, rows[-1]["arena_steps"])
+
+    def attach(self, name: str, path: Path, arena_steps: int) -> None:
+        """Writes a PNG as a picture, and of other files where they are, to the first board."""
+        board = next(iter(self._boards().values()))
+        if path.suffix == ".png":
+            board.add_picture(name, path.read_bytes(), arena_steps)
+        else:
+            board.add_text(name, f"`{path.resolve()}`", arena_steps)
+
+    def close(self) -> None:
+        """Writes what is left."""
+        for board in self._open.values():
+            with contextlib.suppress(OSError):  # which was said when it was lost
+                board.close()
+
+    def _boards(self) -> "dict[int, Board]":
+        if not self._open:
+            self._open = {seed: Board(path, self._purge) for seed, path in self._folders.items()}
+        return self._open
+
+
+class Board:
+    """One folder of TensorBoard.
+
+    TensorBoardX's own `SummaryWriter` has a thread that dies on a full disk and leaves its queue
+    full, so that whoever writes next waits for ever. Its writer of events has none.
+    """
+
+    def __init__(self, folder: Path, purge: int | None) -> None:
+        """Makes the folder and its file; TensorBoard hides what it has from step `purge` on."""
+        from tensorboardX.event_file_writer import EventsWriter
+
+        folder.mkdir(parents=True, exist_ok=True)
+        self._writer = EventsWriter(str(folder / "events"), f".{time.time_ns()}")
+        if purge is not None:
+            event = _event(purge)
+            event.session_log.status = event.session_log.START
+            self._writer.write_event(event)
+
+    def add(self, row: Row, arena_steps: int) -> None:
+        """Writes the numbers of a row."""
+        event = _event(arena_steps)
+        for name, value in row.items():
+            if isinstance(value, int | float):
+                event.summary.value.add(tag=name, simple_value=value)
+        self._writer.write_event(event)
+
+    def add_picture(self, name: str, png: bytes, arena_steps: int) -> None:
+        """Writes a PNG, whose size stands in its first chunk (PNG specification, 11.2.1)."""
+        event = _event(arena_steps)
+        image = event.summary.value.add(tag=name).image
+        image.width, image.height = struct.unpack(">II", png[16:24])
+        image.colorspace, image.encoded_image_string = 4, png  # red, green, blue, alpha
+        self._writer.write_event(event)
+
+    def add_text(self, name: str, text: str, arena_steps: int) -> None:
+        """Writes Markdown for TensorBoard's page of texts."""
+        from tensorboardX.proto import types_pb2
+
+        event = _event(arena_steps)
+        value = event.summary.value.add(tag=name)
+        value.metadata.plugin_data.plugin_name = "text"
+        types: Any = types_pb2
+        value.tensor.dtype = types.DT_STRING
+        value.tensor.string_val.append(text.encode())
+        self._writer.write_event(event)
+
+    def close(self) -> None:
+        """Writes what is left."""
+        self._writer.close()
+
+
+def _event(arena_steps: int) -> Any:
+    """Makes an event of TensorBoard's that holds nothing yet."""
+    from tensorboardX.proto import event_pb2
+
+    made: Any = event_pb2  # whose messages are made when it is imported
+    return made.Event(wall_time=time.time(), step=arena_steps)

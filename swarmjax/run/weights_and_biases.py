@@ -1,0 +1,124 @@
+"""Weights & Biases: a run of theirs for each seed of a run, on their server or in files alone."""
+
+import importlib
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from swarmjax.config import ConfigError, show, to_dict
+from swarmjax.run.directory import Row
+from swarmjax.run.settings import TrainConfig
+from swarmjax.run.tensorboard import BOARDS
+
+EXTRA = "wandb"
+
+
+def check(settings: TrainConfig) -> None:
+    """Refuses a run that asks for W&B where it cannot be used.
+
+    Raises:
+      ConfigError: if the library is missing, or is to send and has no key.
+    """
+    if settings.run.wandb is None:
+        return
+    found = importlib.util.find_spec("wandb")
+    # W&B's own folder of files would be taken for a package without code.
+    if found is None or found.origin is None:
+        raise ConfigError(
+            f"run.wandb is {show(settings.run.wandb)}, but W&B is not installed: install the "
+            f"extra {EXTRA}, as in `uv sync --extra {EXTRA}`, or give run.wandb=null."
+        )
+    if settings.run.wandb_mode == "online":
+        _sign_in()
+
+
+def _sign_in() -> None:
+    try:
+        signed = _wandb().login(verify=False, prompt=False)
+    except Exception:  # of a type of W&B's own
+        signed = False
+    if not signed:
+        raise ConfigError(
+            "run.wandb_mode is online, but W&B has no key: run `wandb login` first, or give "
+            "run.wandb_mode=offline."
+        )
+
+
+class WandbRuns:
+    """Runs of W&B, by seed; a `Logger`.
+
+    Of several seeds the first `BOARDS` have one each, in one group. A run that goes on adds to them
+    on the server; in files alone each process writes others, of the same group. Of the machine
+    W&B is told nothing: neither its name nor its load, source or output.
+    """
+
+    name = "W&B"
+
+    def __init__(self, settings: TrainConfig, run: Path) -> None:
+        """Opens nothing yet: W&B takes seconds."""
+        self._settings, self._run = settings, run
+        self._seeds = settings.numbers[:BOARDS]
+        self._open: dict[int, Any] = {}
+
+    def write(self, rows: Sequence[Row], speeds: Row) -> None:
+        """Writes the numbers of each row, and the speeds of a call with the first seed's last."""
+        mine = [row for row in rows if row["seed"] in self._seeds]
+        last = [row for row in mine if row["seed"] == self._seeds[0]][-1]
+        for row in mine:
+            self._of(row["seed"]).log(_numbers(row | speeds if row is last else row))
+
+    def attach(self, name: str, path: Path, arena_steps: int) -> None:
+        """Writes a PNG as a picture and a page as a page, with the first seed."""
+        wandb = _wandb()
+        made = wandb.Image(str(path)) if path.suffix == ".png" else wandb.Html(path.read_text())
+        self._of(self._seeds[0]).log({name: made, "arena_steps": arena_steps})
+
+    def close(self) -> None:
+        """Waits until everything is written, and sent."""
+        for each in self._open.values():
+            each.finish()
+
+    def _of(self, seed: int) -> Any:
+        """Returns the run of a seed, which is started if it is not there."""
+        if seed not in self._open:
+            self._open[seed] = self._start(seed)
+        return self._open[seed]
+
+    def _start(self, seed: int) -> Any:
+        """Starts or goes on with the run of a seed."""
+        wandb = _wandb()
+        asked, online = self._settings.run, self._settings.run.wandb_mode == "online"
+        run = wandb.init(
+            project=asked.wandb,
+            dir=str(self._run),
+            mode=asked.wandb_mode,
+            group=asked.id,
+            name=f"{self._run.name}-seed{seed}",
+            id=f"{asked.id}-seed{seed}" if online else None,
+            resume="allow" if online else None,
+            config=to_dict(self._settings),
+            reinit="create_new",
+            settings=wandb.Settings(
+                silent=True,
+                console="off",
+                disable_git=True,
+                disable_code=True,
+                host="",
+                x_disable_meta=True,
+                x_save_requirements=False,
+                x_disable_stats=True,
+            ),
+        )
+        run.define_metric("*", step_metric="arena_steps")
+        return run
+
+
+def _wandb() -> Any:
+    """Imports the library, which is an extra and takes seconds."""
+    return importlib.import_module("wandb")
+
+
+def _numbers(row: Row) -> Row:
+    """Takes what is a number, as TensorBoard does."""
+    return {name: value for name, value in row.items() if isinstance(value, int | float)}

@@ -1,0 +1,117 @@
+"""What the newest policy of a run does: a replay of one level, in MuJoCo's C engine.
+
+The weights are those of the newest sound checkpoint. Nothing of the run is executed: a policy that
+needs pieces of somebody's is shown only with the file that whoever watches names.
+"""
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from rich.progress import Progress
+
+from swarmjax import command, policy_file, words
+from swarmjax.config import ConfigError, to_dict
+from swarmjax.evaluate import witness
+from swarmjax.evaluate.trials import Entrant
+from swarmjax.replay import page as replay_page
+from swarmjax.replay.config import ReplayConfig
+from swarmjax.replay.episodes import replay
+from swarmjax.report import rows
+from swarmjax.report.rows import History
+from swarmjax.run.hosts import CHECKPOINTS
+from swarmjax.run.settings import TrainConfig, settle
+from swarmjax.task.stage_config import StageConfig
+from swarmjax.watch.config import WatchConfig
+
+
+class Newest(NamedTuple):
+    """A replay of a run's newest policy.
+
+    Attributes:
+        update: updates that the policy was trained for.
+        sentence: what is seen.
+        page: of HTML.
+    """
+
+    update: int
+    sentence: str
+    page: str
+
+
+def newest_update(run: Path) -> int | None:
+    """Finds the update of the newest checkpoint, sound or not; None if there is none."""
+    try:
+        names = [path.name for path in (run / CHECKPOINTS).iterdir() if path.is_dir()]
+    except OSError:
+        return None
+    return max((int(name) for name in names if name.isdecimal()), default=None)
+
+
+def record(settings: WatchConfig, history: History | None) -> Newest:
+    """Replays a level by the newest policy.
+
+    Args:
+        settings: of the page.
+        history: what the run has written down; None before the first update.
+
+    Raises:
+        ConfigError: if the policy cannot be replayed as the settings say.
+        CheckpointError: if no checkpoint is sound.
+        PolicyError: if the policy is unsound.
+    """
+    from swarmjax.run import checkpoint  # which takes JAX, for seconds
+    from swarmjax.run.policy_export import write_policy
+
+    run = Path(settings.run)
+    trained = _settled(settings, rows.read_config(run))
+    seed, stage = _seed(settings, trained), _stage(trained, history)
+    leaves, update, _ = checkpoint.restore(run)
+    name = f"update-{update}.npz"
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / name
+        write_policy(file, leaves, trained, update, seed)
+        entrant = Entrant(name, policy_file.read(file, settings.extensions))
+    asked = [f"level={settings.level}", f"steps={trained.task.step_limit}"]
+    shown, _ = witness.load(ReplayConfig, asked, [entrant], to_dict(stage))
+    shown = replace(shown, extensions=settings.extensions)
+    episodes = replay(shown, [entrant], Progress(disable=True))
+    made_by = command.line("watch", f"run={run}")
+    page = replay_page.page(shown, [entrant.policy], episodes, made_by)
+    several = f" of seed {seed}" if trained.seeds > 1 else ""
+    sentence = (
+        f"Level {settings.level} of stage {stage.name}, by the policy{several} after "
+        f"{words.count(update, 'update')}."
+    )
+    return Newest(update, sentence, page)
+
+
+def _settled(settings: WatchConfig, trained: TrainConfig) -> TrainConfig:
+    """Puts the file that is named in the place of the one that the run names."""
+    if trained.extensions is not None and settings.extensions is None:
+        raise ConfigError(
+            "the run has pieces of somebody's, which are code: to see its policy, give "
+            "extensions=FILE, a file that you trust."
+        )
+    return settle(replace(trained, extensions=settings.extensions))
+
+
+def _seed(settings: WatchConfig, trained: TrainConfig) -> int:
+    every = trained.numbers
+    if settings.seed is None:
+        return every[0]
+    if settings.seed not in every:
+        raise ConfigError(
+            f"seed is {settings.seed}, but {settings.run} was trained with {every[0]} to "
+            f"{every[-1]}: give one of them."
+        )
+    return settings.seed
+
+
+def _stage(trained: TrainConfig, history: History | None) -> StageConfig:
+    """Chooses the stage that most arenas are on."""
+    if history is None:
+        return trained.stage[0]
+    return trained.stage[int(np.argmax(history.mix[:, -1].mean(axis=0)))]

@@ -1,0 +1,167 @@
+"""Keeps what a page shows as new as it should be, in threads, while somebody looks at it."""
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from swarmjax.config import ConfigError
+from swarmjax.policy import PolicyError
+from swarmjax.report import page as report_page
+from swarmjax.report import rows
+from swarmjax.report.rows import History
+from swarmjax.run.directory import METRICS
+from swarmjax.run.errors import CheckpointError
+from swarmjax.watch import newest
+from swarmjax.watch.config import WatchConfig
+from swarmjax.watch.newest import Newest
+from swarmjax.watch.standing import stand
+
+LOOKED_AT_S = 15.0  # since the page last asked, for which it counts as looked at
+PAUSE_S = 0.5  # between two looks at the directory
+# Drawing takes at most this share of a core, so that a run which shares it is hardly slower.
+SHARE = 0.2
+
+NAMES = {
+    "targets": "Success of each stage, its newest verdict, over arena control steps",
+    "contacts": "Contacts per robot of each stage, its newest verdict, over arena control steps",
+    "return": "Return per robot of each stage, its newest verdict, over arena control steps",
+    "mix": "On which stages the arenas were, over arena control steps",
+}
+
+
+class DrawnFigures(NamedTuple):
+    """Figures of a run.
+
+    Attributes:
+        version: rises with each drawing.
+        history: that they show; None before the first update.
+        figures: PNG files by the names in `NAMES`.
+        trouble: why there are no newer ones; empty if there are.
+    """
+
+    version: int = 0
+    history: History | None = None
+    figures: Mapping[str, bytes] = {}
+    trouble: str = ""
+
+
+class Replayed(NamedTuple):
+    """A replay.
+
+    Attributes:
+        version: rises with each.
+        newest: what is shown; None before there is one.
+        trouble: why there is no newer one; empty if there is.
+    """
+
+    version: int = 0
+    newest: Newest | None = None
+    trouble: str = ""
+
+
+class Views:
+    """What is shown of a run; threads renew it."""
+
+    def __init__(self, settings: WatchConfig) -> None:
+        """Reads the run's config.
+
+        Raises:
+            ConfigError: if there is none that is sound.
+        """
+        self.settings, self.run = settings, Path(settings.run)
+        self.trained = rows.read_config(self.run)
+        self.drawn, self.replayed = DrawnFigures(), Replayed()
+        self._asked = -LOOKED_AT_S
+        self._seen: tuple[int, float] | None = None
+        self._tried: int | None = None
+
+    def follow(self) -> None:
+        """Begins to renew what is shown, whenever somebody looks."""
+        for renew in (self.draw, self.replay):
+            threading.Thread(target=self._keep, args=(renew,), daemon=True).start()
+
+    def state(self) -> dict[str, Any]:
+        """Says what the page shows now, as plain data; whoever asks looks at it."""
+        self._asked = time.monotonic()
+        drawn, replayed = self.drawn, self.replayed
+        standing = stand(self.run, self.trained)
+        return {
+            "state": standing.state,
+            "sentence": standing.sentence,
+            "facts": [] if drawn.history is None else report_page.facts(drawn.history),
+            "figures": {"version": drawn.version, "names": list(drawn.figures)},
+            "trouble": drawn.trouble,
+            "replay": {
+                "version": replayed.version,
+                "sentence": "" if replayed.newest is None else replayed.newest.sentence,
+                "trouble": replayed.trouble,
+            },
+        }
+
+    def draw(self) -> float:
+        """Draws the figures anew, if the run has written more; returns how long to rest then, s."""
+        found = _version(self.run / METRICS)
+        if found is None or found == self._seen:
+            return 0.0
+        began = time.perf_counter()
+        try:
+            self.trained = rows.read_config(self.run)
+            history = rows.read(self.run)
+            self.drawn = DrawnFigures(self.drawn.version + 1, history, figures(history))
+        except (ConfigError, OSError) as error:  # such as of a run that is removed meanwhile
+            self.drawn = self.drawn._replace(trouble=str(error))
+        self._seen = found
+        return (time.perf_counter() - began) * (1.0 - SHARE) / SHARE
+
+    def replay(self) -> float:
+        """Replays a policy that was not tried yet; returns how long to rest then, s."""
+        update = newest.newest_update(self.run)
+        if self.drawn.history is None and not self.drawn.trouble:  # which says on what stage it is
+            return 0.0
+        if update is None or update == self._tried:
+            return 0.0
+        self._tried = update
+        try:
+            found = newest.record(self.settings, self.drawn.history)
+            self.replayed = Replayed(self.replayed.version + 1, found)
+        except (ConfigError, CheckpointError, PolicyError, OSError) as error:
+            self.replayed = self.replayed._replace(trouble=str(error))
+        return self.settings.seconds
+
+    def _keep(self, renew: Callable[[], float]) -> None:
+        """Renews while somebody looks, for ever."""
+        while True:
+            rest = 0.0
+            if time.monotonic() - self._asked < LOOKED_AT_S:
+                try:
+                    rest = renew()
+                except Exception as error:  # nobody foresaw it, and the page goes on
+                    sys.stderr.write(f"swarmjax.watch: {type(error).__name__}: {error}\n")
+                    rest = LOOKED_AT_S
+            time.sleep(PAUSE_S + rest)
+
+
+def _version(path: Path) -> tuple[int, float] | None:
+    """Tells one state of a file from another; None if it is missing or empty."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return (found.st_size, found.st_mtime) if found.st_size else None
+
+
+def figures(history: History) -> dict[str, bytes]:
+    """Draws the figures of a run.
+
+    Returns:
+        PNG files by the names in `NAMES`; those alone that say something.
+    """
+    from swarmjax.report import figures as report_figures  # Matplotlib takes a second
+
+    made = report_figures.by_stage(history)
+    if len(history.names) > 1:
+        made["mix"] = report_figures.mix(history, report_figures.SMALL)
+    return {name: report_figures.png(figure) for name, figure in made.items()}

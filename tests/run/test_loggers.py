@@ -1,0 +1,253 @@
+"""What loggers are told: the figures of `metrics.jsonl`, whatever becomes of the loggers."""
+
+import contextlib
+import importlib.util
+import io
+import json
+import struct
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tensorboardX.proto import event_pb2
+
+import swarmjax
+from swarmjax import train
+from swarmjax.config import ConfigError
+from swarmjax.run import loggers
+from swarmjax.run.loggers import Calls, Guarded
+from swarmjax.run.tensorboard import Boards
+from swarmjax.task.stage_config import StageConfig
+
+TINY = {
+    "stage": [StageConfig(name="pair", robots=2, side=0.5)],
+    "sim.impl": "jax",
+    "arenas": 16,
+    "algo": {"rollout_length": 4, "num_minibatches": 2, "epochs": 1, "hidden_sizes": [8]},
+    "task.step_limit": 8,
+    "budget": 16 * 4 * 6,
+    "run.chunk": 2,
+}
+HAS_WANDB = getattr(importlib.util.find_spec("wandb"), "origin", None) is not None
+
+
+class Listening:
+    """A logger that keeps what it is told, and in which thread."""
+
+    name = "Listening"
+
+    def __init__(self) -> None:
+        self.told: list[tuple[str, Any, int]] = []
+
+    def _keep(self, what: str, found: Any) -> None:
+        self.told.append((what, found, threading.get_ident()))
+
+    def write(self, rows: Any, speeds: Any) -> None:
+        self._keep("write", (rows, speeds))
+
+    def attach(self, name: str, path: Path, arena_steps: int) -> None:
+        self._keep("attach", (name, path, arena_steps))
+
+    def close(self) -> None:
+        self._keep("close", None)
+
+
+class Told:
+    """A run with every logger, and what each was told."""
+
+    def __init__(self, run: Path) -> None:
+        self.called: list[dict] = []
+        self.until: list[int] = []
+        self.listening = Listening()
+        more = {"run.wandb": "swarms"} if HAS_WANDB else {}
+        with contextlib.redirect_stderr(io.StringIO()) as said:
+            swarmjax.train_policy(
+                TINY | more | {"run.dir": run},
+                log=[self.called.append, self._raise, self.listening],
+            )
+        self.said = said.getvalue()
+        self.run = run
+        self.rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+
+    def _raise(self, row: dict) -> None:
+        self.until.append(row["update"])
+        if row["update"] == 2:
+            raise SystemExit("enough")
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> Told:
+    return Told(tmp_path_factory.mktemp("told") / "run")
+
+
+def _numbers(row: dict) -> dict[str, float]:
+    return {name: value for name, value in row.items() if isinstance(value, int | float)}
+
+
+def _events(file: Path) -> Iterator[Any]:
+    """Reads a file of TFRecords: a length, its checksum, the bytes and their checksum, each."""
+    content, at, made = file.read_bytes(), 0, event_pb2
+    while at < len(content):
+        (length,) = struct.unpack_from("<Q", content, at)
+        yield vars(made)["Event"].FromString(content[at + 12 : at + 12 + length])
+        at += 16 + length
+
+
+def _scalars(folder: Path) -> list[tuple[int, dict[str, float]]]:
+    """The numbers of each event of a folder of TensorBoard, by its step."""
+    (file,) = folder.iterdir()
+    return [
+        (event.step, {each.tag: each.simple_value for each in event.summary.value})
+        for event in _events(file)
+        if event.summary.value
+    ]
+
+
+def test_a_function_is_told_the_rows_of_the_record(told: Told) -> None:
+    assert [row["update"] for row in told.rows] == [0, 1, 2, 3, 4, 5]
+    assert told.called == told.rows
+
+
+def test_tensorboard_has_the_numbers_of_the_record(told: Told) -> None:
+    found = [each for each in _scalars(told.run / "tensorboard") if "update" in each[1]]
+    expected = [
+        # TensorBoard keeps numbers of 32 bits.
+        (row["arena_steps"], {k: float(np.float32(v)) for k, v in _numbers(row).items()})
+        for row in told.rows
+    ]
+    assert found == expected
+
+
+def test_speeds_are_told_with_the_rows_of_their_call(told: Told) -> None:
+    calls = [found for what, found, _ in told.listening.told if what == "write"]
+    assert [row for rows, _ in calls for row in rows] == told.rows
+    assert all(speeds["arena_steps_per_s"] > 0 for _, speeds in calls)
+
+
+def test_a_logger_is_called_from_one_thread_that_is_not_the_runs(told: Told) -> None:
+    threads = {thread for _, _, thread in told.listening.told}
+    assert len(threads) == 1
+    assert threads != {threading.get_ident()}
+
+
+def test_a_logger_is_closed_once_and_last(told: Told) -> None:
+    whats = [what for what, _, _ in told.listening.told]
+    assert whats[-1] == "close"
+    assert whats.count("close") == 1
+
+
+@pytest.mark.skipif(not HAS_WANDB, reason="needs the extra wandb")
+def test_wandb_offline_has_the_numbers_of_the_record(told: Told) -> None:
+    (file,) = told.run.glob("wandb/offline-run-*/run-*.wandb")
+    found = [
+        {name: value for name, value in row.items() if name in told.rows[0]}
+        for row in _histories(file)
+    ]
+    assert found == [_numbers(row) for row in told.rows]
+
+
+def _histories(file: Path) -> Iterator[dict]:
+    """Reads the rows of an offline run of W&B: a log of LevelDB with a header of 7 bytes."""
+    from wandb.proto import wandb_internal_pb2 as made  # pyright: ignore[reportMissingImports]
+
+    content, at, part, block = file.read_bytes(), 7, b"", 2**15
+    while at + 7 <= len(content):
+        if block - at % block < 7:
+            at += block - at % block
+            continue
+        length, kind = struct.unpack_from("<HB", content, at + 4)
+        part += content[at + 7 : at + 7 + length]
+        at += 7 + length
+        if kind in (1, 4):  # whole, or the last of several
+            record, part = made.Record.FromString(part), b""
+            if record.WhichOneof("record_type") == "history":
+                items = record.history.item
+                yield {i.key or "/".join(i.nested_key): json.loads(i.value_json) for i in items}
+
+
+def test_a_function_that_raises_loses_itself_and_not_the_run(told: Told) -> None:
+    assert told.until == [0, 1, 2]
+    assert told.said == "swarmjax: log is not written from here on: SystemExit: enough.\n"
+
+
+def test_a_run_that_goes_on_tells_what_comes_after_its_checkpoint(told: Told) -> None:
+    rows: list[dict] = []
+    more = {"budget": 16 * 4 * 8, "run.tensorboard": False, "run.wandb": None}
+    swarmjax.train_policy({"resume": told.run} | more, log=rows.append)
+    assert [row["update"] for row in rows] == [6, 7]
+
+
+def test_a_function_may_change_its_row() -> None:
+    row = {"update": 0, "mix": [1, 2]}
+    Calls(lambda mine: mine["mix"].clear()).write([row], {})
+    assert row == {"update": 0, "mix": [1, 2]}
+
+
+def test_a_logger_that_hangs_is_left_behind(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(loggers, "PATIENCE_S", 0.05)
+    for_ever = threading.Event()
+    guarded = Guarded(Calls(lambda row: for_ever.wait()))
+    for update in range(2 * loggers.MOST_PENDING):
+        guarded.write([{"update": update}], {})
+    guarded.close()
+    for_ever.set()
+    assert capsys.readouterr().err == (
+        "swarmjax: log is not written from here on: it has been 100 calls behind for 0.05 s.\n"
+    )
+
+
+def test_a_logger_that_does_not_end_is_left_behind(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(loggers, "PATIENCE_S", 0.05)
+    for_ever = threading.Event()
+    guarded = Guarded(Calls(lambda row: for_ever.wait()))
+    guarded.write([{"update": 0}], {})
+    guarded.close()
+    for_ever.set()
+    assert "log is not written from here on: it has not taken" in capsys.readouterr().err
+
+
+def test_tensorboard_takes_figures_and_the_places_of_pages(tmp_path: Path) -> None:
+    picture, page = tmp_path / "mix.png", tmp_path / "replay.html"
+    picture.write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">II", 640, 480))
+    page.write_text("<p>a replay</p>")
+    boards = Boards(tmp_path, [0])
+    boards.attach("mix", picture, 128)
+    boards.attach("replay", page, 128)
+    boards.close()
+    (file,) = (tmp_path / "tensorboard").iterdir()
+    first, second = (event for event in _events(file) if event.summary.value)
+    image = first.summary.value[0].image
+    assert (first.step, image.width, image.height) == (128, 640, 480)
+    assert image.encoded_image_string == picture.read_bytes()
+    assert second.summary.value[0].tensor.string_val == [f"`{page}`".encode()]
+
+
+@pytest.mark.parametrize("given", [3, "metrics.jsonl", [print, None]])
+def test_what_is_no_logger_is_refused(given: Any) -> None:
+    with pytest.raises(swarmjax.SwarmjaxError, match=r"^log is .*: give a function of a row, "):
+        swarmjax.train_policy(TINY, log=given)
+
+
+@pytest.mark.parametrize("folder", [False, True])
+def test_wandb_that_is_missing_is_refused_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: bool
+) -> None:
+    # The folder that W&B writes would be a package without code.
+    spec = importlib.util.spec_from_loader("wandb", None) if folder else None
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: spec)
+    words = [
+        "stage=s1",
+        f"run.dir={tmp_path / 'run'}",
+        "run.wandb=swarms",
+        "run.compile_cache=null",
+    ]
+    with pytest.raises(ConfigError, match=r"^run\.wandb is 'swarms', .*install the extra wandb"):
+        train.main(words)
+    assert not any(tmp_path.iterdir())

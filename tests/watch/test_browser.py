@@ -1,0 +1,107 @@
+"""The page of a run in a browser: Chromium without a window, from the loopback alone."""
+
+import json
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import chromium
+import pytest
+from runs import CONFIG, row, write
+
+from swarmjax.run import lifecycle
+from swarmjax.run.checkpoint import Checkpoints
+from swarmjax.run.settings import RunConfig
+from swarmjax.watch.config import WatchConfig
+from swarmjax.watch.server import Server
+from swarmjax.watch.view import Views
+
+pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+from selenium.webdriver.support.ui import WebDriverWait
+
+HOSTILE = "<img src=x onerror=document.title='in'>"
+TRAINED = replace(CONFIG, seeds=2, run=RunConfig(id="0123456789abcdef"))
+
+
+@pytest.fixture(scope="module")
+def views(tmp_path_factory: pytest.TempPathFactory) -> Views:
+    """What is shown of a run of two seeds that was killed, whose directory has an evil name."""
+    rows = [row(update, seed) for update in range(TRAINED.updates - 1) for seed in (0, 1)]
+    run = write(tmp_path_factory.mktemp("runs") / HOSTILE, rows, trained=TRAINED)
+    _, _, state = lifecycle.begin(TRAINED)
+    with Checkpoints(run, keep=1) as checkpoints:
+        checkpoints.save(state, 0)
+    made = Views(WatchConfig(run=str(run), seed=1, level=3))
+    made.draw()
+    made.replay()
+    return made
+
+
+@pytest.fixture(scope="module")
+def server(views: Views) -> Iterator[Server]:
+    with Server(0, views) as made:
+        threading.Thread(target=made.serve_forever, daemon=True).start()
+        yield made
+        made.shutdown()
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    yield from chromium.browsers(tmp_path_factory.mktemp("profile"))
+
+
+def test_the_newest_policy_of_a_seed_is_replayed(views: Views) -> None:
+    assert views.replayed.trouble == ""
+    newest = views.replayed.newest
+    assert newest is not None
+    assert newest.update == 0
+    assert newest.sentence == ("Level 3 of stage pair, by the policy of seed 1 after 0 updates.")
+
+
+def test_a_policy_is_replayed_once(views: Views) -> None:
+    before = views.replayed
+    assert views.replay() == 0.0
+    assert views.replayed is before
+
+
+@chromium.needed
+def test_the_page_follows_a_run_and_asks_nobody_else(browser: Any, server: Server) -> None:
+    browser.get("about:blank")  # the browser's own first page asks for much
+    for log in ("performance", "browser"):
+        browser.get_log(log)  # reading empties it
+    browser.get(server.url)
+    wait = WebDriverWait(browser, 60)
+    drawn = "return document.querySelectorAll('figure:not([hidden])').length"
+    wait.until(lambda _: browser.execute_script(drawn) == 4)
+    standing = browser.find_element("id", "standing")
+    assert standing.text.startswith("It was killed, or broke, after 19 of 20 updates; ")
+    assert "seeds\n0 to 1" in browser.find_element("id", "facts").text
+    assert "by the policy of seed 1" in browser.find_element("id", "seen").text
+    browser.switch_to.frame("replay")
+    wait.until(lambda _: browser.execute_script("return !!window.replay?.ready"))
+    browser.switch_to.default_content()
+    # The name of the run is text.
+    assert browser.title == f"Watching {server.views.run}"
+    assert browser.find_element("css selector", "h1").text.endswith(HOSTILE)
+    seen = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
+    asked = {
+        each["params"]["request"]["url"]
+        for each in seen
+        if each["method"] == "Network.requestWillBeSent"
+    }
+    paths = {url.removeprefix(server.url) for url in asked if url.startswith(server.url)}
+    assert len(paths) == len(asked - {"data:,"})  # the icon is empty, and inside the page
+    assert {"", "state.json", "figures/targets.png?1", "replay.html?1"} <= paths
+    assert browser.get_log("browser") == []  # no errors, and nothing that the page forbids itself
+
+
+@chromium.needed
+def test_it_says_when_its_server_is_gone(browser: Any, views: Views) -> None:
+    with Server(0, views) as gone:
+        thread = threading.Thread(target=gone.serve_forever, daemon=True)
+        thread.start()
+        browser.get(gone.url)
+        gone.shutdown()
+    trouble = browser.find_element("id", "trouble")
+    WebDriverWait(browser, 60).until(lambda _: "has ended" in trouble.text)

@@ -1,0 +1,324 @@
+"""What the server of a run's page answers, and what it says of a run."""
+
+import http.client
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from runs import CONFIG, row, write
+
+from swarmjax import command
+from swarmjax.config import ConfigError
+from swarmjax.run import directory
+from swarmjax.run.directory import Writer
+from swarmjax.watch import __main__ as watch
+from swarmjax.watch import newest, standing
+from swarmjax.watch.config import WatchConfig
+from swarmjax.watch.server import Server
+from swarmjax.watch.standing import stand
+from swarmjax.watch.view import Views
+
+UPDATES = CONFIG.updates
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("runs") / "a <b>", [row(0), row(1)])
+
+
+@pytest.fixture(scope="module")
+def server(run: Path) -> Iterator[Server]:
+    """A server whose figures are drawn, and that renews nothing."""
+    views = Views(WatchConfig(run=str(run)))
+    views.draw()
+    with Server(0, views) as made:
+        threading.Thread(target=made.serve_forever, daemon=True).start()
+        yield made
+        made.shutdown()
+
+
+def _ask(
+    server: Server, path: str, method: str = "GET", host: str | None = None
+) -> tuple[int, dict[str, str], bytes]:
+    """Asks, with any words as path and host."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=30)
+    connection.putrequest(method, path, skip_host=True)
+    if host != "":
+        connection.putheader("Host", host or f"127.0.0.1:{server.server_port}")
+    connection.endheaders()
+    answer = connection.getresponse()
+    found = answer.status, dict(answer.getheaders()), answer.read()
+    connection.close()
+    return found
+
+
+def test_it_listens_on_the_loopback_alone(server: Server) -> None:
+    assert server.server_address[0] == "127.0.0.1"
+
+
+@pytest.mark.parametrize(
+    ("path", "kind"),
+    [
+        ("/", "text/html; charset=utf-8"),
+        ("/?a=b", "text/html; charset=utf-8"),
+        ("/state.json", "application/json"),
+        ("/figures/targets.png", "image/png"),
+        ("/figures/mix.png?2", "image/png"),
+    ],
+)
+def test_what_there_is_is_answered_and_not_kept(server: Server, path: str, kind: str) -> None:
+    status, headers, content = _ask(server, path)
+    assert (status, headers["Content-Type"]) == (200, kind)
+    assert headers["Cache-Control"] == "no-store"
+    assert headers["X-Content-Type-Options"] == "nosniff"
+    assert headers["Content-Security-Policy"] == "frame-ancestors 'none'"
+    assert content
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/config.json",
+        "/../config.json",
+        "/figures/../config.json",
+        "/figures/..%2fconfig.json",
+        "/%2e%2e/config.json",
+        "//etc/passwd",
+        "/figures/../../../../etc/passwd.png",
+        "/figures/curves.png",  # which these rows do not make
+        "/replay.html",  # not yet
+        "http://127.0.0.1/",
+        "*",
+    ],
+)
+def test_no_path_leads_elsewhere(server: Server, path: str) -> None:
+    status, _, content = _ask(server, path)
+    assert (status, content) == (404, b"There is no such page.\n")
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:{port}", "127.0.0.1", "127.0.0.1:1", "", "[::1]:{port}"]
+)
+@pytest.mark.parametrize("method", ["GET", "POST"])
+def test_a_request_that_was_meant_for_another_host_is_refused(
+    server: Server, host: str, method: str
+) -> None:
+    host = host.format(port=server.server_port)
+    assert _ask(server, "/state.json", method, host)[0] == 421
+
+
+def test_localhost_is_this_machine(server: Server) -> None:
+    assert _ask(server, "/", host=f"localhost:{server.server_port}")[0] == 200
+
+
+@pytest.mark.parametrize("method", ["HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE"])
+def test_it_is_read_and_nothing_else(server: Server, method: str) -> None:
+    status, headers, _ = _ask(server, "/", method)
+    assert (status, headers["Allow"]) == (405, "GET")
+
+
+def test_the_name_of_a_run_is_text(server: Server) -> None:
+    content = _ask(server, "/")[2].decode()
+    assert "a &lt;b&gt;" in content
+    assert "a <b>" not in content
+
+
+def test_a_line_that_is_half_written_is_left_out(tmp_path: Path) -> None:
+    run = write(tmp_path / "run", [row(0), row(1)])
+    with (run / "metrics.jsonl").open("a") as file:
+        file.write(json.dumps(row(2))[:40])
+    views = Views(WatchConfig(run=str(run)))
+    views.draw()
+    assert views.drawn.history is not None
+    assert views.drawn.history.updates.tolist() == [0, 1]
+    assert views.state()["trouble"] == ""
+    assert standing.progress(run, 1) == (2, 60.0)
+
+
+def test_updates_count_when_every_seed_has_written_them(tmp_path: Path) -> None:
+    rows = [row(0, 0), row(0, 1), row(1, 0)]
+    assert standing.progress(write(tmp_path / "run", rows), 2).done == 1
+
+
+def test_a_damaged_line_is_told_and_what_was_drawn_stays(tmp_path: Path) -> None:
+    run = write(tmp_path / "run", [row(0)])
+    views = Views(WatchConfig(run=str(run)))
+    views.draw()
+    with (run / "metrics.jsonl").open("a") as file:
+        file.write("{}\n")
+    views.draw()
+    state = views.state()
+    assert "in line 2" in state["trouble"]
+    assert "targets" in state["figures"]["names"]
+
+
+def test_figures_are_drawn_anew_when_there_is_more_alone(tmp_path: Path) -> None:
+    run = write(tmp_path / "run", [row(0)])
+    views = Views(WatchConfig(run=str(run)))
+    views.draw()
+    views.draw()
+    assert views.drawn.version == 1
+    write(run, [row(0), row(1)])
+    views.draw()
+    assert views.drawn.version == 2
+
+
+# How a run stands
+
+
+def _state(run: Path) -> tuple[str, str]:
+    return stand(run, CONFIG)
+
+
+def test_a_run_whose_lock_is_held_trains(tmp_path: Path) -> None:
+    run = write(tmp_path / "run", [row(0), row(1)])
+    with directory.locked(run):
+        state, sentence = _state(run)
+    assert state == "trains"
+    # 60 s of training for 2 updates, and 18 are left.
+    assert "It trains: 2 of 20 updates done, about 9 min 00 s left; the newest" in sentence
+
+
+def test_a_run_that_trains_and_has_written_nothing_says_so(tmp_path: Path) -> None:
+    run = write(tmp_path / "run", [])
+    with directory.locked(run):
+        assert _state(run)[1] == "It trains: 0 of 20 updates done; no update is written yet."
+
+
+def test_a_run_whose_process_was_killed_says_so(tmp_path: Path) -> None:
+    run = write(tmp_path / "run", [row(0)])
+    code = "import pathlib, sys, time\nfrom swarmjax.run import directory\n"
+    code += (
+        "with directory.locked(pathlib.Path(sys.argv[1])):\n print(flush=True)\n time.sleep(600)"
+    )
+    words = [sys.executable, "-c", code, str(run)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE) as holder:
+        assert holder.stdout is not None
+        holder.stdout.readline()
+        assert _state(run)[0] == "trains"
+        holder.kill()
+    state, sentence = _state(run)
+    assert state == "killed"
+    assert sentence.startswith("It was killed, or broke, after 1 of 20 updates; the newest was")
+    assert sentence.endswith(f"Go on with: python -m swarmjax.train resume={run}")
+
+
+def test_the_number_of_a_dead_process_that_another_has_by_now_is_not_it(tmp_path: Path) -> None:
+    run = write(tmp_path / "run", [row(0)])
+    with directory.locked(run):
+        pass
+    (run / ".lock").write_text(f"process {os.getpid()}\n")  # which holds no lock
+    assert _state(run)[0] == "killed"
+
+
+def test_a_run_that_saved_before_it_stopped_was_stopped(tmp_path: Path) -> None:
+    run = write(tmp_path / "run", [row(0)])
+    (run / "summary.json").write_text('{"updates": 1}')
+    assert _state(run)[0] == "stopped"
+
+
+def test_a_run_whose_summary_is_of_an_earlier_stop_was_killed(tmp_path: Path) -> None:
+    run = write(tmp_path / "run", [row(0), row(1)])
+    (run / "summary.json").write_text('{"updates": 1}')
+    assert _state(run)[0] == "killed"
+
+
+def test_a_run_that_was_removed_is_gone(tmp_path: Path) -> None:
+    assert _state(tmp_path / "run") == ("silent", f"{tmp_path / 'run'} is gone.")
+
+
+def test_a_run_whose_budget_is_spent_has_ended(tmp_path: Path) -> None:
+    run = write(tmp_path / "run", [row(update) for update in range(UPDATES)])
+    assert _state(run) == ("ended", "It has ended: all 20 updates are done.")
+
+
+@pytest.mark.parametrize(("age", "state"), [(0, "elsewhere"), (1000, "silent")])
+def test_a_run_on_another_machine_is_judged_by_what_it_writes(
+    tmp_path: Path, age: int, state: str
+) -> None:
+    run = write(tmp_path / "run", [row(0)])
+    (run / ".lock").write_text("process 1\nnode7\n")
+    then = (run / "metrics.jsonl").stat().st_mtime - age
+    os.utime(run / "metrics.jsonl", (then, then))
+    found, sentence = _state(run)
+    assert found == state
+    assert "1 of 20 updates done on node7" in sentence
+
+
+def test_a_lock_of_an_older_version_is_of_this_machine(tmp_path: Path) -> None:
+    (tmp_path / ".lock").write_text("process 7")
+    found = directory.writer(tmp_path)
+    assert found is not None
+    assert found.process == 7
+    assert found.is_here
+    assert directory.writer(tmp_path / "none") is None
+
+
+def test_without_a_list_of_locks_a_process_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(path: Path) -> str:
+        raise FileNotFoundError(path)
+
+    monkeypatch.setattr(Path, "read_text", missing)
+    assert directory.is_writing(Writer(os.getpid(), ""))
+    assert not directory.is_writing(Writer(2**22 + 1, ""))  # above the largest number of Linux
+
+
+# The newest policy
+
+
+def test_code_that_a_run_names_is_not_run(tmp_path: Path) -> None:
+    mark = tmp_path / "ran"
+    own = tmp_path / "own.py"
+    own.write_text(f"open({str(mark)!r}, 'w')\n")
+    run = write(tmp_path / "run", [row(0)], trained=replace(CONFIG, extensions=str(own)))
+    views = Views(WatchConfig(run=str(run)))
+    views.draw()
+    with pytest.raises(ConfigError, match=r"^the run has pieces of somebody's, which are code"):
+        newest.record(views.settings, views.drawn.history)
+    assert not mark.exists()
+
+
+def test_a_seed_that_the_run_has_not_is_refused(tmp_path: Path) -> None:
+    run = write(tmp_path / "run", [row(0)])
+    with pytest.raises(ConfigError, match=r"^seed is 4, but .* was trained with 0 to 0"):
+        newest.record(WatchConfig(run=str(run), seed=4), None)
+
+
+# The command
+
+
+def _command(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["watch", *words])
+    return command.run("watch", watch.main, WatchConfig)
+
+
+def test_a_folder_that_is_no_run_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert _command(monkeypatch, f"run={tmp_path}") == 2
+    said = capsys.readouterr().err
+    assert said.endswith(f"{tmp_path} is no run directory: it has no config.json.\n")
+    assert said.count("\n") == 1
+
+
+def test_a_port_that_is_taken_is_one_sentence(
+    server: Server, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert _command(monkeypatch, f"run={str(run)!r}", f"port={server.server_port}") == 2
+    assert f"port is {server.server_port}, which cannot be had" in capsys.readouterr().err
+
+
+def test_control_c_ends_it(run: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    def interrupted(server: Server) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Server, "serve_forever", interrupted)
+    assert _command(monkeypatch, f"run={str(run)!r}") == 130
+    assert capsys.readouterr().out.startswith("http://127.0.0.1:")
