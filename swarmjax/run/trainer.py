@@ -238,10 +238,7 @@ def train(
             began = time.perf_counter()
             state, metrics = compiled.call(schedule, state, np.int32(n))
             metrics = jax.device_get(hosts.gather(metrics))
-            log = metrics.pop(episodes.KEY, None)
             _report(program, tally, metrics, n, time.perf_counter() - began, record, display)
-            if log is not None:
-                _log_episodes(program.config, log, np.arange(tally.update)[-n:], record, display)
             due = saves.due(tally, checkpoints.write_seconds)
             if tally.is_sound and hosts.share(due)[0]:
                 save(what(state), tally.update, record.sync(), score(settings, tally))
@@ -431,14 +428,14 @@ def stop_together(stop: Stop) -> bool:
 def _report(
     program: Built,
     tally: Tally,
-    metrics: dict[str, np.ndarray],
+    metrics: dict[str, Any],
     n: int,
     seconds: float,
     record: Recorder,
     display: Display,
 ) -> None:
-    """Adds a call to the tally, writes it down and shows it."""
-    settings = program.config
+    """Adds a call to the tally, writes it and its episodes down, and shows it."""
+    settings, log = program.config, metrics.pop(episodes.KEY, None)
     names = [stage.name for stage in settings.stage]
     control_steps = settings.arenas * settings.algo.rollout_length
     tally.update += n
@@ -456,6 +453,8 @@ def _report(
     pace = tally.seconds / (tally.update - tally.first)
     display.hear(rows, speeds)
     display.show(summarize(rows, names), speeds, pace * (settings.updates - tally.update))
+    if log is not None:
+        _log_episodes(settings, log, np.arange(tally.update)[-n:], record, display)
 
 
 def _log_episodes(
