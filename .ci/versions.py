@@ -6,8 +6,8 @@
 
 Each goes into an environment of its own, without the tree and without its constraints. There the
 console script trains on a user's stage, goes on, and judges, shows and exports the policy; Python
-steps both bodies by JAX and by Warp, Pyright reads a user's file, and the tests of `TESTS` run. It
-takes minutes and is no part of `.ci/run`.
+steps both bodies, Pyright reads a user's file, and the tests of `TESTS` run. It takes minutes and
+is no part of `.ci/run`.
 """
 
 import argparse
@@ -39,8 +39,8 @@ STAGE = "name: mine\nrobots: 3\nside: 0.8\nobstacles: 2\n"
 SMALL = ["algo.hidden_sizes=[16]", "task.step_limit=40", "run.compile_cache=null"]
 PYTHON_CALLS = """
 import jax, swarmjax
-for robot, impl in (("planar", "jax"), ("wheeled", "jax"), ("wheeled", "warp")):
-    env = swarmjax.make_env("mine.yaml", robot=robot, sim={"impl": impl}, arenas=4)
+for robot in ("planar", "wheeled"):
+    env = swarmjax.make_env("mine.yaml", robot=robot, arenas=4)
     state = jax.jit(env.reset)(jax.random.key(0))
     state, outcome = jax.jit(env.step)(state, jax.numpy.zeros((4, 3, 2)))
     assert state.observation.shape == (4, 3, 10) and outcome.reward.shape == (4, 3)
