@@ -193,7 +193,7 @@ def test_speeds_of_a_run_are_its_steps_by_the_seconds_of_a_call(
 
     shown: list[Line] = []
     display: Any = SimpleNamespace(
-        show=lambda _, speeds, __: shown.append(speeds), say=print, hear=lambda _: None
+        show=lambda _, speeds, __: shown.append(speeds), say=print, hear=lambda *_: None
     )
     compiled: Any = trainer.Compiled(call, seconds=0.0, state_bytes=0, work_bytes=0)
     begun: Any = _State(jnp.zeros(SEEDS, jnp.int32))

@@ -289,7 +289,7 @@ def test_the_engines_agree_on_a_policy_that_remembers(tmp_path: Path, kind: str,
         none = {name: array * ("memory" not in name) for name, array in given.items()}
     else:
         kernel = given["actor/hidden_0/kernel"]
-        kernel[:, observation.SIZE :] *= 0.3
+        kernel[:, observation.SIZE :] *= 0.5
         newest = np.arange(kernel.shape[1]) < observation.SIZE
         none = given | {"actor/hidden_0/kernel": kernel * newest[:, None]}
     path = tmp_path / "policy.npz"
@@ -299,11 +299,11 @@ def test_the_engines_agree_on_a_policy_that_remembers(tmp_path: Path, kind: str,
     free = c.found["contacts_per_robot"][0] == 0.0
     assert free.sum() > 2
     np.testing.assert_allclose(mjx.found["spl"][0, free], c.found["spl"][0, free], atol=2e-3)
-    # Without its memory it drives another way.
+    # Without its memory it drives another way, by three times what the engines may differ by.
     other = tmp_path / "other.npz"
     policy_file.write(other, none | {"actor/log_std": np.full((1, 2), -3.0, np.float32)}, said)
     forgetful = _judge(other, STAGES[0], "c", episodes=8).trials[0]
-    assert np.abs(forgetful.found["spl"] - c.found["spl"])[0, free].max() > 0.01
+    assert np.abs(forgetful.found["spl"] - c.found["spl"])[0, free].max() > 6e-3
 
 
 def test_boxes_beyond_what_the_engine_is_compiled_for_are_refused() -> None:

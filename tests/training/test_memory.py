@@ -44,7 +44,9 @@ def _algo(config: TrainConfig, policy: str) -> AlgoConfig:
     return AlgoConfig(**{**vars(algo), "policy": policy})
 
 
-@pytest.fixture(scope="module", params=["shared", "independent"])
+@pytest.fixture(
+    scope="module", params=["shared", pytest.param("independent", marks=pytest.mark.slow)]
+)
 def trained(request: pytest.FixtureRequest, tiny_config: TrainConfig) -> Trained:
     config = replace(tiny_config, algo=_algo(tiny_config, request.param))
     program, schedule = programs.load(config)

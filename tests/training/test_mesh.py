@@ -40,7 +40,7 @@ def _end(*processes: subprocess.Popen[str]) -> None:
 
 @pytest.fixture(
     scope="module",
-    params=[pytest.param(PLAIN, marks=pytest.mark.slow), REMEMBERS],
+    params=[PLAIN, pytest.param(REMEMBERS, marks=pytest.mark.slow)],
     ids=["plain", "remembers"],
 )
 def words(request: pytest.FixtureRequest) -> str:
