@@ -187,6 +187,7 @@ def test_the_space_of_a_history_names_how_old_its_entries_are() -> None:
     assert seen.names[-1] == "target_bearing[-1]"
 
 
+@pytest.mark.slow
 def test_pieces_handed_over_are_trained_and_judged(tmp_path: Path) -> None:
     settings = TINY | {"stage": extensions.RING, "run.dir": tmp_path / "run", "budget": 16}
     result = swarmjax.train_policy(settings, extensions=str(extensions.OWN))

@@ -87,6 +87,7 @@ def test_jax_is_mended_for_a_while() -> None:
     assert not hasattr(jax, name)
 
 
+@pytest.mark.slow
 def test_braxs_evaluator_counts_targets_reached(env: SwarmBraxEnv, course: Course) -> None:
     from brax.training import acting
 

@@ -151,6 +151,7 @@ def test_what_cannot_be_measured_is_refused(word: str, said: str) -> None:
         rub_sweeps.main([word])
 
 
+@pytest.mark.slow
 def test_a_line_of_a_stage() -> None:
     settings = rub_sweeps.RubSweepsConfig(stages=("s6",), designs=("plain", "built"))
     words = ["arenas=32", "sim.max_robots=5"]

@@ -182,6 +182,7 @@ def test_a_run_that_goes_on_elsewhere_has_a_checkpoint_there_at_once(tmp_path: P
     assert checkpoint.find(on).update == 5
 
 
+@pytest.mark.slow
 def test_episodes_stay_where_a_run_writes_none_for_a_while(tmp_path: Path) -> None:
     run = tmp_path / "run"
     assert train.main([*TINY, f"run.dir={run}", "run.episodes=true", "run.stop_after=4"]) == 0
@@ -219,6 +220,7 @@ def test_damaged_rows_of_a_run_that_goes_on_are_one_sentence(tmp_path: Path) -> 
         train.main([f"resume={run}"])
 
 
+@pytest.mark.slow
 def test_digests_of_another_budget_are_not_compared(tmp_path: Path) -> None:
     run = _stopped(tmp_path / "run", after=5)
     assert train.main([f"resume={run}", "budget=160"]) == 0
@@ -237,7 +239,9 @@ def test_a_run_that_goes_on_elsewhere_takes_its_logs_along(whole: Path, tmp_path
     assert _digest(tmp_path / "on") == _digest(whole)
 
 
-@pytest.mark.parametrize("words", [["run.chunk=1"], ["run.chunk=all"]])
+@pytest.mark.parametrize(
+    "words", [["run.chunk=1"], pytest.param(["run.chunk=all"], marks=pytest.mark.slow)]
+)
 def test_a_signal_of_a_scheduler_saves_and_asks_for_a_requeue(
     words: list[str], tmp_path: Path
 ) -> None:

@@ -186,6 +186,7 @@ def pair(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
+@pytest.mark.slow
 def test_several_seeds_begin_with_as_many_lane_by_lane(trained: Path, pair: Path) -> None:
     source, state, settings = _load([f"init_from={pair}", "seeds=2", "seed=5"])
     found = checkpoint.to_leaves(warm_start.carry(source, state, settings))
