@@ -174,7 +174,7 @@ def step(
     Args:
         policy: Of one learner for all robots, or of R or more.
         memory: [..., R, H] as `begin` or the step before returned it.
-        observation: As in `act`; of this control step alone, whatever the history.
+        observation: As in `act`; of this control step alone, also with a history.
         normal: As in `act`.
 
     Returns:

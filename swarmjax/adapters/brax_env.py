@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from swarmjax.adapters.library import fault, find
+from swarmjax.adapters.library import check, find
 from swarmjax.adapters.robots import line_up
 from swarmjax.environment import Swarm
 
@@ -82,8 +82,7 @@ class SwarmBraxEnv(_base.Env):
         Raises:
             ValueError: the action has a wrong shape; TypeError: a wrong dtype.
         """
-        if sentence := fault(action, (self.num_envs, 2)):
-            raise (TypeError if "dtype" in sentence else ValueError)(sentence)
+        check(action, (self.num_envs, 2))
         steps = state.pipeline_state.arenas.clock[self.robots.arena] + 1.0
         now, came = self.robots.step(state.pipeline_state, action)
         idle = came.truncated | ~came.valid

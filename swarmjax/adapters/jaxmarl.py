@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from swarmjax.adapters.library import fault, find
+from swarmjax.adapters.library import check, find
 from swarmjax.adapters.robots import RobotStep, line_up_arena
 from swarmjax.environment import Swarm, SwarmState
 
@@ -107,8 +107,7 @@ class SwarmMultiAgentEnv(_base):
         if missing := sorted(set(self.agents) - set(actions)):
             raise ValueError(f"actions lack {missing}: give one of each agent.")
         for agent in self.agents:
-            if sentence := fault(actions[agent], (2,)):
-                raise (TypeError if "dtype" in sentence else ValueError)(f"{agent}: {sentence}")
+            check(actions[agent], (2,), f"{agent}: ")
         return jnp.stack([actions[agent] for agent in self.agents])
 
 

@@ -13,6 +13,23 @@ def fault(action: Any, shape: tuple[int, ...]) -> str | None:
     return None
 
 
+def check(action: Any, shape: tuple[int, ...], whose: str = "") -> None:
+    """Refuses an action, for libraries that have no errors of their own.
+
+    Args:
+        action: what a robot or several are told.
+        shape: that it must have.
+        whose: put before the sentence.
+
+    Raises:
+        ValueError: it has another shape.
+        TypeError: it is of a wrong dtype.
+    """
+    if sentence := fault(action, shape):
+        kind = ValueError if tuple(action.shape) != shape else TypeError
+        raise kind(whose + sentence)
+
+
 def find(module: str, extra: str, name: str | None = None) -> Any:
     """Imports a module of another library, or takes something out of it.
 

@@ -80,7 +80,7 @@ class SwarmParallelEnv(_base):
             acted.
 
         Raises:
-            InvalidAction: an action is missing, of nobody, or of a wrong shape or dtype.
+            InvalidAction: an action is missing, of no agent, or of a wrong shape or dtype.
             ResetNeeded: no agent is left.
             ClosedEnvironmentError: it was closed.
         """

@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from swarmjax.adapters.library import fault, find
+from swarmjax.adapters.library import check, find
 from swarmjax.adapters.robots import line_up_arena
 from swarmjax.environment import Swarm
 
@@ -75,8 +75,7 @@ class SwarmMjxEnv(_playground.MjxEnv):
             ValueError: the action has a wrong shape.
             TypeError: the action is of a wrong dtype.
         """
-        if sentence := fault(action, (self.action_size,)):
-            raise (TypeError if "dtype" in sentence else ValueError)(sentence)
+        check(action, (self.action_size,))
         late = state.data.arenas.clock[0] + 1 >= self.episode_length
         now, came = self.robots.step(state.data, action.reshape(-1, 2))
         done = came.over[0] & ~(late & came.truncated.any())

@@ -14,11 +14,11 @@ from swarmjax.environment import Swarm, SwarmState
 
 
 class RobotStep(NamedTuple):
-    """What a control step came to, robot by robot.
+    """The outcome of a control step, robot by robot.
 
     Attributes:
         observation: [N, O] act on this: of the next episode where `over`.
-        last: [N, O] what the step came to, before any reset.
+        last: [N, O] the observation after the step, before any reset.
         reward: [N] 0 for robots that had arrived and stand.
         terminated: [N] the robot arrived in this step.
         truncated: [N] the time ran out on its way.
@@ -67,7 +67,7 @@ class RobotRow:
             action: [N, 2], -1..1 spans the commands; what is beyond is clipped.
 
         Returns:
-            The state after, and what the step came to.
+            The state after, and the outcome.
         """
         arenas, robots = self.swarm.num_arenas, self.swarm.num_robots
         places = jnp.zeros((arenas * robots, 2)).at[self.index].set(action)

@@ -86,5 +86,5 @@ class Session:
 
 
 def fetch(came: RobotStep) -> RobotStep:
-    """Copies what a step came to from the device."""
+    """Copies the outcome of a step from the device."""
     return RobotStep(*(np.array(each) for each in jax.device_get(came)))

@@ -4,7 +4,7 @@ from typing import Any
 
 import jax
 
-from swarmjax.adapters.library import fault, find
+from swarmjax.adapters.library import check, find
 from swarmjax.adapters.robots import RobotStep, line_up
 from swarmjax.environment import Swarm, SwarmState
 
@@ -75,8 +75,7 @@ class SwarmTorchEnv:
         self._check_open()
         if self._state is None:
             raise ValueError("step was called before reset: call reset first.")
-        if sentence := fault(action, (len(self), 2)):
-            raise (TypeError if "dtype" in sentence else ValueError)(sentence)
+        check(action, (len(self), 2))
         self._state, came = self._step(self._state, to_jax(action.float()))
         return RobotStep(*map(to_torch, came))
 

@@ -234,9 +234,7 @@ def recall_values(
     Returns:
         The expected discounted return, [...], and the memory after.
     """
-    seen = normalize(learner, observation)
-    if state is not None:
-        seen = jnp.concatenate([seen, state], axis=-1)
+    seen = networks.critic_input(normalize(learner, observation), state)
     return networks.recall_value(learner.params, config, seen, memory)
 
 

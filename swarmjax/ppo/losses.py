@@ -116,9 +116,7 @@ def evaluate(
         Mean action [B, U], deviation [U] and value [B].
     """
     seen, memory = minibatch.observation, minibatch.memory
-    judged = seen
-    if minibatch.state is not None:
-        judged = jnp.concatenate([seen, minibatch.state], axis=-1)
+    judged = networks.critic_input(seen, minibatch.state)
     if memory is None or minibatch.begins is None:
         mean, std = networks.action_distribution(params, config, seen)
         return mean, std, networks.value(params, config, judged)

@@ -244,6 +244,19 @@ def recall_value(
     return cast("tuple[jax.Array, jax.Array | None]", output)
 
 
+def critic_input(observation: jax.Array, state: jax.Array | None) -> jax.Array:
+    """Puts together what a critic sees.
+
+    Args:
+        observation: [B, O], normalised.
+        state: [B, P], what the critic sees besides; None if nothing.
+
+    Returns:
+        [B, O + P], as `recall_value` takes it.
+    """
+    return observation if state is None else jnp.concatenate([observation, state], axis=-1)
+
+
 def beyond_range(mean: jax.Array) -> jax.Array:
     """Computes how far a mean action lies beyond the range of commands.
 

@@ -1,4 +1,4 @@
-"""Where a run's figures go besides its own files: TensorBoard, W&B, and whatever Python is given.
+"""Where a run's figures go besides its own files: TensorBoard, W&B and functions.
 
 `metrics.jsonl` is the run's own record: it is written first, checkpoints count it, and a run that
 cannot write it ends. A logger holds nothing that the record does not, so that none ends a run.
@@ -136,7 +136,7 @@ class Guarded:
     def _try(self, what: Callable[..., None], *arguments: Any) -> None:
         try:
             what(*arguments)
-        except BaseException as error:  # whatever a library or a function of somebody's raises
+        except BaseException as error:  # of a library or a user's function
             self._lose(_why(error))
 
     def _lose(self, why: str) -> None:

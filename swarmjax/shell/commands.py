@@ -23,7 +23,7 @@ COMMANDS: dict[str, Command] = {
     "train": Command("swarmjax.run.settings:TrainConfig", "Train a swarm."),
     "evaluate": Command("swarmjax.evaluate.config:EvaluateConfig", "Judge policies in MuJoCo C."),
     "replay": Command("swarmjax.replay.config:ReplayConfig", "Show episodes on a page."),
-    "report": Command("swarmjax.report.config:ReportConfig", "Draw what runs came to."),
+    "report": Command("swarmjax.report.config:ReportConfig", "Draw the results of runs."),
     "export": Command(
         "swarmjax.export.config:ExportConfig", "Write a policy for ONNX, C or Webots."
     ),

@@ -21,7 +21,6 @@ from swarmjax.replay.config import ReplayConfig
 from swarmjax.replay.episodes import replay
 from swarmjax.report import rows
 from swarmjax.report.rows import History
-from swarmjax.run.hosts import CHECKPOINTS
 from swarmjax.run.settings import TrainConfig, settle
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.watch.config import WatchConfig
@@ -39,15 +38,6 @@ class Newest(NamedTuple):
     update: int
     sentence: str
     page: str
-
-
-def newest_update(run: Path) -> int | None:
-    """Finds the update of the newest checkpoint, sound or not; None if there is none."""
-    try:
-        names = [path.name for path in (run / CHECKPOINTS).iterdir() if path.is_dir()]
-    except OSError:
-        return None
-    return max((int(name) for name in names if name.isdecimal()), default=None)
 
 
 def record(settings: WatchConfig, history: History | None) -> Newest:

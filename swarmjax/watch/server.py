@@ -81,16 +81,16 @@ class Answers(BaseHTTPRequestHandler):
     def _find(self, path: str) -> tuple[str, bytes, str] | None:
         """Finds the type, the content and who may frame it; None if there is none."""
         views = self.server.views
-        html, nobody = "text/html; charset=utf-8", "frame-ancestors 'none'"
+        html, unframed = "text/html; charset=utf-8", "frame-ancestors 'none'"
         if path == "/":
-            return html, self.server.page.encode(), nobody
+            return html, self.server.page.encode(), unframed
         if path == "/state.json":
-            return "application/json", json.dumps(views.state()).encode(), nobody
+            return "application/json", json.dumps(views.state()).encode(), unframed
         if path == "/replay.html" and views.replayed.newest is not None:
             return html, views.replayed.newest.page.encode(), "frame-ancestors 'self'"
         name = path.removeprefix("/figures/").removesuffix(".png")
         if path == f"/figures/{name}.png" and name in views.drawn.figures:
-            return "image/png", views.drawn.figures[name], nobody
+            return "image/png", views.drawn.figures[name], unframed
         return None
 
     def _refuse(self) -> None:

@@ -102,7 +102,7 @@ class Views:
         }
 
     def draw(self) -> float:
-        """Draws the figures anew, if the run has written more; returns how long to rest then, s."""
+        """Draws the figures again if the run has written more; returns how long to rest then, s."""
         found = _version(self.run / METRICS)
         if found is None or found == self._seen:
             return 0.0
@@ -118,9 +118,11 @@ class Views:
 
     def replay(self) -> float:
         """Replays a policy that was not tried yet; returns how long to rest then, s."""
-        update = newest.newest_update(self.run)
         if self.drawn.history is None and not self.drawn.trouble:  # which says on what stage it is
             return 0.0
+        from swarmjax.run import checkpoint  # JAX takes seconds to import
+
+        update = max(checkpoint.steps(self.run), default=None)
         if update is None or update == self._tried:
             return 0.0
         self._tried = update
@@ -138,7 +140,7 @@ class Views:
             if time.monotonic() - self._asked < LOOKED_AT_S:
                 try:
                     rest = renew()
-                except Exception as error:  # nobody foresaw it, and the page goes on
+                except Exception as error:  # unforeseen; the page goes on
                     sys.stderr.write(f"swarmjax.watch: {type(error).__name__}: {error}\n")
                     rest = LOOKED_AT_S
             time.sleep(PAUSE_S + rest)

@@ -67,7 +67,7 @@ class Force(NamedTuple):
 
 
 class Swept(NamedTuple):
-    """What a sweep came to.
+    """The result of a sweep.
 
     Attributes:
       force: of all contacts after it.
@@ -85,8 +85,8 @@ class Search(NamedTuple):
       done: [] sweeps.
       force: to go on from.
       motion: what comes of it.
-      last: what the last sweep came to.
-      before: what the one before it came to.
+      last: result of the last sweep.
+      before: result of the one before it.
       moves: [] whether the last sweep changed a force.
     """
 

@@ -76,7 +76,7 @@ class WarpRubbingArena:
       asked: [K, A] aref of its push and of its rub, and J M^-1 J' + R of both.
       force: [K, A] its push and its rub, N.
       between: [K, A] the robot that is pushed along, and the one that is pushed back; -1: none.
-      past: [KEPT, K, A] push and rub that a sweep came to, N, and by how much it changed them;
+      past: [KEPT, K, A] push and rub after a sweep, N, and by how much it changed them;
         sweep i is in row i modulo KEPT.
       found: [A, R] acceleration of x, y and yaw.
       index: of the thread, [A].
@@ -102,7 +102,7 @@ class WarpRubbingArena:
 
 @wp.struct
 class WarpSwept:
-    """What a sweep came to, with sums over contacts that the next leap is found by.
+    """The result of a sweep, with sums over contacts that the next leap is found by.
 
     With r the changes of this sweep, a what they differ by from those of the last one, and b what
     those differ by from the ones before:
@@ -352,7 +352,7 @@ def _sweep(arena: WarpRubbingArena, count: int, index: int, least: float) -> War
 def _remember(
     arena: WarpRubbingArena, swept: WarpSwept, k: int, index: int, more: wp.vec2
 ) -> WarpSwept:
-    """Writes down what a contact came to in a sweep, and adds to its sums."""
+    """Stores the forces of a contact after a sweep, and adds to the sums."""
     force = arena.force[k, arena.index]
     last = arena.past[(index + 2) % _KEPT, k, arena.index]
     before = arena.past[(index + 1) % _KEPT, k, arena.index]
