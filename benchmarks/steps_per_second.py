@@ -114,8 +114,8 @@ def physics_alone(program: Program, arenas: EnvState, key: Array) -> tuple[EnvSt
 
 
 def environment(
-    program: Program, schedule: Schedule, arenas: EnvState, key: Array
-) -> tuple[EnvState, dict[str, Array]]:
+    program: Program, schedule: Schedule, arenas: rollout.Arena, key: Array
+) -> tuple[rollout.Arena, dict[str, Array]]:
     """Steps all arenas with random actions, resets and all.
 
     Returns:
@@ -126,23 +126,24 @@ def environment(
     step = jax.vmap(partial(env.step, world))
     unpack = jax.vmap(partial(physics.unpack, world.physics))
 
-    def body(arenas: EnvState, key: Array, starts: EnvState) -> tuple[EnvState, dict[str, Array]]:
+    def body(arenas: rollout.Arena, key: Array, starts: rollout.Arena) -> tuple[Any, Any]:
         arenas, came = step(arenas, _actions(program, key))
         reward = jnp.sum(came.reward) + jnp.sum(came.observation)
         sums = {"reward": reward, "episodes_ended": jnp.sum(came.done, dtype=jnp.int32)}
         return rollout.restart(arenas, starts, came.done), sums
 
-    def rolled(arenas: EnvState, key: Array) -> tuple[EnvState, dict[str, Array]]:
+    def rolled(arenas: rollout.Arena, key: Array) -> tuple[Any, Any]:
         level_key, key = jax.random.split(key)
         index = jnp.zeros((1, program.config.arenas), jnp.int32)
         starts = rollout.draw_starts(world, schedule.stages, index, jnp.int32(0), level_key)
         keys = jax.random.split(key, program.config.algo.rollout_length)
         return jax.lax.scan(partial(body, starts=starts), arenas, keys)
 
-    arenas = replace(arenas, sim=unpack(arenas.sim))
+    began = replace(arenas, sim=unpack(arenas.sim), recall=None)  # who drives at random forgets
     keys = jax.random.split(key, _rollouts(program.config))
-    arenas, sums = jax.lax.scan(rolled, arenas, keys)
-    return replace(arenas, sim=jax.vmap(physics.pack)(arenas.sim)), jax.tree.map(jnp.sum, sums)
+    ended, sums = jax.lax.scan(rolled, began, keys)
+    packed = jax.vmap(physics.pack)(ended.sim)
+    return replace(ended, sim=packed, recall=arenas.recall), jax.tree.map(jnp.sum, sums)
 
 
 def _rollouts(settings: TrainConfig) -> int:

@@ -58,6 +58,7 @@ class RewardTerm(Piece):
     kind: ClassVar[str] = "reward"
     taken: ClassVar[tuple[str, ...]] = (
         "progress",
+        "path_progress",
         "proximity",
         "arrival",
         "contact",

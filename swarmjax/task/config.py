@@ -27,6 +27,10 @@ class RewardConfig(Section):
     renamed: ClassVar[Mapping[str, str]] = {"time": "step_penalty"}
 
     progress: float = field(default=1.0, metadata=_weight("per metre nearer to the target"))
+    path_progress: float = field(
+        default=0.0,
+        metadata=_weight("per metre nearer along the shortest path around walls and boxes"),
+    )
     proximity: float = field(
         default=0.0,
         metadata=_weight("per control step before arrival with something in infrared range"),

@@ -20,7 +20,16 @@ from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps as sim_gaps
 from swarmjax.sim.config import RobotConfig, SimConfig, physics_substeps
 from swarmjax.sim.realism_config import RealismConfig
-from swarmjax.task import arrival, extended, observation, pieces, reward, room, surroundings
+from swarmjax.task import (
+    arrival,
+    extended,
+    geodesic,
+    observation,
+    pieces,
+    reward,
+    room,
+    surroundings,
+)
 from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors as task_factors
 from swarmjax.task import stage as task_stage
@@ -80,6 +89,7 @@ class EnvState:
       distance: [R] to the target, m.
       apart: [R, 3] for how long there was no contact of each kind, s.
       episode: sums since the start.
+      path: the shortest paths to the targets; None where the reward does not ask.
     """
 
     sim: Any
@@ -92,6 +102,7 @@ class EnvState:
     distance: Array
     apart: Array
     episode: Episode
+    path: geodesic.Path | None
 
 
 class TimeStep(NamedTuple):
@@ -216,7 +227,13 @@ def reset(world: World, level: Level) -> EnvState:
         distance=sight.distance,
         apart=jnp.full((robots, len(sim_gaps.KINDS)), sim_gaps.CONTACT_PAUSE),
         episode=_no_episode(robots),
+        path=geodesic.begin(level, world.robot.hull_radius) if _asks_for_path(world) else None,
     )
+
+
+def _asks_for_path(world: World) -> bool:
+    """Whether the reward looks at the shortest paths."""
+    return world.task.reward.path_progress != 0.0
 
 
 def look_around(world: World, state: EnvState) -> Array:
@@ -271,6 +288,10 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     )
     begins, apart = _count_contacts(world, state, pose)
     earned = _earned(world, state, sight, arrives, begins & active[:, None])
+    path, before = state.path, state.path
+    if before is not None:
+        path = geodesic.go_on(before, pose[:, :2], level, world.robot.hull_radius)
+        earned = earned._replace(path_before=before.distance, path=path.distance)
     if world.terms:
         earned = _fill(world, earned, state, action, pose)
     gained = reward.total(earned, world.task.reward, world.terms)
@@ -293,6 +314,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
         distance=sight.distance,
         apart=apart,
         episode=episode,
+        path=path,
     )
     return new, TimeStep(
         observation=seen,

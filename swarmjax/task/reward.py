@@ -37,6 +37,8 @@ class Step(NamedTuple):
       action: [R, 2] clipped to -1..1, which spans the commands.
       present: [R] whether the robot takes part, bool.
       clock: [] control steps since the start, this one included, int32.
+      path_before: [R] along the shortest path to the target, m; None where the weights do not ask.
+      path: [R] after the step, m.
     """
 
     distance_before: Array
@@ -51,11 +53,18 @@ class Step(NamedTuple):
     action: Any = None
     present: Any = None
     clock: Any = None
+    path_before: Any = None
+    path: Any = None
 
 
 def progress(step: Step) -> Array:
     """Metres nearer to the target: previous distance - current distance (equation 3)."""
     return step.distance_before - step.distance
+
+
+def path_progress(step: Step) -> Array:
+    """Metres nearer to the target along the shortest path around walls and boxes."""
+    return step.path_before - step.path
 
 
 def proximity(step: Step) -> Array:
@@ -92,6 +101,7 @@ def _before_arrival(step: Step, price: Array) -> Array:
 
 TERMS: dict[str, Callable[[Step], Array]] = {
     "progress": progress,
+    "path_progress": path_progress,
     "proximity": proximity,
     "arrival": arrival,
     "contact": contact,

@@ -28,6 +28,8 @@ def step() -> reward.Step:
         sensor_range=RANGE,
         arrives=jnp.array([False, False, True, False]),
         contact_begins=jnp.array([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 0]], bool),
+        path_before=jnp.array([0.75, 0.5, 0.0625, 0.5]),
+        path=jnp.array([0.5, 0.625, 0.03125, 0.5]),
     )
 
 
@@ -35,6 +37,7 @@ def step() -> reward.Step:
     ("name", "expected"),
     [
         ("progress", [0.125, 0.0, 0.03125, -0.25]),  # before - now, exact in binary
+        ("path_progress", [0.25, -0.125, 0.03125, 0.0]),
         ("proximity", [0, 1, 1, 0]),  # once, however many rays; a full ray sees nothing
         ("arrival", [0, 0, 1, 0]),
         ("contact", [0, 1, 2, 0]),

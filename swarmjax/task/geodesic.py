@@ -1,0 +1,186 @@
+"""How far it is to the target along the shortest path around walls and boxes.
+
+A visibility graph (Lozano-Pérez & Wesley 1979, "An Algorithm for Planning Collision-Free Paths
+Among Polyhedral Obstacles"), solved for every target once an episode: from then on the distance is
+the least, over the corners that a robot sees, of the way to the corner and the way on from there.
+Rewards of navigation count progress along it (Wijmans et al. 2020, "DD-PPO", section 4).
+
+Other robots do not count. Obstacles are widened by a little less than a robot's radius, with square
+corners, so that a robot that touches one is still outside. Lengths are then a millimetre too short
+to three centimetres too long. What matters to a reward is which way round a path leads, and that it
+gets shorter on the way.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from swarmjax.task.level import Level
+
+# Of the hull's radius: by how much obstacles are widened, and how far off corners lie. Contacts
+# are soft, so a robot that is pushed against a wall is a little nearer than its radius.
+_WIDENED = 0.8
+_CORNER = 0.9
+_SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
+
+
+class Roadmap(NamedTuple):
+    """Where paths turn, and how far it is from there.
+
+    Attributes:
+      corner: [K, 2] of the widened obstacles, x and y, m.
+      to_go: [R, K] from each corner to each robot's target, m; inf where no path leads.
+    """
+
+    corner: Array
+    to_go: Array
+
+
+class Path(NamedTuple):
+    """What an arena keeps of the paths of its robots.
+
+    Attributes:
+      roadmap: of the episode.
+      distance: [R] along the shortest path to the target, m.
+    """
+
+    roadmap: Roadmap
+    distance: Array
+
+
+def begin(level: Level, hull_radius: float) -> Path:
+    """Finds the paths of an episode.
+
+    Args:
+      level: what it starts from.
+      hull_radius: of robots, m.
+
+    Returns:
+      The paths from where robots start. A robot that has none is as far away as the straight line.
+    """
+    roadmap = survey(level, hull_radius)
+    start = level.start[:, :2]
+    straight = jnp.hypot(*(level.target - start).T)
+    return Path(roadmap, measure(roadmap, start, level, hull_radius, straight))
+
+
+def go_on(path: Path, place: Array, level: Level, hull_radius: float) -> Path:
+    """Measures the paths anew.
+
+    Args:
+      path: before.
+      place: [R, 2] where the robots are now, m.
+      level: of the episode.
+      hull_radius: of robots, m.
+
+    Returns:
+      The paths from there. A robot from where none is found keeps its distance.
+    """
+    distance = measure(path.roadmap, place, level, hull_radius, path.distance)
+    return path._replace(distance=distance)
+
+
+def survey(level: Level, hull_radius: float) -> Roadmap:
+    """Solves the visibility graph of a level for the targets of its robots.
+
+    Args:
+      level: of which obstacles and targets count.
+      hull_radius: of robots, m.
+
+    Returns:
+      The corners, four an obstacle, and how far it is from there.
+    """
+    corner = _corners(level, _CORNER * hull_radius)
+    usable = _is_free(corner, level, _WIDENED * hull_radius)
+    legs = _legs(corner, corner, level, hull_radius)
+    legs = jnp.where(usable[:, None] & usable[None, :], legs, jnp.inf)
+    direct = jnp.where(usable, _legs(level.target, corner, level, hull_radius), jnp.inf)
+
+    def shorten(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        # Bellman and Ford's step: a path may have one corner more.
+        to_go, _ = carry
+        shorter = jnp.minimum(to_go, jnp.min(legs + to_go[:, None, :], axis=-1, initial=jnp.inf))
+        return shorter, jnp.any(shorter < to_go)
+
+    to_go, _ = jax.lax.while_loop(lambda carry: carry[1], shorten, (direct, jnp.array(True)))
+    return Roadmap(corner, to_go)
+
+
+def measure(
+    roadmap: Roadmap, place: Array, level: Level, hull_radius: float, otherwise: Array
+) -> Array:
+    """Measures the shortest paths from places [R, 2] to the robots' targets.
+
+    Args:
+      roadmap: of the level.
+      place: [R, 2] x and y, m.
+      level: of the episode.
+      hull_radius: of robots, m.
+      otherwise: [R] what to return where there is no path, m.
+
+    Returns:
+      [R] m.
+    """
+    reach = _WIDENED * hull_radius
+    barred = _is_barred(place[:, None], level.target[:, None], level, reach)[:, 0]
+    direct = jnp.where(barred, jnp.inf, jnp.hypot(*(level.target - place).T))
+    around = _legs(place, roadmap.corner, level, hull_radius) + roadmap.to_go
+    found = jnp.minimum(direct, jnp.min(around, axis=-1, initial=jnp.inf))
+    return jnp.where(jnp.isfinite(found), found, otherwise)
+
+
+def _corners(level: Level, off: float) -> Array:
+    """Lists the corners [4 M, 2] of obstacles that are widened by `off`, m."""
+    x, y, yaw, half_x, half_y = (each[:, None] for each in level.obstacle.T)
+    sign = jnp.asarray(_SIGNS)
+    in_x, in_y = sign[:, 0] * (half_x + off), sign[:, 1] * (half_y + off)
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    corner = jnp.stack([x + cos * in_x - sin * in_y, y + sin * in_x + cos * in_y], axis=-1)
+    return corner.reshape(-1, 2)
+
+
+def _is_free(place: Array, level: Level, off: float) -> Array:
+    """Tells whether places [K, 2] lie in the arena, outside of obstacles widened by `off`."""
+    inside = jnp.all(jnp.abs(place) <= 0.5 * level.side - off, axis=-1)
+    return inside & ~_is_barred(place[:, None], place[:, None], level, off)[:, 0]
+
+
+def _legs(begin: Array, end: Array, level: Level, hull_radius: float) -> Array:
+    """Measures the straight ways [B, E] from places [B, 2] to others [E, 2]; inf where barred."""
+    barred = _is_barred(begin[:, None], end[None], level, _WIDENED * hull_radius)
+    away = end[None] - begin[:, None]
+    return jnp.where(barred, jnp.inf, jnp.hypot(away[..., 0], away[..., 1]))
+
+
+def _is_barred(begin: Array, end: Array, level: Level, off: float) -> Array:
+    """Tells whether segments meet an obstacle that is widened by `off`.
+
+    Args:
+      begin: [..., 2] x and y, m; axes broadcast.
+      end: [..., 2].
+      level: whose obstacles.
+      off: m.
+
+    Returns:
+      [...]. By separating axes (Ericson 2005, "Real-Time Collision Detection", section 5.3.3).
+    """
+    x, y, yaw, half_x, half_y = level.obstacle.T
+    half_x, half_y = half_x + off, half_y + off
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+
+    def into_frames(place: Array) -> tuple[Array, Array]:
+        to_x, to_y = place[..., :1] - x, place[..., 1:] - y
+        return cos * to_x + sin * to_y, cos * to_y - sin * to_x
+
+    (begin_x, begin_y), (end_x, end_y) = into_frames(begin), into_frames(end)
+    middle_x, middle_y = 0.5 * (begin_x + end_x), 0.5 * (begin_y + end_y)
+    reach_x, reach_y = 0.5 * jnp.abs(end_x - begin_x), 0.5 * jnp.abs(end_y - begin_y)
+    across = 0.5 * (middle_x * (end_y - begin_y) - middle_y * (end_x - begin_x))
+    meets = (
+        (jnp.abs(middle_x) < half_x + reach_x)
+        & (jnp.abs(middle_y) < half_y + reach_y)
+        & (jnp.abs(across) < half_x * reach_y + half_y * reach_x)
+    )
+    return jnp.any(meets & level.obstacle_present, axis=-1)

@@ -1,0 +1,174 @@
+"""Shortest paths around walls and boxes: by hand, against the judge's, and as a reward."""
+
+import dataclasses
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmjax.evaluate.shortest_path import shortest
+from swarmjax.run.settings import load_train
+from swarmjax.sim import physics
+from swarmjax.sim.config import SimConfig
+from swarmjax.task import env, extended, geodesic, level
+from swarmjax.task import stage as task_stage
+from swarmjax.task.config import RewardConfig, TaskConfig
+from swarmjax.task.level import Level
+from swarmjax.task.stage_config import StageConfig
+from swarmjax.training import program as programs
+
+HULL = 0.037  # m
+CORNER = 0.9 * HULL  # how far off an obstacle paths turn, in x and in y
+TARGET = 0.05  # m
+# m; float32, sums of a few lengths of about 1.
+ROUND = 1e-6
+# A wall of 0.4 m from south to north, between a robot in the west and a target in the east.
+WALL = [0.0, 0.0, 0.0, 0.01, 0.2]
+
+
+def _level(start: list[float], target: list[float], boxes: list[list[float]]) -> Level:
+    return Level(
+        side=np.float32(1.0),
+        present=np.ones(1, bool),
+        start=np.float32([[*start, 0.0]]),
+        target=np.float32([target]),
+        obstacle_present=np.ones(len(boxes), bool),
+        obstacle=np.asarray(boxes, np.float32).reshape(-1, 5),
+        seed=np.uint32(0),
+    )
+
+
+def _distance(drawn: Level) -> float:
+    return float(jax.jit(partial(geodesic.begin, hull_radius=HULL))(drawn).distance[0])
+
+
+def test_the_path_is_straight_where_nothing_is_in_the_way() -> None:
+    assert _distance(_level([-0.3, 0.0], [0.1, 0.3], [])) == pytest.approx(0.5, abs=ROUND)
+
+
+def test_a_box_beside_the_line_changes_nothing() -> None:
+    beside = [0.0, 0.1, 0.0, 0.05, 0.05]  # its near edge is 0.05 m off the line
+    assert _distance(_level([-0.3, 0.0], [0.3, 0.0], [beside])) == pytest.approx(0.6, abs=ROUND)
+
+
+@pytest.mark.parametrize("quarters", [0, 1, 2, 3])
+def test_the_path_turns_at_the_near_end_of_a_wall(quarters: int) -> None:
+    turn = 0.5 * np.pi * quarters
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    start, target = (list(rotation @ place) for place in ([-0.3, 0.1], [0.3, 0.1]))
+    wall = [0.0, 0.0, turn, *WALL[3:]]
+    # To (0.01 + CORNER, 0.2 + CORNER) on either side of the wall, and past its end between them.
+    across, up = 0.01 + CORNER, 0.2 + CORNER - 0.1
+    expected = 2.0 * np.hypot(0.3 - across, up) + 2.0 * across
+    assert _distance(_level(start, target, [wall])) == pytest.approx(expected, abs=ROUND)
+
+
+def test_a_gap_too_narrow_for_a_robot_is_no_way() -> None:
+    # North of the wall are 5 cm, south of it 35 cm: two boxes fill the rest of the line.
+    north, south = [0.0, 0.475, 0.0, 0.01, 0.025], [0.0, -0.05, 0.0, 0.01, 0.45]
+    drawn = _level([-0.3, 0.3], [0.3, 0.3], [north, south])
+    found = jax.jit(partial(geodesic.survey, hull_radius=HULL))(drawn)
+    barred = jax.jit(geodesic.measure, static_argnums=3)(
+        found, drawn.start[:, :2], drawn, HULL, jnp.full(1, 9.0)
+    )
+    assert barred[0] == 9.0
+
+
+def test_an_absent_obstacle_is_in_nobodys_way() -> None:
+    drawn = _level([-0.3, 0.0], [0.3, 0.0], [WALL])
+    absent = drawn._replace(obstacle_present=np.zeros(1, bool))
+    assert _distance(absent) == pytest.approx(0.6, abs=ROUND)
+
+
+def test_a_robot_without_a_path_keeps_its_distance() -> None:
+    walls = [[0.0, 0.0, 0.0, 0.01, 0.6]]  # from wall to wall
+    drawn = _level([-0.3, 0.0], [0.3, 0.0], walls)
+    path = geodesic.begin(drawn, HULL)
+    assert float(path.distance[0]) == pytest.approx(0.6, abs=ROUND)
+    later = geodesic.go_on(path, jnp.array([[-0.1, 0.2]]), drawn, HULL)
+    assert float(later.distance[0]) == pytest.approx(0.6, abs=ROUND)
+
+
+@pytest.fixture(scope="module", params=["trap", "fence", "maze", "clutter"])
+def drawn(request: pytest.FixtureRequest) -> Level:
+    """Thirty levels of a family."""
+    settings = load_train([f"stage=world_{request.param}", "arenas=8"])
+    program, schedule = programs.load(settings)
+    spacing = program.world.spacing
+    numbers = np.random.default_rng(5).random((30, level.uniform_count(spacing)), np.float32)
+    stage = task_stage.select(jax.tree.map(jnp.asarray, schedule.stages), jnp.int32(0))
+    draw = partial(extended.draw, stage=stage, spacing=spacing, drawings=())
+    return jax.jit(jax.vmap(draw))(numbers)
+
+
+def test_paths_are_as_long_as_those_of_the_judge(drawn: Level) -> None:
+    found = jax.jit(jax.vmap(partial(geodesic.begin, hull_radius=HULL)))(drawn).distance
+    places = np.asarray(drawn.start)[..., :2]
+    exact = shortest(drawn.side, places, drawn.target, drawn.obstacle, HULL, TARGET)
+    there = np.asarray(drawn.present) & np.isfinite(exact)
+    longer = (np.asarray(found) - TARGET - exact)[there]
+    # Obstacles are widened by 0.8 of the hull, 7 mm less than it takes, and have square corners:
+    # a turn by a right angle is up to 2 - pi / 2 of 0.9 hulls longer, 14 mm. Paths have few turns.
+    assert longer.min() > -2e-3
+    assert longer.max() < 0.04
+
+
+class Driven(NamedTuple):
+    """A world whose reward is progress along the path alone, and an episode in it."""
+
+    began: env.EnvState
+    ended: env.EnvState
+    rewards: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def driven() -> Driven:
+    """A robot that wriggles in front of a wall for 40 steps."""
+    weights = RewardConfig(progress=0.0, path_progress=2.0, contact=0.0, step_penalty=0.0)
+    stage = StageConfig(name="wall", robots=1, side=1.0, obstacles=1)
+    sim = SimConfig(impl="jax", max_robots=1, max_obstacles=1)
+    world = env.load([stage], task=TaskConfig(reward=weights), sim=sim)
+    state = env.reset(world, _level([-0.3, 0.1], [0.3, 0.1], [WALL]))
+    began = dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
+    actions = np.random.default_rng(2).uniform(-1.0, 1.0, (40, 1, 2)).astype(np.float32)
+
+    def step(state: env.EnvState, action: jax.Array) -> tuple[env.EnvState, jax.Array]:
+        state, came = env.step(world, state, action)
+        return state, came.reward
+
+    ended, rewards = jax.jit(lambda *given: jax.lax.scan(step, *given))(began, actions)
+    return Driven(began, ended, np.asarray(rewards)[:, 0])
+
+
+def test_rewards_add_up_to_how_much_shorter_the_path_is(driven: Driven) -> None:
+    assert driven.began.path is not None
+    assert driven.ended.path is not None
+    shorter = float(driven.began.path.distance[0] - driven.ended.path.distance[0])
+    assert abs(shorter) > 1e-3  # it moved
+    # Float32: 40 differences of numbers below 1.
+    assert driven.rewards.sum() == pytest.approx(2.0 * shorter, abs=1e-5)
+
+
+def test_an_arena_keeps_the_path_from_where_its_robot_is(driven: Driven) -> None:
+    assert driven.ended.path is not None
+    now = np.asarray(driven.ended.sim.qpos)[:2]
+    drawn = _level(list(now), [0.3, 0.1], [WALL])
+    assert float(driven.ended.path.distance[0]) == pytest.approx(_distance(drawn), abs=1e-5)
+
+
+def test_without_its_weight_no_path_is_kept(tiny_world: env.World) -> None:
+    drawn = jax.eval_shape(
+        lambda: env.reset(
+            tiny_world,
+            level.sample(
+                jnp.zeros(level.uniform_count(tiny_world.spacing)),
+                task_stage.single(StageConfig(name="pair", robots=2, side=0.5)),
+                tiny_world.spacing,
+                jnp,
+            ),
+        )
+    )
+    assert drawn.path is None
