@@ -1,7 +1,10 @@
 """Placement on a lattice, in whole units of 1/4096 m, by hand."""
 
+import re
+from functools import partial
 from types import ModuleType
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -135,3 +138,22 @@ def test_place_nothing(xp: ModuleType) -> None:
     centres, sound = place(xp.asarray(ROW), free, none, none.astype(bool), Gap(1, 1), xp)
     assert centres.shape == (0, 2)
     assert sound.shape == (0,)
+
+
+def _place_two(score: jax.Array | np.ndarray, picks: jax.Array) -> jax.Array:
+    there = jnp.ones(2, dtype=bool)
+    return place(jnp.asarray(ROW), score, picks, there, Gap(5, 5), jnp)[0]
+
+
+def _reductions(lowered: jax.stages.Lowered) -> int:
+    return len(re.findall(r" reduce(?:-window)?\(", lowered.compile().as_text() or ""))
+
+
+def test_xla_does_not_search_free_points_as_it_compiles() -> None:
+    # It did so arena by arena, for minutes. What it cannot know it leaves to the program.
+    picks = jax.ShapeDtypeStruct((8, 2), jnp.float32)
+    score = jax.ShapeDtypeStruct((8, len(ROW)), jnp.int32)
+    free = np.zeros(len(ROW), np.int32)
+    known = jax.jit(jax.vmap(partial(_place_two, free))).lower(picks)
+    unknown = jax.jit(jax.vmap(_place_two)).lower(score, picks)
+    assert _reductions(known) == _reductions(unknown) > 0
