@@ -168,7 +168,8 @@ class AlgoConfig(Section):
         default="auto",
         metadata=about(
             "how gradients are computed; fused: also, minibatches of tiles of valid samples; "
-            "auto: fused on an NVIDIA GPU where the layers fit it"
+            "auto: fused on an NVIDIA GPU where the layers fit it; with memory, autodiff of the "
+            "rollouts of robots that something is learned from"
         ),
     )
     exploration: Literal["learned", "scheduled"] = field(

@@ -18,8 +18,9 @@ _LEAST_GENERATION = 8
 # Names that JAX has for products without tensor cores (`jax.default_matmul_precision`).
 _FULL = ("highest", "float32", "F32_F32_F32")
 
-# autodiff: `learner` alone; blocks: autodiff of a whole batch, block by block; fused: kernels.
-Backend = Literal["autodiff", "blocks", "fused"]
+# autodiff: `learner` alone; blocks: autodiff of a whole batch, block by block; fused: kernels;
+# sequences: autodiff of the sequences of robots that remember, without those of absent ones.
+Backend = Literal["autodiff", "blocks", "fused", "sequences"]
 Learn = Callable[
     [AlgoConfig, int, Progress, Minibatch, jax.Array, Shards], tuple[Progress, Metrics]
 ]
@@ -30,7 +31,8 @@ def resolve(config: AlgoConfig, observation_size: int, action_size: int) -> Back
 
     `auto` is `fused` on an NVIDIA GPU where the layers fit it, unless JAX's matrix products are to
     be in full precision: without tensor cores the kernels are slower than what XLA makes. A whole
-    batch on a CPU is taken in `blocks`; an accelerator has it all at once.
+    batch on a CPU is taken in `blocks`; an accelerator has it all at once. A policy with memory is
+    trained in `sequences`, on any device.
 
     Args:
         config: Of the learner.
@@ -43,8 +45,9 @@ def resolve(config: AlgoConfig, observation_size: int, action_size: int) -> Back
     Raises:
         ConfigError: `fused` is asked for where there is no such GPU, or of layers that do not fit.
     """
-    if config.memory != "none":  # the faster ways take samples one by one
-        return "autodiff"
+    if config.memory != "none":  # the other faster ways take samples one by one
+        left = config.update_backend == "auto"
+        return "sequences" if left and _has_fast() else "autodiff"
     if _fuses(config, observation_size, action_size):
         return "fused"
     whole = config.num_minibatches == 1 and jax.default_backend() == "cpu"
@@ -61,6 +64,10 @@ def find(backend: Backend) -> Learn | None:
         from swarmjax.ppo.fast import blocks
 
         return blocks.learn
+    if backend == "sequences":
+        from swarmjax.ppo.fast import sequences
+
+        return sequences.learn
     return None
 
 

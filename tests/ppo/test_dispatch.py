@@ -95,12 +95,24 @@ def test_a_critic_that_sees_the_state_has_autodiff(monkeypatch: pytest.MonkeyPat
     assert dispatch.resolve(AlgoConfig(critic="state"), OBSERVATION, ACTION) == "autodiff"
 
 
+def test_a_memory_is_trained_in_sequences_on_any_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = AlgoConfig(memory="gru", num_minibatches=1)
+    asked = AlgoConfig(memory="gru", update_backend="autodiff")
+    assert dispatch.resolve(config, OBSERVATION, ACTION) == "sequences"
+    assert dispatch.resolve(asked, OBSERVATION, ACTION) == "autodiff"
+    _on(monkeypatch, compute_capability="9.0")
+    assert dispatch.resolve(config, OBSERVATION, ACTION) == "sequences"
+    assert dispatch.resolve(asked, OBSERVATION, ACTION) == "autodiff"
+
+
 def test_without_the_faster_ways_there_is_autodiff(monkeypatch: pytest.MonkeyPatch) -> None:
     assert dispatch.find("blocks") is not None
     assert dispatch.find("fused") is not None
+    assert dispatch.find("sequences") is not None
     assert dispatch.find("autodiff") is None
     monkeypatch.setitem(sys.modules, "swarmjax.ppo.fast", None)  # cannot be imported
     assert dispatch.resolve(AlgoConfig(num_minibatches=1), OBSERVATION, ACTION) == "autodiff"
+    assert dispatch.resolve(AlgoConfig(memory="gru"), OBSERVATION, ACTION) == "autodiff"
     _on(monkeypatch, compute_capability="9.0")
     assert dispatch.resolve(AlgoConfig(), OBSERVATION, ACTION) == "autodiff"
     with pytest.raises(ConfigError, match=r"swarmjax\.ppo\.fast cannot be imported"):

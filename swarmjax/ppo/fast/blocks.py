@@ -113,12 +113,26 @@ def gradient(
         block = jax.tree.map(lambda x: x[i], blocks.samples)
         return jax.grad(losses.ppo_loss, has_aux=True)(params, block, config, expected_valid)
 
-    def add(i: jax.Array, total: tuple[Params, Metrics]) -> tuple[Params, Metrics]:
-        return jax.tree.map(jnp.add, total, of_block(i))
+    return add_up(blocks.used, of_block)
 
-    shapes = jax.eval_shape(lambda: of_block(0))
+
+def add_up[T](count: jax.Array, part: Callable[[jax.Array | int], T]) -> T:
+    """Adds up what is computed part by part, such as gradients of a sum over samples.
+
+    Args:
+        count: [], int32, how many parts there are.
+        part: Computes one, a tree of arrays, from its number.
+
+    Returns:
+        The sum; 0 if there is none.
+    """
+
+    def add(i: jax.Array, total: T) -> T:
+        return jax.tree.map(jnp.add, total, part(i))
+
+    shapes = jax.eval_shape(lambda: part(0))
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    return jax.lax.fori_loop(0, blocks.used, add, nothing)
+    return jax.lax.fori_loop(0, count, add, nothing)
 
 
 def in_turn[**P, T](function: Callable[P, T]) -> Callable[P, T]:

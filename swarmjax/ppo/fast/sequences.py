@@ -1,0 +1,196 @@
+"""Updates of policies with memory, in minibatches of the sequences that something is learned from.
+
+A sequence is the rollout of one robot. Those of robots that are absent, or that had arrived before
+the rollout began, hold no valid sample; they are never gone through. The others are shuffled one by
+one, and a minibatch is taken in tiles of a fixed number of them. The loss is a sum over samples, so
+the gradients of tiles add up.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from swarmjax.ppo import losses, optimizer
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.fast import blocks
+from swarmjax.ppo.losses import Metrics, Minibatch
+from swarmjax.ppo.networks import Params
+from swarmjax.ppo.optimizer import Progress
+from swarmjax.shards import ALONE, Shards
+
+# Sequences of a tile. On a CPU tiles of 32 take no longer than whole minibatches where all robots
+# take part, and fill up where few do. An accelerator waits for one step after the other, so a large
+# tile takes it little longer than a small one.
+CPU_TILE, TILE = 32, 2048
+
+
+class Dealt(NamedTuple):
+    """The useful sequences of a batch, dealt out to minibatches.
+
+    Attributes:
+        order: [Q], int32, all sequences; those of the first minibatch come first, the useless ones
+            last.
+        span: [M, 2], int32, where in `order` each minibatch begins, and where it has ended.
+    """
+
+    order: jax.Array
+    span: jax.Array
+
+
+def learn(
+    config: AlgoConfig,
+    updates: int,
+    begun: Progress,
+    samples: Minibatch,
+    key: jax.Array,
+    shards: Shards = ALONE,
+) -> tuple[Progress, Metrics]:
+    """Learns from a batch, in minibatches of useful sequences.
+
+    Args:
+        config: Of networks with memory.
+        updates: Number of updates of the whole run.
+        begun: Parameters and the optimiser's state.
+        samples: [G, N, ...], zero where not valid, ordered by step.
+        key: Random key, consumed.
+        shards: How the samples are spread over devices.
+
+    Returns:
+        Parameters and the optimiser's state after, and the metrics of each step, [epochs, M].
+    """
+    rows = arrange(samples, config.rollout_length)
+    expected_valid = shards.sum(jnp.sum(samples.valid)) / config.num_minibatches
+
+    def epoch(progress: Progress, key: jax.Array) -> tuple[Progress, Metrics]:
+        dealt = deal(key, jnp.any(rows.valid, axis=1), config.num_minibatches, shards)
+
+        def step(progress: Progress, span: jax.Array) -> tuple[Progress, Metrics]:
+            found = gradient(progress[0], rows, dealt.order, span, config, expected_valid)
+            return optimizer.take(config, updates, progress, found, span[1] > span[0], shards)
+
+        return jax.lax.scan(step, progress, dealt.span)
+
+    return jax.lax.scan(epoch, begun, jax.random.split(key, config.epochs))
+
+
+def arrange(samples: Minibatch, steps: int) -> Minibatch:
+    """Lays samples out by sequence.
+
+    Args:
+        samples: [G, T S, ...], and memory [G, S, H].
+        steps: T.
+
+    Returns:
+        [Q, T, ...] and memory [Q, H], with Q = G S: the robots of the first group come first.
+    """
+
+    def by_sequence(x: jax.Array) -> jax.Array:
+        split = x.reshape(x.shape[0], steps, -1, *x.shape[2:])
+        return jnp.moveaxis(split, 1, 2).reshape(-1, steps, *x.shape[2:])
+
+    memory = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), samples.memory)
+    return replace(jax.tree.map(by_sequence, replace(samples, memory=None)), memory=memory)
+
+
+def deal(key: jax.Array, useful: jax.Array, minibatches: int, shards: Shards = ALONE) -> Dealt:
+    """Deals the useful sequences out to minibatches at random.
+
+    Each stream of random numbers deals its own, as evenly as they divide, so that a minibatch holds
+    the same sequences on any number of devices. Where a stream has fewer of them than there are
+    minibatches, the last minibatches get none of it.
+
+    Args:
+        key: Random key, the same on all devices, consumed.
+        useful: [Q], bool, which sequences of this device hold a valid sample.
+        minibatches: M.
+        shards: How the sequences are spread over devices.
+
+    Returns:
+        The minibatches of this device.
+    """
+    by_stream = useful.reshape(shards.local_streams, -1)
+    size = by_stream.shape[1]
+    drawn = shards.draw(key, lambda key: jax.random.uniform(key, (size,))).reshape(by_stream.shape)
+    shuffled = jnp.argsort(jnp.where(by_stream, drawn, jnp.inf), axis=1).astype(jnp.int32)
+    count = jnp.sum(by_stream, axis=1, keepdims=True, dtype=jnp.int32)
+    share, rest = count // minibatches, count % minibatches  # the first `rest` get one more
+    place, longer = jnp.arange(size, dtype=jnp.int32), rest * (share + 1)
+    beyond = rest + (place - longer) // jnp.maximum(share, 1)
+    dealt_to = jnp.where(place < longer, place // (share + 1), beyond)
+    dealt_to = jnp.where(place < count, dealt_to, minibatches)
+    first = size * jnp.arange(len(by_stream), dtype=jnp.int32)[:, None]
+    order = (first + shuffled).ravel()[jnp.argsort(dealt_to.ravel(), stable=True)]
+    end = jnp.cumsum(jnp.sum(share + (jnp.arange(minibatches) < rest), axis=0, dtype=jnp.int32))
+    return Dealt(order, jnp.stack([jnp.concatenate([jnp.zeros_like(end[:1]), end[:-1]]), end], 1))
+
+
+def gradient(
+    params: Params,
+    rows: Minibatch,
+    order: jax.Array,
+    span: jax.Array,
+    config: AlgoConfig,
+    expected_valid: jax.Array,
+) -> tuple[Params, Metrics]:
+    """Computes the gradient of `losses.ppo_loss` over the sequences of one minibatch.
+
+    Args:
+        params: Of actor and critic.
+        rows: As `arrange` gives them.
+        order: [Q], as `deal` gives it.
+        span: [2], int32, of the minibatch.
+        config: Clip range and costs.
+        expected_valid: [], valid samples of the whole batch / number of minibatches.
+
+    Returns:
+        The gradient, and the metrics of the loss; 0 if the span is empty.
+    """
+    size = tile_size(len(order), config.num_minibatches)
+
+    def of_tile(i: jax.Array | int) -> tuple[Params, Metrics]:
+        tile = take_tile(rows, order, span[0] + i * size, span[1], size)
+        return jax.grad(losses.ppo_loss, has_aux=True)(params, tile, config, expected_valid)
+
+    return blocks.add_up(tiles_of(span, size), of_tile)
+
+
+def tile_size(sequences: int, minibatches: int) -> int:
+    """Chooses how many sequences a tile has: no more than the fullest minibatch can have."""
+    most = CPU_TILE if jax.default_backend() == "cpu" else TILE
+    return min(most, -(-sequences // minibatches))
+
+
+def tiles_of(span: jax.Array, size: int) -> jax.Array:
+    """Counts the tiles of `size` sequences, [], that a span [2] of sequences takes."""
+    return (span[1] - span[0] + size - 1) // size
+
+
+def take_tile(
+    rows: Minibatch, order: jax.Array, start: jax.Array, end: jax.Array, size: int
+) -> Minibatch:
+    """Takes the sequences of a tile, step by step.
+
+    Args:
+        rows: As `arrange` gives them.
+        order: [Q], as `deal` gives it.
+        start: [], int32, place in `order` of the tile's first sequence.
+        end: [], int32, where the minibatch has ended. What the tile holds from there on is not
+            valid.
+        size: Sequences of the tile.
+
+    Returns:
+        [T size, ...], ordered by step, and memory [size, H].
+    """
+    place = start + jnp.arange(size, dtype=jnp.int32)
+    which = order[jnp.minimum(place, len(order) - 1)]
+    tile = jax.tree.map(lambda x: x[which], rows)
+    tile = replace(tile, valid=tile.valid.astype(bool) & (place < end)[:, None])
+    flat = jax.tree.map(_by_step, replace(tile, memory=None))
+    return replace(flat, memory=tile.memory)
+
+
+def _by_step(x: jax.Array) -> jax.Array:
+    """Turns sequences [B, T, ...] into samples [T B, ...]."""
+    return jnp.moveaxis(x, 1, 0).reshape(-1, *x.shape[2:])

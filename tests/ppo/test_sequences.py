@@ -1,0 +1,220 @@
+"""Policies with memory learn from useful sequences as they do from all, and from no others."""
+
+from dataclasses import replace
+from functools import partial
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmjax.ppo import learner as ppo
+from swarmjax.ppo import losses
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.dispatch import Backend
+from swarmjax.ppo.fast import sequences
+from swarmjax.ppo.learner import Batch, LearnerState
+from swarmjax.ppo.losses import Metrics, Minibatch
+from swarmjax.ppo.memory import Recall
+from swarmjax.shards import Shards
+
+GROUPS, ROBOTS, STEPS, SIZE, UPDATES = 4, 5, 8, 3, 10
+OBSERVATION, ACTION = 6, 2
+CONFIG = AlgoConfig(
+    memory="gru",
+    memory_size=SIZE,
+    hidden_sizes=(4,),
+    num_minibatches=1,
+    epochs=1,
+    rollout_length=STEPS,
+    entropy_cost=0.01,
+    max_grad_norm=None,  # a clipped gradient would have a right length if it were wrong
+)
+# Of 5 robots: two with all steps, one whose last is the fourth, and two that are absent.
+ENDS = np.array([STEPS, STEPS, 4, 0, 0])
+USEFUL = 3 * GROUPS
+
+
+@pytest.fixture(autouse=True)
+def _small_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sequences, "CPU_TILE", 5)  # 12 sequences: two tiles and a part of one
+
+
+def _batch(seed: int = 0, ends: np.ndarray = ENDS) -> Batch:
+    rng = np.random.default_rng(seed)
+    shape = (GROUPS, STEPS, ROBOTS)
+
+    def drawn(*more: int) -> jax.Array:
+        return jnp.array(rng.normal(size=(GROUPS, STEPS * ROBOTS, *more)), jnp.float32)
+
+    valid = np.broadcast_to(np.arange(STEPS)[:, None] < ends, shape)
+    begins = np.zeros(shape, bool)
+    begins[1, 5] = begins[2, 2, 1] = True  # borders of episodes, of an arena and of one robot
+    return Batch(
+        observation=drawn(OBSERVATION),
+        action=drawn(ACTION),
+        log_prob=jnp.full((GROUPS, STEPS * ROBOTS), -2.5),
+        advantage=drawn(),
+        return_=drawn(),
+        valid=jnp.array(valid.reshape(GROUPS, -1)),
+        memory=Recall(*jnp.array(rng.normal(size=(2, GROUPS, ROBOTS, SIZE)), jnp.float32)),
+        begins=jnp.array(begins.reshape(GROUPS, -1)),
+    )
+
+
+def _learner(seed: int = 0) -> LearnerState:
+    return ppo.init(jax.random.key(seed), CONFIG, OBSERVATION, ACTION, UPDATES)
+
+
+@partial(jax.jit, static_argnums=(2, 3))
+def _update(
+    learner: LearnerState, batch: Batch, config: AlgoConfig, backend: Backend = "sequences"
+) -> tuple[LearnerState, Metrics]:
+    return ppo.update(learner, config, batch, jax.random.key(1), UPDATES, backend)
+
+
+def _samples(batch: Batch) -> Minibatch:
+    return ppo._samples(_learner(), CONFIG, batch, ppo.ALONE)
+
+
+def test_a_gradient_by_tiles_is_that_of_all_samples_at_once() -> None:
+    samples, params = _samples(_batch()), _learner().params
+    count = jnp.sum(samples.valid)
+    rows = sequences.arrange(samples, STEPS)
+    dealt = sequences.deal(jax.random.key(3), rows.valid.any(axis=1), 1)
+    found = sequences.gradient(params, rows, dealt.order, dealt.span[0], CONFIG, count)
+    whole = ppo._gather(samples, jnp.arange(GROUPS), CONFIG)
+    expected = jax.grad(losses.ppo_loss, has_aux=True)(params, whole, CONFIG, count)
+    # Sums of 80 float32 of order 1 to 100 in another order.
+    chex.assert_trees_all_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_learner_learns_as_by_autodiff() -> None:
+    found, expected = (
+        _update(_learner(), _batch(), CONFIG, name) for name in ("sequences", "autodiff")
+    )
+    chex.assert_trees_all_equal_structs(found, expected)
+    # Of Adam's first step, 1e-3 long, gradients that differ by rounding leave a hundredth.
+    chex.assert_trees_all_close(found, expected, rtol=1e-4, atol=1e-5)
+    moved = jax.tree.map(lambda a, b: np.abs(a - b).max(), found[0].params, _learner().params)
+    assert min(jax.tree.leaves(moved)) > 1e-4
+
+
+@pytest.mark.parametrize(("minibatches", "streams"), [(1, 1), (2, 1), (3, 1), (16, 1), (2, 4)])
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_every_useful_sequence_is_dealt_once(minibatches: int, streams: int, share: float) -> None:
+    useful = np.random.default_rng(0).uniform(size=48) < share
+    shards = Shards(streams=streams)
+    order, span = sequences.deal(jax.random.key(0), jnp.array(useful), minibatches, shards)
+    dealt = [np.asarray(order)[first:end] for first, end in np.asarray(span)]
+    np.testing.assert_array_equal(np.sort(np.concatenate(dealt)), np.flatnonzero(useful))
+    np.testing.assert_array_equal(np.sort(order), np.arange(48))
+    for stream in range(streams):
+        mine = [np.sum(each // (48 // streams) == stream) for each in dealt]
+        assert max(mine) - min(mine) <= 1
+
+
+def test_sequences_are_dealt_anew_with_another_key() -> None:
+    useful = jnp.ones(48, bool)
+    first, second = (
+        set(np.asarray(sequences.deal(jax.random.key(seed), useful, 2).order[:24]))
+        for seed in (0, 1)
+    )
+    # That two halves of 48 drawn at random are the same, or as good as apart, is below 1e-8.
+    assert 2 < len(first & second) < 22
+
+
+def test_a_minibatch_goes_through_its_sequences_and_no_others() -> None:
+    """Each sequence is told by its memory, and each sample by its return."""
+    batch = _batch()
+    name = jnp.arange(GROUPS * ROBOTS, dtype=jnp.float32).reshape(GROUPS, 1, ROBOTS)
+    step = jnp.arange(STEPS, dtype=jnp.float32)[:, None]
+    memory = jnp.broadcast_to(name[:, 0, :, None], (GROUPS, ROBOTS, SIZE))
+    batch = replace(
+        batch,
+        return_=(100 * step + name).reshape(GROUPS, -1),
+        valid=jnp.ones_like(batch.valid),
+        memory=Recall(memory, memory),
+    )
+    rows = sequences.arrange(_samples(batch), STEPS)
+    order = jnp.array([7, 3, 19, 0, *[1] * 16])
+    tile = sequences.take_tile(rows, order, jnp.int32(1), jnp.int32(3), 4)
+    taken = np.array([3, 19, 0, 1])
+    assert tile.memory is not None
+    np.testing.assert_array_equal(tile.memory.actor[:, 0], taken)
+    np.testing.assert_array_equal(
+        tile.return_.reshape(STEPS, 4), 100 * np.arange(STEPS)[:, None] + taken
+    )
+    np.testing.assert_array_equal(tile.valid.reshape(STEPS, 4), [[True, True, False, False]] * 8)
+
+
+@pytest.mark.parametrize(("useful", "tiles"), [(0, 0), (1, 1), (5, 1), (6, 2), (40, 8)])
+def test_tiles_follow_useful_sequences_and_not_robots(useful: int, tiles: int) -> None:
+    for robots in (40, 400):
+        marked = jnp.arange(robots) < useful
+        span = sequences.deal(jax.random.key(0), marked, 1).span[0]
+        size = sequences.tile_size(robots, 1)
+        assert size == 5
+        assert int(sequences.tiles_of(span, size)) == tiles
+
+
+def test_a_tile_holds_no_more_than_the_fullest_minibatch() -> None:
+    assert sequences.tile_size(sequences=12, minibatches=4) == 3
+
+
+def test_absent_robots_may_hold_nan() -> None:
+    batch = _batch()
+    absent = jnp.tile(ENDS == 0, STEPS)
+
+    def spoil(x: jax.Array) -> jax.Array:
+        return jnp.where(absent.reshape(-1, *[1] * (x.ndim - 2)), jnp.nan, x)
+
+    spoilt = replace(
+        batch,
+        observation=spoil(batch.observation),
+        action=spoil(batch.action),
+        log_prob=spoil(batch.log_prob),
+        advantage=spoil(batch.advantage),
+        return_=spoil(batch.return_),
+        memory=jax.tree.map(lambda x: x.at[:, ENDS == 0].set(jnp.nan), batch.memory),
+    )
+    found, expected = (_update(_learner(), each, CONFIG) for each in (spoilt, batch))
+    assert float(found[1]["skipped_steps"]) == 0.0
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+
+
+def test_a_batch_of_nothing_valid_is_no_step() -> None:
+    begun = _learner()
+    after, metrics = _update(begun, _batch(ends=np.zeros(ROBOTS, int)), CONFIG)
+    jax.tree.map(np.testing.assert_array_equal, after.params, begun.params)
+    jax.tree.map(np.testing.assert_array_equal, after.optimizer_state, begun.optimizer_state)
+    assert float(metrics["skipped_steps"]) == 0.0
+    assert float(metrics["grad_norm"]) == 0.0
+
+
+def test_a_minibatch_without_a_sequence_is_no_step() -> None:
+    config = replace(CONFIG, num_minibatches=4, epochs=3)
+    batch = _batch()
+    alone = jnp.zeros_like(batch.valid).at[2, ROBOTS].set(True)  # robot 0 of an arena, one step
+    after, metrics = _update(_learner(), replace(batch, valid=alone), config)
+    counts = [
+        x for x in jax.tree.leaves(after.optimizer_state) if jnp.issubdtype(x.dtype, jnp.integer)
+    ]
+    assert counts
+    assert all(int(x) == 3 for x in counts)  # one step an epoch
+    assert float(metrics["grad_norm"]) > 0.0
+
+
+def test_learners_side_by_side_come_to_what_each_does_alone() -> None:
+    config = replace(CONFIG, num_minibatches=2, epochs=2)
+    ends = (ENDS, np.array([3, 0, 0, 0, 0]))  # the second has fewer tiles to go through
+    batches = [_batch(i, each) for i, each in enumerate(ends)]
+    learners = [_learner(i) for i in range(2)]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *zip(learners, batches, strict=True))
+    together = jax.vmap(lambda learner, batch: _update(learner, batch, config))(*stacked)
+    for i, (learner, batch) in enumerate(zip(learners, batches, strict=True)):
+        alone = _update(learner, batch, config)
+        mine = jax.tree.map(lambda x, i=i: x[i], together)
+        # Products of matrices side by side, through four steps of Adam of up to 1e-3.
+        chex.assert_trees_all_close(mine, alone, rtol=1e-4, atol=1e-5)
