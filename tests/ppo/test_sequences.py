@@ -33,7 +33,6 @@ CONFIG = AlgoConfig(
 )
 # Of 5 robots: two with all steps, one whose last is the fourth, and two that are absent.
 ENDS = np.array([STEPS, STEPS, 4, 0, 0])
-USEFUL = 3 * GROUPS
 
 
 @pytest.fixture(autouse=True)
@@ -78,12 +77,17 @@ def _samples(batch: Batch) -> Minibatch:
     return ppo._samples(_learner(), CONFIG, batch, ppo.ALONE)
 
 
-def test_a_gradient_by_tiles_is_that_of_all_samples_at_once() -> None:
+@pytest.mark.parametrize("minibatches", [1, 2])
+def test_gradients_of_minibatches_add_up_to_that_of_all_samples(minibatches: int) -> None:
     samples, params = _samples(_batch()), _learner().params
     count = jnp.sum(samples.valid)
     rows = sequences.arrange(samples, STEPS)
-    dealt = sequences.deal(jax.random.key(3), rows.valid.any(axis=1), 1)
-    found = sequences.gradient(params, rows, dealt.order, dealt.span[0], CONFIG, count)
+    dealt = sequences.deal(jax.random.key(3), rows.valid.any(axis=1), minibatches)
+    config = replace(CONFIG, num_minibatches=minibatches)
+    parts = [
+        sequences.gradient(params, rows, dealt.order, span, config, count) for span in dealt.span
+    ]
+    found = jax.tree.map(lambda *x: sum(x), *parts)
     whole = ppo._gather(samples, jnp.arange(GROUPS), CONFIG)
     expected = jax.grad(losses.ppo_loss, has_aux=True)(params, whole, CONFIG, count)
     # Sums of 80 float32 of order 1 to 100 in another order.
