@@ -92,16 +92,20 @@ def survey(level: Level, hull_radius: float) -> Roadmap:
     Returns:
       The corners, four an obstacle, and how far it is from there.
     """
-    corner = _corners(level, _CORNER * hull_radius)
-    usable = _is_free(corner, level, _WIDENED * hull_radius)
-    legs = _legs(corner, corner, level, hull_radius)
+    corner = jax.lax.optimization_barrier(_corners(level, _CORNER * hull_radius))
+    corners, targets = _locate(corner, level), _locate(level.target, level)
+    usable = jnp.all(jnp.abs(corner) <= 0.5 * level.side - _WIDENED * hull_radius, axis=-1)
+    usable &= ~_covers(corners, level, _WIDENED * hull_radius)
+    usable = jax.lax.optimization_barrier(usable)
+    legs = _legs(corners, corners, level, hull_radius)
     legs = jnp.where(usable[:, None] & usable[None, :], legs, jnp.inf)
-    direct = jnp.where(usable, _legs(level.target, corner, level, hull_radius), jnp.inf)
+    direct = jnp.where(usable, _legs(targets, corners, level, hull_radius), jnp.inf)
 
     def shorten(carry: tuple[Array, Array]) -> tuple[Array, Array]:
         # Bellman and Ford's step: a path may have one corner more.
         to_go, _ = carry
-        shorter = jnp.minimum(to_go, jnp.min(legs + to_go[:, None, :], axis=-1, initial=jnp.inf))
+        further = jnp.min(legs + to_go[:, None, :], axis=-1, initial=jnp.inf)
+        shorter = jnp.minimum(to_go, further)
         return shorter, jnp.any(shorter < to_go)
 
     to_go, _ = jax.lax.while_loop(lambda carry: carry[1], shorten, (direct, jnp.array(True)))
@@ -123,12 +127,24 @@ def measure(
     Returns:
       [R] m.
     """
-    reach = _WIDENED * hull_radius
-    barred = _is_barred(place[:, None], level.target[:, None], level, reach)[:, 0]
+    here, targets = _locate(place, level), _locate(level.target, level)
+    barred = _is_barred(here, targets, level, _WIDENED * hull_radius)
     direct = jnp.where(barred, jnp.inf, jnp.hypot(*(level.target - place).T))
-    around = _legs(place, roadmap.corner, level, hull_radius) + roadmap.to_go
+    around = _legs(here, _locate(roadmap.corner, level), level, hull_radius) + roadmap.to_go
     found = jnp.minimum(direct, jnp.min(around, axis=-1, initial=jnp.inf))
     return jnp.where(jnp.isfinite(found), found, otherwise)
+
+
+class _Places(NamedTuple):
+    """Places, [P, 2] x and y, m, and where they lie in the frames of the obstacles, [P, M] each."""
+
+    place: Array
+    x: Array
+    y: Array
+
+    def expand(self, axis: int) -> "_Places":
+        """Returns them with an axis for other places."""
+        return _Places(*(jnp.expand_dims(each, axis) for each in self))
 
 
 def _corners(level: Level, off: float) -> Array:
@@ -141,46 +157,51 @@ def _corners(level: Level, off: float) -> Array:
     return corner.reshape(-1, 2)
 
 
-def _is_free(place: Array, level: Level, off: float) -> Array:
-    """Tells whether places [K, 2] lie in the arena, outside of obstacles widened by `off`."""
-    inside = jnp.all(jnp.abs(place) <= 0.5 * level.side - off, axis=-1)
-    return inside & ~_is_barred(place[:, None], place[:, None], level, off)[:, 0]
+def _locate(place: Array, level: Level) -> _Places:
+    """Turns places [P, 2] into coordinates in the frames of the obstacles."""
+    x, y, yaw = level.obstacle[:, :3].T
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    to_x, to_y = place[:, :1] - x, place[:, 1:] - y
+    local = cos * to_x + sin * to_y, cos * to_y - sin * to_x
+    # Pairs of places look at this. Without the barrier XLA puts all of it into the code of each
+    # pair, and compiles that for minutes on a GPU.
+    return _Places(place, *jax.lax.optimization_barrier(local))
 
 
-def _legs(begin: Array, end: Array, level: Level, hull_radius: float) -> Array:
-    """Measures the straight ways [B, E] from places [B, 2] to others [E, 2]; inf where barred."""
-    barred = _is_barred(begin[:, None], end[None], level, _WIDENED * hull_radius)
-    away = end[None] - begin[:, None]
+def _covers(places: _Places, level: Level, off: float) -> Array:
+    """Tells which places [P] lie within an obstacle that is widened by `off`, m."""
+    half_x, half_y = (level.obstacle[:, 3:] + off).T
+    within = (jnp.abs(places.x) < half_x) & (jnp.abs(places.y) < half_y)
+    return jnp.any(within & level.obstacle_present, axis=-1)
+
+
+def _legs(begin: _Places, end: _Places, level: Level, hull_radius: float) -> Array:
+    """Measures the straight ways [B, E] from B places to E others; inf where barred."""
+    begin, end = begin.expand(1), end.expand(0)
+    barred = _is_barred(begin, end, level, _WIDENED * hull_radius)
+    away = end.place - begin.place
     return jnp.where(barred, jnp.inf, jnp.hypot(away[..., 0], away[..., 1]))
 
 
-def _is_barred(begin: Array, end: Array, level: Level, off: float) -> Array:
+def _is_barred(begin: _Places, end: _Places, level: Level, off: float) -> Array:
     """Tells whether segments meet an obstacle that is widened by `off`.
 
     Args:
-      begin: [..., 2] x and y, m; axes broadcast.
-      end: [..., 2].
+      begin: where they begin; leading axes broadcast.
+      end: where they end.
       level: whose obstacles.
       off: m.
 
     Returns:
       [...]. By separating axes (Ericson 2005, "Real-Time Collision Detection", section 5.3.3).
     """
-    x, y, yaw, half_x, half_y = level.obstacle.T
-    half_x, half_y = half_x + off, half_y + off
-    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-
-    def into_frames(place: Array) -> tuple[Array, Array]:
-        to_x, to_y = place[..., :1] - x, place[..., 1:] - y
-        return cos * to_x + sin * to_y, cos * to_y - sin * to_x
-
-    (begin_x, begin_y), (end_x, end_y) = into_frames(begin), into_frames(end)
-    middle_x, middle_y = 0.5 * (begin_x + end_x), 0.5 * (begin_y + end_y)
-    reach_x, reach_y = 0.5 * jnp.abs(end_x - begin_x), 0.5 * jnp.abs(end_y - begin_y)
-    across = 0.5 * (middle_x * (end_y - begin_y) - middle_y * (end_x - begin_x))
+    half_x, half_y = (level.obstacle[:, 3:] + off).T
+    middle_x, middle_y = 0.5 * (begin.x + end.x), 0.5 * (begin.y + end.y)
+    reach_x, reach_y = 0.5 * (end.x - begin.x), 0.5 * (end.y - begin.y)
+    across = middle_x * reach_y - middle_y * reach_x
     meets = (
-        (jnp.abs(middle_x) < half_x + reach_x)
-        & (jnp.abs(middle_y) < half_y + reach_y)
-        & (jnp.abs(across) < half_x * reach_y + half_y * reach_x)
+        (jnp.abs(middle_x) < half_x + jnp.abs(reach_x))
+        & (jnp.abs(middle_y) < half_y + jnp.abs(reach_y))
+        & (jnp.abs(across) < half_x * jnp.abs(reach_y) + half_y * jnp.abs(reach_x))
     )
     return jnp.any(meets & level.obstacle_present, axis=-1)

@@ -158,13 +158,13 @@ def test_tiles_follow_useful_sequences_and_not_robots(useful: int, tiles: int) -
     for robots in (40, 400):
         marked = jnp.arange(robots) < useful
         span = sequences.deal(jax.random.key(0), marked, 1).span[0]
-        size = sequences.tile_size(robots, 1)
+        size = sequences.tile_size(robots, 1, STEPS)
         assert size == 5
         assert int(sequences.tiles_of(span, size)) == tiles
 
 
 def test_a_tile_holds_no_more_than_the_fullest_minibatch() -> None:
-    assert sequences.tile_size(sequences=12, minibatches=4) == 3
+    assert sequences.tile_size(sequences=12, minibatches=4, steps=STEPS) == 3
 
 
 def test_absent_robots_may_hold_nan() -> None:

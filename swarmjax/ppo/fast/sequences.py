@@ -21,9 +21,11 @@ from swarmjax.ppo.optimizer import Progress
 from swarmjax.shards import ALONE, Shards
 
 # Sequences of a tile. On a CPU tiles of 32 take no longer than whole minibatches where all robots
-# take part, and fill up where few do. An accelerator waits for one step after the other, so a large
-# tile takes it little longer than a small one.
-CPU_TILE, TILE = 32, 2048
+# take part, and fill up where few do.
+CPU_TILE = 32
+# Samples of a tile elsewhere. An accelerator waits for one step after the other, so a large tile
+# takes it little longer than a small one; this many take about 12 GB with default layers.
+TILE_SAMPLES = 2**21
 
 
 class Dealt(NamedTuple):
@@ -147,7 +149,7 @@ def gradient(
     Returns:
         The gradient, and the metrics of the loss; 0 if the span is empty.
     """
-    size = tile_size(len(order), config.num_minibatches)
+    size = tile_size(len(order), config.num_minibatches, config.rollout_length)
 
     def of_tile(i: jax.Array | int) -> tuple[Params, Metrics]:
         tile = take_tile(rows, order, span[0] + i * size, span[1], size)
@@ -156,10 +158,20 @@ def gradient(
     return blocks.add_up(tiles_of(span, size), of_tile)
 
 
-def tile_size(sequences: int, minibatches: int) -> int:
-    """Chooses how many sequences a tile has: no more than the fullest minibatch can have."""
-    most = CPU_TILE if jax.default_backend() == "cpu" else TILE
-    return min(most, -(-sequences // minibatches))
+def tile_size(sequences: int, minibatches: int, steps: int) -> int:
+    """Chooses how many sequences a tile has, so that few tiles fill the fullest minibatch.
+
+    Args:
+        sequences: Q, of the batch.
+        minibatches: M.
+        steps: T, of a sequence.
+
+    Returns:
+        At most `CPU_TILE` or `TILE_SAMPLES`, at least 1.
+    """
+    most = CPU_TILE if jax.default_backend() == "cpu" else max(1, TILE_SAMPLES // steps)
+    fullest = -(-sequences // minibatches)
+    return -(-fullest // -(-fullest // most))
 
 
 def tiles_of(span: jax.Array, size: int) -> jax.Array:
