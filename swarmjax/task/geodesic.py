@@ -11,6 +11,8 @@ to three centimetres too long. What matters to a reward is which way round a pat
 gets shorter on the way.
 """
 
+import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -136,15 +138,11 @@ def measure(
 
 
 class _Places(NamedTuple):
-    """Places, [P, 2] x and y, m, and where they lie in the frames of the obstacles, [P, M] each."""
+    """Places, [P, 2] x and y, m, and where they lie in the frames of the obstacles, [M, P] each."""
 
     place: Array
     x: Array
     y: Array
-
-    def expand(self, axis: int) -> "_Places":
-        """Returns them with an axis for other places."""
-        return _Places(*(jnp.expand_dims(each, axis) for each in self))
 
 
 def _corners(level: Level, off: float) -> Array:
@@ -159,9 +157,9 @@ def _corners(level: Level, off: float) -> Array:
 
 def _locate(place: Array, level: Level) -> _Places:
     """Turns places [P, 2] into coordinates in the frames of the obstacles."""
-    x, y, yaw = level.obstacle[:, :3].T
+    x, y, yaw = (each[:, None] for each in level.obstacle[:, :3].T)
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-    to_x, to_y = place[:, :1] - x, place[:, 1:] - y
+    to_x, to_y = place[:, 0] - x, place[:, 1] - y
     local = cos * to_x + sin * to_y, cos * to_y - sin * to_x
     # Pairs of places look at this. Without the barrier XLA puts all of it into the code of each
     # pair, and compiles that for minutes on a GPU.
@@ -170,24 +168,30 @@ def _locate(place: Array, level: Level) -> _Places:
 
 def _covers(places: _Places, level: Level, off: float) -> Array:
     """Tells which places [P] lie within an obstacle that is widened by `off`, m."""
-    half_x, half_y = (level.obstacle[:, 3:] + off).T
-    within = (jnp.abs(places.x) < half_x) & (jnp.abs(places.y) < half_y)
-    return jnp.any(within & level.obstacle_present, axis=-1)
+
+    def within(i: int) -> Array:
+        half_x, half_y = level.obstacle[i, 3] + off, level.obstacle[i, 4] + off
+        inside = (jnp.abs(places.x[i]) < half_x) & (jnp.abs(places.y[i]) < half_y)
+        return inside & level.obstacle_present[i]
+
+    return _any(within, places.x)
 
 
 def _legs(begin: _Places, end: _Places, level: Level, hull_radius: float) -> Array:
     """Measures the straight ways [B, E] from B places to E others; inf where barred."""
-    begin, end = begin.expand(1), end.expand(0)
-    barred = _is_barred(begin, end, level, _WIDENED * hull_radius)
-    away = end.place - begin.place
-    return jnp.where(barred, jnp.inf, jnp.hypot(away[..., 0], away[..., 1]))
+    away_x, away_y = (end.place[None] - begin.place[:, None]).transpose(2, 0, 1)
+    rows = _Places(begin.place, begin.x[:, :, None], begin.y[:, :, None])
+    columns = _Places(end.place, end.x[:, None], end.y[:, None])
+    barred = _is_barred(rows, columns, level, _WIDENED * hull_radius)
+    legs = jnp.where(barred, jnp.inf, jnp.hypot(away_x, away_y))
+    return jax.lax.optimization_barrier(legs)
 
 
 def _is_barred(begin: _Places, end: _Places, level: Level, off: float) -> Array:
     """Tells whether segments meet an obstacle that is widened by `off`.
 
     Args:
-      begin: where they begin; leading axes broadcast.
+      begin: where they begin; the axes behind that of the obstacles broadcast.
       end: where they end.
       level: whose obstacles.
       off: m.
@@ -195,13 +199,27 @@ def _is_barred(begin: _Places, end: _Places, level: Level, off: float) -> Array:
     Returns:
       [...]. By separating axes (Ericson 2005, "Real-Time Collision Detection", section 5.3.3).
     """
-    half_x, half_y = (level.obstacle[:, 3:] + off).T
-    middle_x, middle_y = 0.5 * (begin.x + end.x), 0.5 * (begin.y + end.y)
-    reach_x, reach_y = 0.5 * (end.x - begin.x), 0.5 * (end.y - begin.y)
-    across = middle_x * reach_y - middle_y * reach_x
-    meets = (
-        (jnp.abs(middle_x) < half_x + jnp.abs(reach_x))
-        & (jnp.abs(middle_y) < half_y + jnp.abs(reach_y))
-        & (jnp.abs(across) < half_x * jnp.abs(reach_y) + half_y * jnp.abs(reach_x))
-    )
-    return jnp.any(meets & level.obstacle_present, axis=-1)
+
+    def meets(i: int) -> Array:
+        half_x, half_y = level.obstacle[i, 3] + off, level.obstacle[i, 4] + off
+        middle_x, middle_y = 0.5 * (begin.x[i] + end.x[i]), 0.5 * (begin.y[i] + end.y[i])
+        reach_x, reach_y = 0.5 * (end.x[i] - begin.x[i]), 0.5 * (end.y[i] - begin.y[i])
+        across = middle_x * reach_y - middle_y * reach_x
+        reach_x, reach_y = jnp.abs(reach_x), jnp.abs(reach_y)
+        return (
+            (jnp.abs(middle_x) < half_x + reach_x)
+            & (jnp.abs(middle_y) < half_y + reach_y)
+            & (jnp.abs(across) < half_x * reach_y + half_y * reach_x)
+            & level.obstacle_present[i]
+        )
+
+    return _any(meets, begin.x + end.x)
+
+
+def _any(of: Callable[[int], Array], like: Array) -> Array:
+    """Tells whether something holds of any obstacle, [...]; `like` is [M, ...].
+
+    Term by term: as a reduction XLA compiles it for minutes on a GPU.
+    """
+    nothing = jnp.zeros(like.shape[1:], bool)
+    return functools.reduce(jnp.logical_or, map(of, range(like.shape[0])), nothing)
