@@ -11,7 +11,6 @@ to three centimetres too long. What matters to a reward is which way round a pat
 gets shorter on the way.
 """
 
-import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -62,6 +61,7 @@ def begin(level: Level, hull_radius: float) -> Path:
     Returns:
       The paths from where robots start. A robot that has none is as far away as the straight line.
     """
+    level = jax.tree.map(jnp.asarray, level)
     roadmap = survey(level, hull_radius)
     start = level.start[:, :2]
     straight = jnp.hypot(*(level.target - start).T)
@@ -169,7 +169,7 @@ def _locate(place: Array, level: Level) -> _Places:
 def _covers(places: _Places, level: Level, off: float) -> Array:
     """Tells which places [P] lie within an obstacle that is widened by `off`, m."""
 
-    def within(i: int) -> Array:
+    def within(i: Array) -> Array:
         half_x, half_y = level.obstacle[i, 3] + off, level.obstacle[i, 4] + off
         inside = (jnp.abs(places.x[i]) < half_x) & (jnp.abs(places.y[i]) < half_y)
         return inside & level.obstacle_present[i]
@@ -200,7 +200,7 @@ def _is_barred(begin: _Places, end: _Places, level: Level, off: float) -> Array:
       [...]. By separating axes (Ericson 2005, "Real-Time Collision Detection", section 5.3.3).
     """
 
-    def meets(i: int) -> Array:
+    def meets(i: Array) -> Array:
         half_x, half_y = level.obstacle[i, 3] + off, level.obstacle[i, 4] + off
         middle_x, middle_y = 0.5 * (begin.x[i] + end.x[i]), 0.5 * (begin.y[i] + end.y[i])
         reach_x, reach_y = 0.5 * (end.x[i] - begin.x[i]), 0.5 * (end.y[i] - begin.y[i])
@@ -216,10 +216,13 @@ def _is_barred(begin: _Places, end: _Places, level: Level, off: float) -> Array:
     return _any(meets, begin.x + end.x)
 
 
-def _any(of: Callable[[int], Array], like: Array) -> Array:
+def _any(of: Callable[[Array], Array], like: Array) -> Array:
     """Tells whether something holds of any obstacle, [...]; `like` is [M, ...].
 
-    Term by term: as a reduction XLA compiles it for minutes on a GPU.
+    One obstacle after the other: as a reduction, or written out, XLA compiles it for minutes on a
+    GPU.
     """
     nothing = jnp.zeros(like.shape[1:], bool)
-    return functools.reduce(jnp.logical_or, map(of, range(like.shape[0])), nothing)
+    if not len(like):
+        return nothing
+    return jax.lax.fori_loop(0, like.shape[0], lambda i, found: found | of(i), nothing)

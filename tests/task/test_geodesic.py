@@ -88,6 +88,7 @@ def test_a_robot_without_a_path_keeps_its_distance() -> None:
     drawn = _level([-0.3, 0.0], [0.3, 0.0], walls)
     path = geodesic.begin(drawn, HULL)
     assert float(path.distance[0]) == pytest.approx(0.6, abs=ROUND)
+    drawn = jax.tree.map(jnp.asarray, drawn)
     later = geodesic.go_on(path, jnp.array([[-0.1, 0.2]]), drawn, HULL)
     assert float(later.distance[0]) == pytest.approx(0.6, abs=ROUND)
 
