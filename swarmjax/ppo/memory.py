@@ -71,15 +71,10 @@ class Gru(nn.Module):
             memory = remember(seen, recurrent(memory), memory)
             return jnp.concatenate([features, memory], axis=-1), memory
         chex.assert_equal_shape_prefix([features, begins], begins.ndim)
-
-        def step(memory: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[Any, Any]:
-            seen, begins = now
-            memory = jnp.where(begins[..., None], 0.0, memory)
-            memory = remember(seen, recurrent(memory), memory)
-            return memory, memory
-
-        memory, every = jax.lax.scan(step, memory, (seen, begins), unroll=_UNROLL)
-        return jnp.concatenate([features, every], axis=-1), memory
+        recurrent(memory)  # has its weights from here on, also while they are drawn
+        weights = recurrent.variables["params"]
+        every = remember_all(weights["kernel"], weights["bias"], seen, begins, memory)
+        return jnp.concatenate([features, every], axis=-1), every[-1]
 
     def _layer(self, kernel: Any, name: str) -> nn.Dense:
         """Makes what the three gates add up to, side by side."""
@@ -112,6 +107,71 @@ def remember(seen: jax.Array, recalled: jax.Array, memory: jax.Array) -> jax.Arr
     fresh = jnp.tanh(candidate + nn.sigmoid(reset + reset_) * candidate_)
     kept = nn.sigmoid(update + update_)
     return fresh + kept * (memory - fresh)
+
+
+@jax.custom_vjp
+def remember_all(
+    kernel: jax.Array, bias: jax.Array, seen: jax.Array, begins: jax.Array, memory: jax.Array
+) -> jax.Array:
+    """Computes what is remembered after each observation of sequences.
+
+    Its gradient is that of `remember`, step by step. Only what one step needs of the next is
+    computed in turn; autodiff would also add the kernel's gradient up in turn, from products that
+    fill a small part of a GPU.
+
+    Args:
+        kernel: [H, 3 H] of what is recalled.
+        bias: [3 H] likewise.
+        seen: [T, B, 3 H], as `remember` takes it.
+        begins: [T, B], whether an episode begins with the step.
+        memory: [B, H] before the first.
+
+    Returns:
+        The memory [T, B, H] after each step.
+    """
+
+    def step(memory: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        seen, begins = now
+        memory = jnp.where(begins[..., None], 0.0, memory)
+        memory = remember(seen, memory @ kernel + bias, memory)
+        return memory, memory
+
+    return jax.lax.scan(step, memory, (seen, begins), unroll=_UNROLL)[1]
+
+
+def _remember_forward(
+    kernel: jax.Array, bias: jax.Array, seen: jax.Array, begins: jax.Array, memory: jax.Array
+) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    """Computes `remember_all`, and keeps what its gradient needs."""
+    every = remember_all(kernel, bias, seen, begins, memory)
+    return every, (kernel, bias, seen, begins, memory, every)
+
+
+def _remember_backward(kept: tuple[jax.Array, ...], slope: jax.Array) -> tuple[Any, ...]:
+    """Takes the gradient [T, B, H] by what is remembered back to all that it came from."""
+    kernel, bias, seen, begins, memory, every = kept
+    before = jnp.concatenate([memory[None], every[:-1]])
+    before = jnp.where(begins[..., None], 0.0, before)
+    recalled = before @ kernel + bias
+
+    def step(later: jax.Array, now: tuple[jax.Array, ...]) -> tuple[jax.Array, Any]:
+        seen, recalled, before, begins, slope = now
+        _, pull = jax.vjp(remember, seen, recalled, before)
+        by_seen, by_recalled, by_memory = pull(later + slope)
+        by_memory = by_memory + by_recalled @ kernel.T
+        return jnp.where(begins[..., None], 0.0, by_memory), (by_seen, by_recalled)
+
+    steps = (seen, recalled, before, begins, slope)
+    nothing = jnp.zeros_like(memory)
+    by_memory, (by_seen, by_recalled) = jax.lax.scan(
+        step, nothing, steps, reverse=True, unroll=_UNROLL
+    )
+    by_kernel = jnp.einsum("tbh,tbg->thg", before, by_recalled).sum(axis=0)
+    by_bias = by_recalled.sum(axis=tuple(range(by_recalled.ndim - 1)))
+    return by_kernel, by_bias, by_seen, None, by_memory
+
+
+remember_all.defvjp(_remember_forward, _remember_backward)
 
 
 def _recurrent(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
