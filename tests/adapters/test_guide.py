@@ -1,0 +1,26 @@
+"""The code of docs/adapters.md runs as it is written."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+_GUIDE = (Path(__file__).parents[2] / "docs" / "adapters.md").read_text()
+_BLOCKS = dict(re.findall(r"^## ([^\n]+)\n.*?^```python\n(.*?)^```", _GUIDE, re.M | re.S))
+_TORCH = ("Stable-Baselines3", "PyTorch")
+
+
+@pytest.mark.parametrize(
+    "section",
+    [
+        pytest.param(each, marks=pytest.mark.torch if each in _TORCH else pytest.mark.slow)
+        for each in _BLOCKS
+    ],
+)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # JAXopt's own, which Brax imports
+def test_the_code_of_a_section_runs(section: str) -> None:
+    exec(compile(_BLOCKS[section], f"docs/adapters.md, {section}", "exec"), {})
+
+
+def test_every_adapter_has_code() -> None:
+    assert len(_BLOCKS) == len(re.findall(r"^\| \[`", _GUIDE, re.M))
