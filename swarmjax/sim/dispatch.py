@@ -186,6 +186,20 @@ def _push_apart(impl: str, *, rubs: bool) -> Any:
     return importlib.import_module(f"swarmjax.sim.fast.{name}").push_apart
 
 
+def load_paths(impl: str) -> ModuleType | None:
+    """What finds shortest paths by Warp; None: plain JAX does.
+
+    Args:
+      impl: `jax` or `warp`.
+
+    Returns:
+      `swarmjax.sim.fast.paths_warp`, or None.
+    """
+    if impl != "warp" or _discs() is None:
+        return None
+    return importlib.import_module("swarmjax.sim.fast.paths_warp")
+
+
 def pieces(count: int, xp: Any) -> list[slice]:
     """Cuts an axis of things up as is fastest to go through.
 

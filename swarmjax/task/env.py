@@ -227,13 +227,16 @@ def reset(world: World, level: Level) -> EnvState:
         distance=sight.distance,
         apart=jnp.full((robots, len(sim_gaps.KINDS)), sim_gaps.CONTACT_PAUSE),
         episode=_no_episode(robots),
-        path=geodesic.begin(level, world.robot.hull_radius) if _asks_for_path(world) else None,
+        path=_begin_path(world, level),
     )
 
 
-def _asks_for_path(world: World) -> bool:
-    """Whether the reward looks at the shortest paths."""
-    return world.task.reward.path_progress != 0.0
+def _begin_path(world: World, level: Level) -> geodesic.Path | None:
+    """Finds the shortest paths, if the reward looks at them."""
+    if not world.task.reward.path_progress:
+        return None
+    fast = dispatch.load_paths(world.physics.engine.impl)
+    return geodesic.begin(level, world.robot.hull_radius, fast)
 
 
 def look_around(world: World, state: EnvState) -> Array:
@@ -290,7 +293,8 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     earned = _earned(world, state, sight, arrives, begins & active[:, None])
     path, before = state.path, state.path
     if before is not None:
-        path = geodesic.go_on(before, pose[:, :2], level, world.robot.hull_radius)
+        fast = dispatch.load_paths(world.physics.engine.impl)
+        path = geodesic.go_on(before, pose[:, :2], level, world.robot.hull_radius, fast)
         earned = earned._replace(path_before=before.distance, path=path.distance)
     if world.terms:
         earned = _fill(world, earned, state, action, pose)

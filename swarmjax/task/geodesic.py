@@ -12,13 +12,13 @@ gets shorter on the way.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from swarmjax.task.level import Level
+from swarmjax.task.level import PARKING, Level
 
 # Of the hull's radius: by how much obstacles are widened, and how far off corners lie. Contacts
 # are soft, so a robot that is pushed against a wall is a little nearer than its radius.
@@ -51,24 +51,25 @@ class Path(NamedTuple):
     distance: Array
 
 
-def begin(level: Level, hull_radius: float) -> Path:
+def begin(level: Level, hull_radius: float, fast: Any = None) -> Path:
     """Finds the paths of an episode.
 
     Args:
       level: what it starts from.
       hull_radius: of robots, m.
+      fast: what finds them by Warp, `swarmjax.sim.fast.paths_warp`; None: plain JAX.
 
     Returns:
       The paths from where robots start. A robot that has none is as far away as the straight line.
     """
     level = jax.tree.map(jnp.asarray, level)
-    roadmap = survey(level, hull_radius)
+    roadmap = survey(level, hull_radius, fast)
     start = level.start[:, :2]
     straight = jnp.hypot(*(level.target - start).T)
-    return Path(roadmap, measure(roadmap, start, level, hull_radius, straight))
+    return Path(roadmap, _measured(roadmap, start, level, hull_radius, fast, straight))
 
 
-def go_on(path: Path, place: Array, level: Level, hull_radius: float) -> Path:
+def go_on(path: Path, place: Array, level: Level, hull_radius: float, fast: Any = None) -> Path:
     """Measures the paths anew.
 
     Args:
@@ -76,25 +77,40 @@ def go_on(path: Path, place: Array, level: Level, hull_radius: float) -> Path:
       place: [R, 2] where the robots are now, m.
       level: of the episode.
       hull_radius: of robots, m.
+      fast: as of `begin`.
 
     Returns:
       The paths from there. A robot from where none is found keeps its distance.
     """
-    distance = measure(path.roadmap, place, level, hull_radius, path.distance)
+    distance = _measured(path.roadmap, place, level, hull_radius, fast, path.distance)
     return path._replace(distance=distance)
 
 
-def survey(level: Level, hull_radius: float) -> Roadmap:
+def _measured(
+    roadmap: Roadmap, place: Array, level: Level, hull_radius: float, fast: Any, otherwise: Array
+) -> Array:
+    """Returns the distances [R], those of `otherwise` where no path leads."""
+    distance = measure(roadmap, place, level, hull_radius, fast)
+    return jnp.where(jnp.isfinite(distance), distance, otherwise)
+
+
+def survey(level: Level, hull_radius: float, fast: Any = None) -> Roadmap:
     """Solves the visibility graph of a level for the targets of its robots.
 
     Args:
       level: of which obstacles and targets count.
       hull_radius: of robots, m.
+      fast: as of `begin`.
 
     Returns:
       The corners, four an obstacle, and how far it is from there.
     """
     corner = jax.lax.optimization_barrier(_corners(level, _CORNER * hull_radius))
+    if fast is not None and len(corner):
+        widened, frame = _WIDENED * hull_radius, _frames(level)
+        legs = fast.find_legs(corner, level.side, frame, widened)
+        to_go = fast.settle(level.target, level.side, corner, frame, legs, widened)
+        return Roadmap(corner, to_go)
     corners, targets = _locate(corner, level), _locate(level.target, level)
     usable = jnp.all(jnp.abs(corner) <= 0.5 * level.side - _WIDENED * hull_radius, axis=-1)
     usable &= ~_covers(corners, level, _WIDENED * hull_radius)
@@ -115,7 +131,7 @@ def survey(level: Level, hull_radius: float) -> Roadmap:
 
 
 def measure(
-    roadmap: Roadmap, place: Array, level: Level, hull_radius: float, otherwise: Array
+    roadmap: Roadmap, place: Array, level: Level, hull_radius: float, fast: Any = None
 ) -> Array:
     """Measures the shortest paths from places [R, 2] to the robots' targets.
 
@@ -124,17 +140,19 @@ def measure(
       place: [R, 2] x and y, m.
       level: of the episode.
       hull_radius: of robots, m.
-      otherwise: [R] what to return where there is no path, m.
+      fast: as of `begin`.
 
     Returns:
-      [R] m.
+      [R] m; inf where no path leads.
     """
+    if fast is not None and len(roadmap.corner):
+        known = level.target, roadmap.corner, roadmap.to_go, _frames(level)
+        return fast.measure(place, level.side, *known, _WIDENED * hull_radius)
     here, targets = _locate(place, level), _locate(level.target, level)
     barred = _is_barred(here, targets, level, _WIDENED * hull_radius)
     direct = jnp.where(barred, jnp.inf, jnp.hypot(*(level.target - place).T))
     around = _legs(here, _locate(roadmap.corner, level), level, hull_radius) + roadmap.to_go
-    found = jnp.minimum(direct, jnp.min(around, axis=-1, initial=jnp.inf))
-    return jnp.where(jnp.isfinite(found), found, otherwise)
+    return jnp.minimum(direct, jnp.min(around, axis=-1, initial=jnp.inf))
 
 
 class _Places(NamedTuple):
@@ -153,6 +171,13 @@ def _corners(level: Level, off: float) -> Array:
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     corner = jnp.stack([x + cos * in_x - sin * in_y, y + sin * in_x + cos * in_y], axis=-1)
     return corner.reshape(-1, 2)
+
+
+def _frames(level: Level) -> Array:
+    """Lists obstacles [M, 6]: x, y (m), cosine and sine of yaw, half edges (m); absent ones far."""
+    x, y, yaw, half_x, half_y = level.obstacle.T
+    x = jnp.where(level.obstacle_present, x, PARKING)
+    return jnp.stack([x, y, jnp.cos(yaw), jnp.sin(yaw), half_x, half_y], axis=-1)
 
 
 def _locate(place: Array, level: Level) -> _Places:

@@ -71,10 +71,8 @@ def test_a_gap_too_narrow_for_a_robot_is_no_way() -> None:
     north, south = [0.0, 0.475, 0.0, 0.01, 0.025], [0.0, -0.05, 0.0, 0.01, 0.45]
     drawn = _level([-0.3, 0.3], [0.3, 0.3], [north, south])
     found = jax.jit(partial(geodesic.survey, hull_radius=HULL))(drawn)
-    barred = jax.jit(geodesic.measure, static_argnums=3)(
-        found, drawn.start[:, :2], drawn, HULL, jnp.full(1, 9.0)
-    )
-    assert barred[0] == 9.0
+    barred = jax.jit(geodesic.measure, static_argnums=3)(found, drawn.start[:, :2], drawn, HULL)
+    assert barred[0] == np.inf
 
 
 def test_an_absent_obstacle_is_in_nobodys_way() -> None:
@@ -173,3 +171,16 @@ def test_without_its_weight_no_path_is_kept(tiny_world: env.World) -> None:
         )
     )
     assert drawn.path is None
+
+
+def test_warp_finds_the_same_paths(drawn: Level) -> None:
+    paths_warp = pytest.importorskip("swarmjax.sim.fast.paths_warp")
+    plain = jax.jit(jax.vmap(partial(geodesic.begin, hull_radius=HULL)))(drawn)
+    begin = partial(geodesic.begin, hull_radius=HULL, fast=paths_warp)
+    fast = jax.jit(jax.vmap(begin))(drawn)
+    there = np.asarray(drawn.present)
+    # Float32: sums of a few lengths below 5 m.
+    np.testing.assert_allclose(fast.distance[there], plain.distance[there], atol=1e-5)
+    both = np.isfinite(plain.roadmap.to_go) & there[..., None]
+    np.testing.assert_allclose(fast.roadmap.to_go[both], plain.roadmap.to_go[both], atol=1e-5)
+    assert (np.isfinite(fast.roadmap.to_go) == np.isfinite(plain.roadmap.to_go))[there].all()

@@ -1,0 +1,230 @@
+"""Shortest paths around obstacles by Warp: what `task/geodesic.py` does, without pairs that wait.
+
+A thread a pair of corners finds whether they see each other, a thread a robot settles the corners
+from its target on (Dijkstra 1959, "A Note on Two Problems in Connexion with Graphs"), and a thread
+a robot looks for the corner by which its path leads, at obstacles only where that might be shorter.
+XLA compiles the same for minutes on a GPU.
+"""
+
+from functools import partial
+
+import jax.numpy as jnp
+import warp as wp
+from jax import Array
+
+from swarmjax.sim.fast.planar_warp import of_arenas
+
+_FAR = wp.constant(1e30)  # m; stands for inf inside the kernels
+_OPEN, _SETTLED = wp.constant(0), wp.constant(1)
+
+
+def find_legs(corner: Array, side: Array, frame: Array, widened: float) -> Array:
+    """Measures the straight ways between the corners of an arena.
+
+    Axes that `vmap` adds are arenas of one kernel.
+
+    Args:
+      corner: [K, 2] x and y, m.
+      side: [] of the arena, m.
+      frame: [M, 6] of obstacles: x (m), y (m), cosine and sine of yaw, half edges (m).
+      widened: by how much obstacles are, m.
+
+    Returns:
+      [K, K] m; inf where an obstacle is in between, or a corner lies in one or outside. A corner
+      is 0 m from itself, unless it lies there.
+    """
+    many = of_arenas(partial(_find_legs, widened))
+    return many(corner[None], jnp.asarray(side)[None], frame[None])[0]
+
+
+def settle(
+    target: Array, side: Array, corner: Array, frame: Array, legs: Array, widened: float
+) -> Array:
+    """Finds how far it is from each corner to each target.
+
+    Args:
+      target: [R, 2] x and y, m.
+      side: [] of the arena, m.
+      corner: [K, 2] x and y, m.
+      frame: [M, 6] as of `find_legs`.
+      legs: [K, K] as `find_legs` gives them.
+      widened: by how much obstacles are, m.
+
+    Returns:
+      [R, K] m; inf where no path leads.
+    """
+    many = of_arenas(partial(_settle, widened))
+    given = (target, jnp.asarray(side), corner, frame, legs)
+    return many(*(each[None] for each in given))[0]
+
+
+def measure(
+    place: Array,
+    side: Array,
+    target: Array,
+    corner: Array,
+    to_go: Array,
+    frame: Array,
+    widened: float,
+) -> Array:
+    """Measures the shortest paths.
+
+    Args:
+      place: [R, 2] of the robots, x and y, m.
+      side: [] of the arena, m.
+      target: [R, 2] x and y, m.
+      corner: [K, 2] x and y, m.
+      to_go: [R, K] from each corner to each target, m.
+      frame: [M, 6] as of `find_legs`.
+      widened: by how much obstacles are, m.
+
+    Returns:
+      [R] m; inf where no path leads.
+    """
+    many = of_arenas(partial(_measure, widened))
+    given = (place, jnp.asarray(side), target, corner, to_go, frame)
+    return many(*(each[None] for each in given))[0]
+
+
+def _find_legs(widened: float, corner: Array, side: Array, frame: Array) -> Array:
+    """The ways [A, K, K] of arenas."""
+    arenas, corners = corner.shape[:2]
+    call = wp.jax_kernel(_leg, num_outputs=1)
+    size = (arenas, corners, corners)
+    return _from_far(call(corner, side, frame, widened, launch_dims=size, output_dims=size)[0])
+
+
+def _settle(widened: float, target: Array, side: Array, *given: Array) -> Array:
+    """The distances [A, R, K] of arenas."""
+    arenas, robots = target.shape[:2]
+    corner, frame, legs = given
+    size = (arenas, robots, corner.shape[1])
+    call = wp.jax_kernel(_settle_corners, num_outputs=2)
+    del side  # `of_arenas` counts arenas by it
+    shapes = {"state": size, "to_go": size}
+    found = call(
+        target, corner, frame, legs, widened, launch_dims=(arenas, robots), output_dims=shapes
+    )
+    return _from_far(found[1])
+
+
+def _measure(widened: float, place: Array, side: Array, *given: Array) -> Array:
+    """The distances [A, R] of arenas."""
+    size = place.shape[:2]
+    del side
+    call = wp.jax_kernel(_path, num_outputs=1)
+    return _from_far(call(place, *given, widened, launch_dims=size, output_dims=size)[0])
+
+
+def _from_far(found: Array) -> Array:
+    return jnp.where(found >= 0.5e30, jnp.inf, found)
+
+
+@wp.func
+def _is_barred(
+    frame: wp.array3d[float], arena: int, widened: float, begin: wp.vec2, end: wp.vec2
+) -> bool:
+    """Whether a segment meets a widened obstacle: by separating axes, as in `task/geodesic.py`."""
+    barred = wp.bool(False)
+    m = wp.int32(0)
+    while m < frame.shape[1] and not barred:
+        x, y = frame[arena, m, 0], frame[arena, m, 1]
+        cos, sin = frame[arena, m, 2], frame[arena, m, 3]
+        half_x, half_y = frame[arena, m, 4] + widened, frame[arena, m, 5] + widened
+        middle_x = 0.5 * (begin[0] + end[0]) - x
+        middle_y = 0.5 * (begin[1] + end[1]) - y
+        reach_x, reach_y = 0.5 * (end[0] - begin[0]), 0.5 * (end[1] - begin[1])
+        at_x, at_y = cos * middle_x + sin * middle_y, cos * middle_y - sin * middle_x
+        to_x, to_y = cos * reach_x + sin * reach_y, cos * reach_y - sin * reach_x
+        across = wp.abs(at_x * to_y - at_y * to_x)
+        to_x, to_y = wp.abs(to_x), wp.abs(to_y)
+        barred = (
+            wp.abs(at_x) < half_x + to_x
+            and wp.abs(at_y) < half_y + to_y
+            and across < half_x * to_y + half_y * to_x
+        )
+        m += 1
+    return barred
+
+
+@wp.kernel(enable_backward=False)
+def _leg(
+    corner: wp.array2d[wp.vec2],
+    side: wp.array[float],
+    frame: wp.array3d[float],
+    widened: float,
+    found: wp.array3d[float],
+) -> None:
+    """Measures the way from one corner to another."""
+    arena, i, j = wp.tid()
+    begin, end = corner[arena, i], corner[arena, j]
+    reach = wp.max(
+        wp.max(wp.abs(begin[0]), wp.abs(begin[1])), wp.max(wp.abs(end[0]), wp.abs(end[1]))
+    )
+    length = float(_FAR)
+    if reach <= 0.5 * side[arena] - widened and not _is_barred(frame, arena, widened, begin, end):
+        length = wp.length(end - begin)
+    found[arena, i, j] = length
+
+
+@wp.kernel(enable_backward=False)
+def _settle_corners(
+    target: wp.array2d[wp.vec2],
+    corner: wp.array2d[wp.vec2],
+    frame: wp.array3d[float],
+    legs: wp.array3d[float],
+    widened: float,
+    state: wp.array3d[int],
+    to_go: wp.array3d[float],
+) -> None:
+    """Settles the corners of an arena, from those that the target sees on."""
+    arena, robot = wp.tid()
+    goal, corners = target[arena, robot], corner.shape[1]
+    for k in range(corners):
+        state[arena, robot, k] = _OPEN
+        to_go[arena, robot, k] = _FAR
+        if legs[arena, k, k] == 0.0 and not _is_barred(
+            frame, arena, widened, goal, corner[arena, k]
+        ):
+            to_go[arena, robot, k] = wp.length(corner[arena, k] - goal)
+    nearest = _nearest(state, to_go, arena, robot)
+    while nearest >= 0:
+        state[arena, robot, nearest] = _SETTLED
+        least = to_go[arena, robot, nearest]
+        for k in range(corners):
+            further = least + legs[arena, nearest, k]
+            to_go[arena, robot, k] = wp.min(further, to_go[arena, robot, k])
+        nearest = _nearest(state, to_go, arena, robot)
+
+
+@wp.func
+def _nearest(state: wp.array3d[int], to_go: wp.array3d[float], arena: int, robot: int) -> int:
+    """The open corner nearest to the target; -1: no other has a path."""
+    nearest, least = wp.int32(-1), wp.float32(_FAR)
+    for k in range(to_go.shape[2]):
+        if state[arena, robot, k] == _OPEN and to_go[arena, robot, k] < least:
+            nearest, least = k, wp.float32(to_go[arena, robot, k])
+    return nearest
+
+
+@wp.kernel(enable_backward=False)
+def _path(
+    place: wp.array2d[wp.vec2],
+    target: wp.array2d[wp.vec2],
+    corner: wp.array2d[wp.vec2],
+    to_go: wp.array3d[float],
+    frame: wp.array3d[float],
+    widened: float,
+    found: wp.array2d[float],
+) -> None:
+    """Measures the path of a robot."""
+    arena, robot = wp.tid()
+    here, goal = place[arena, robot], target[arena, robot]
+    least = float(_FAR)
+    if not _is_barred(frame, arena, widened, here, goal):
+        least = wp.length(goal - here)
+    for k in range(corner.shape[1]):
+        length = wp.length(corner[arena, k] - here) + to_go[arena, robot, k]
+        if length < least and not _is_barred(frame, arena, widened, here, corner[arena, k]):
+            least = length
+    found[arena, robot] = least
