@@ -78,6 +78,7 @@ def train_brax(given: AdapterTrainConfig) -> tuple[float, int, float]:
             clipping_epsilon=0.2,
             max_grad_norm=0.5,
             normalize_observations=True,
+            progress_fn=look,
             seed=given.seed,
         )
     share, steps, _ = curve[-1]
