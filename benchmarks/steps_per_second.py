@@ -219,14 +219,14 @@ def made_with() -> dict[str, Any]:
     }
 
 
-def settle(prepared: Prepared) -> EnvState:
+def settle(prepared: Prepared) -> rollout.Arena:
     """Steps the environment until its arenas have all ages.
 
     Returns:
       The arenas, after a step limit that they began with clocks spread evenly over it.
     """
     settings = prepared.program.config
-    arenas: EnvState = prepared.start(prepared.schedule).arenas
+    arenas: rollout.Arena = prepared.start(prepared.schedule).arenas
     spread = jnp.linspace(0, settings.task.step_limit, arenas.clock.size, endpoint=False)
     clock = jax.random.permutation(jax.random.key(0), spread.astype(arenas.clock.dtype))
     arenas = replace(arenas, clock=clock.reshape(arenas.clock.shape))
@@ -243,7 +243,7 @@ def time_physics(prepared: Prepared, arenas: EnvState) -> dict[str, Any]:
     return _line(prepared, "physics", steps, calls_s)
 
 
-def time_environment(prepared: Prepared, arenas: EnvState) -> dict[str, Any]:
+def time_environment(prepared: Prepared, arenas: rollout.Arena) -> dict[str, Any]:
     """Times the environment; returns the line. The arenas are used up."""
     settings = prepared.program.config
     argument = prepared.schedule, prepared.keys
@@ -305,8 +305,8 @@ def _physics(program: Program, arenas: EnvState, keys: Array) -> tuple[EnvState,
 
 
 def _environments(
-    program: Program, arenas: EnvState, argument: tuple[Schedule, Array]
-) -> tuple[EnvState, dict[str, Array]]:
+    program: Program, arenas: rollout.Arena, argument: tuple[Schedule, Array]
+) -> tuple[rollout.Arena, dict[str, Array]]:
     """`environment` for all seeds."""
     schedule, keys = argument
     step = partial(environment, program, schedule)

@@ -166,7 +166,8 @@ def _remember_backward(kept: tuple[jax.Array, ...], slope: jax.Array) -> tuple[A
     by_memory, (by_seen, by_recalled) = jax.lax.scan(
         step, nothing, steps, reverse=True, unroll=_UNROLL
     )
-    by_kernel = jnp.einsum("tbh,tbg->thg", before, by_recalled).sum(axis=0)
+    flat = (x.reshape(len(x), -1, x.shape[-1]) for x in (before, by_recalled))
+    by_kernel = jnp.einsum("tbh,tbg->thg", *flat).sum(axis=0)
     by_bias = by_recalled.sum(axis=tuple(range(by_recalled.ndim - 1)))
     return by_kernel, by_bias, by_seen, None, by_memory
 

@@ -187,7 +187,7 @@ def _push_apart(impl: str, *, rubs: bool) -> Any:
 
 
 def load_paths(impl: str) -> ModuleType | None:
-    """What finds shortest paths by Warp; None: plain JAX does.
+    """Loads what finds shortest paths by Warp; None where plain JAX does.
 
     Args:
       impl: `jax` or `warp`.

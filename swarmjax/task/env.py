@@ -291,11 +291,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     )
     begins, apart = _count_contacts(world, state, pose)
     earned = _earned(world, state, sight, arrives, begins & active[:, None])
-    path, before = state.path, state.path
-    if before is not None:
-        fast = dispatch.load_paths(world.physics.engine.impl)
-        path = geodesic.go_on(before, pose[:, :2], level, world.robot.hull_radius, fast)
-        earned = earned._replace(path_before=before.distance, path=path.distance)
+    path, earned = _follow_path(world, state, pose, earned)
     if world.terms:
         earned = _fill(world, earned, state, action, pose)
     gained = reward.total(earned, world.task.reward, world.terms)
@@ -352,6 +348,17 @@ def _earned(
         begins,
         None if world.task.arrival == "latch" else ~state.arrived,
     )
+
+
+def _follow_path(
+    world: World, state: EnvState, pose: Array, earned: reward.Step
+) -> tuple[geodesic.Path | None, reward.Step]:
+    """Measures the shortest paths from poses [R, 3], and adds what the reward sees of them."""
+    if state.path is None:
+        return None, earned
+    fast = dispatch.load_paths(world.physics.engine.impl)
+    path = geodesic.go_on(state.path, pose[:, :2], state.level, world.robot.hull_radius, fast)
+    return path, earned._replace(path_before=state.path.distance, path=path.distance)
 
 
 def _is_finite(numbers: Array, counted: Array) -> Array:

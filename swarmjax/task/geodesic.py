@@ -7,8 +7,8 @@ Rewards of navigation count progress along it (Wijmans et al. 2020, "DD-PPO", se
 
 Other robots do not count. Obstacles are widened by a little less than a robot's radius, with square
 corners, so that a robot that touches one is still outside. Lengths are then a millimetre too short
-to three centimetres too long. What matters to a reward is which way round a path leads, and that it
-gets shorter on the way.
+to three centimetres too long, and a gap of 59 to 74 mm counts as a way though no robot fits. What
+matters to a reward is which way round a path leads, and that it gets shorter on the way.
 """
 
 from collections.abc import Callable

@@ -31,14 +31,15 @@ class Step(NamedTuple):
       contact_begins: [R, 3] whether a contact of each kind began in this step.
       outside: [R] whether the robot had not arrived when the step began; None where that is so of
         all that earn, as by `task.arrival=latch`.
+      path_before: [R] along the shortest path to the target, m; None where the weights do not ask,
+        and in an extension.
+      path: [R] after the step, m.
       pose_before: [R, 3] x (m), y (m), yaw (rad); this and what follows for extensions alone, which
         also find `outside` filled by both rules.
       pose: [R, 3] after the step.
       action: [R, 2] clipped to -1..1, which spans the commands.
       present: [R] whether the robot takes part, bool.
       clock: [] control steps since the start, this one included, int32.
-      path_before: [R] along the shortest path to the target, m; None where the weights do not ask.
-      path: [R] after the step, m.
     """
 
     distance_before: Array
@@ -48,13 +49,13 @@ class Step(NamedTuple):
     arrives: Array
     contact_begins: Array
     outside: Any = None
+    path_before: Any = None
+    path: Any = None
     pose_before: Any = None
     pose: Any = None
     action: Any = None
     present: Any = None
     clock: Any = None
-    path_before: Any = None
-    path: Any = None
 
 
 def progress(step: Step) -> Array:

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 _GUIDE = (Path(__file__).parents[2] / "docs" / "adapters.md").read_text()
-_BLOCKS = dict(re.findall(r"^## ([^\n]+)\n.*?^```python\n(.*?)^```", _GUIDE, re.M | re.S))
+_SECTION = re.compile(r"^## ([^\n]+)\n(?:(?!^## ).)*?^```python\n(.*?)^```", re.M | re.S)
+_BLOCKS = dict(_SECTION.findall(_GUIDE))
 _TORCH = ("Stable-Baselines3", "PyTorch")
 
 

@@ -68,10 +68,11 @@ def test_rewards_are_those_of_the_task(settings: EvaluateConfig) -> None:
     assert near > 0
 
 
-def test_a_reward_that_it_does_not_know_is_refused(settings: EvaluateConfig) -> None:
-    task = replace(settings.task, reward=replace(settings.task.reward, arrival=1.0))
+@pytest.mark.parametrize("term", ["arrival", "path_progress"])
+def test_a_reward_that_it_does_not_know_is_refused(settings: EvaluateConfig, term: str) -> None:
+    task = replace(settings.task, reward=replace(settings.task.reward, **{term: 1.0}))
     assert (
-        refusal(MujocoArena, replace(settings, task=task)) == "task.reward.arrival is 1.0: give 0."
+        refusal(MujocoArena, replace(settings, task=task)) == f"task.reward.{term} is 1.0: give 0."
     )
 
 

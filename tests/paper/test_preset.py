@@ -60,7 +60,8 @@ def test_the_preset_leaves_no_number_of_the_learner_to_a_default() -> None:
     rewards = {f.name for f in dataclasses.fields(RewardConfig)} - {"extra"}
     assert set(given["task"]["reward"]) == rewards
     # Equation 3.
-    assert dataclasses.astuple(PAPER.task.reward) == (1.0, -0.001, 0.0, 0.0, 0.0, 0.0, {})
+    weights = {name: weight for name, weight in vars(PAPER.task.reward).items() if weight}
+    assert weights == {"progress": 1.0, "proximity": -0.001}
 
 
 def test_the_preset_chooses_the_files_that_are_not_given() -> None:

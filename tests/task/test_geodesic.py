@@ -67,7 +67,7 @@ def test_the_path_turns_at_the_near_end_of_a_wall(quarters: int) -> None:
 
 
 def test_a_gap_too_narrow_for_a_robot_is_no_way() -> None:
-    # North of the wall are 5 cm, south of it 35 cm: two boxes fill the rest of the line.
+    # Two boxes in line leave 5 cm between them.
     north, south = [0.0, 0.475, 0.0, 0.01, 0.025], [0.0, -0.05, 0.0, 0.01, 0.45]
     drawn = _level([-0.3, 0.3], [0.3, 0.3], [north, south])
     found = jax.jit(partial(geodesic.survey, hull_radius=HULL))(drawn)

@@ -1,9 +1,9 @@
 """Updates of policies with memory, in minibatches of the sequences that something is learned from.
 
 A sequence is the rollout of one robot. Those of robots that are absent, or that had arrived before
-the rollout began, hold no valid sample; they are never gone through. The others are shuffled one by
-one, and a minibatch is taken in tiles of a fixed number of them. The loss is a sum over samples, so
-the gradients of tiles add up.
+the rollout began, hold no valid sample: they come last, and tiles that would hold no others are
+left out. The others are shuffled one by one, and a minibatch is taken in tiles of a fixed number of
+them. The loss is a sum over samples, so the gradients of tiles add up.
 """
 
 from dataclasses import replace
@@ -24,7 +24,8 @@ from swarmjax.shards import ALONE, Shards
 # take part, and fill up where few do.
 CPU_TILE = 32
 # Samples of a tile elsewhere. An accelerator waits for one step after the other, so a large tile
-# takes it little longer than a small one; this many take about 12 GB with default layers.
+# takes it little longer than a small one. A minibatch is then mostly one tile, filled up with
+# absent robots. With default layers a tile takes about 12 GB for each learner and seed.
 TILE_SAMPLES = 2**21
 
 

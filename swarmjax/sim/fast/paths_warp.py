@@ -31,7 +31,7 @@ def find_legs(corner: Array, side: Array, frame: Array, widened: float) -> Array
 
     Returns:
       [K, K] m; inf where an obstacle is in between, or a corner lies in one or outside. A corner
-      is 0 m from itself, unless it lies there.
+      is 0 m from itself, unless it lies outside.
     """
     many = of_arenas(partial(_find_legs, widened))
     return many(corner[None], jnp.asarray(side)[None], frame[None])[0]
