@@ -292,16 +292,14 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     begins, apart = _count_contacts(world, state, pose)
     earned = _earned(world, state, sight, arrives, begins & active[:, None])
     path, earned = _follow_path(world, state, pose, earned)
-    if world.terms:
-        earned = _fill(world, earned, state, action, pose)
+    earned = _fill(world, earned, state, action, pose)
     gained = reward.total(earned, world.task.reward, world.terms)
     sound &= _is_finite(gained, active) & _is_finite(sight.distance, level.present)
     sound &= _is_finite(seen, level.present[:, None])
     valid = active & sound
     gained = jnp.where(valid, gained, 0.0)
     # The step of an arena that broke is not learned from, and the critic need not see it either.
-    seen = observation.stack(seen, state.observation, jnp)
-    seen = jnp.where(sound, seen, state.observation)
+    seen = jnp.where(sound, observation.stack(seen, state.observation, jnp), state.observation)
     episode = _tally(state.episode, gained, begins, earned, valid & ~state.arrived)
     timeout = clock >= world.task.step_limit
     new = replace(
@@ -416,7 +414,9 @@ def _look_by_extension(
 def _fill(
     world: World, step: reward.Step, state: EnvState, action: Array, pose: Array
 ) -> reward.Step:
-    """Adds what only the terms of an extension look at."""
+    """Adds what only the terms of an extension look at, if there are any."""
+    if not world.terms:
+        return step
     return step._replace(
         outside=~state.arrived,
         pose_before=physics.poses(world.physics, state.sim),

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from swarmjax.task.level import PARKING, Level
+from swarmjax.task.surroundings import into_frame
 
 # Of the hull's radius: by how much obstacles are widened, and how far off corners lie. Contacts
 # are soft, so a robot that is pushed against a wall is a little nearer than its radius.
@@ -70,7 +71,7 @@ def begin(level: Level, hull_radius: float, fast: Any = None) -> Path:
 
 
 def go_on(path: Path, place: Array, level: Level, hull_radius: float, fast: Any = None) -> Path:
-    """Measures the paths anew.
+    """Measures the paths from where robots are now.
 
     Args:
       path: before.
@@ -182,10 +183,7 @@ def _frames(level: Level) -> Array:
 
 def _locate(place: Array, level: Level) -> _Places:
     """Turns places [P, 2] into coordinates in the frames of the obstacles."""
-    x, y, yaw = (each[:, None] for each in level.obstacle[:, :3].T)
-    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-    to_x, to_y = place[:, 0] - x, place[:, 1] - y
-    local = cos * to_x + sin * to_y, cos * to_y - sin * to_x
+    local = into_frame(level.obstacle[:, None, :3], place)
     # Pairs of places look at this. Without the barrier XLA puts all of it into the code of each
     # pair, and compiles that for minutes on a GPU.
     return _Places(place, *jax.lax.optimization_barrier(local))

@@ -40,7 +40,7 @@ def look(pose: Array, level: Level, arrived: Array) -> Array:
       [R, P] in the robots' frames, x forward: m, within +-2; directions, within +-1; and marks, 0
       or 1. Rows of absent things are 0.
     """
-    target = _shown(*_into_frame(pose, level.target))
+    target = _shown(*into_frame(pose, level.target))
     own = [*target, arrived.astype(jnp.float32)]
     parts = [jnp.stack(own, axis=-1), _robots(pose, level, arrived), _rectangles(pose, level)]
     found = jnp.concatenate(parts, axis=-1)
@@ -57,8 +57,8 @@ def _shown(x: Array, y: Array) -> tuple[Array, Array]:
 def _robots(pose: Array, level: Level, arrived: Array) -> Array:
     """Lists the other robots, [R, N * _ROBOT]."""
     yaw = pose[None, :, 2] - pose[:, None, 2]
-    x, y = _into_frame(pose[:, None], pose[None, :, :2])
-    target = _shown(*_into_frame(pose[:, None], level.target[None]))
+    x, y = into_frame(pose[:, None], pose[None, :, :2])
+    target = _shown(*into_frame(pose[:, None], level.target[None]))
     is_there = level.present & ~jnp.eye(len(pose), dtype=bool)
     rows = (1.0, *_shown(x, y), jnp.cos(yaw), jnp.sin(yaw), *target, arrived)
     return _nearest(jnp.hypot(x, y), is_there, rows, NEAREST_ROBOTS)
@@ -69,7 +69,7 @@ def _rectangles(pose: Array, level: Level) -> Array:
     x, y, yaw, half_x, half_y = model.fixture_rectangles(level.side, level.obstacle, jnp).T
     # The nearest point: the robot's place in the rectangle's frame, pushed into it.
     centre = jnp.stack([x, y, yaw], axis=-1)
-    at_x, at_y = _into_frame(centre, pose[:, None, :2])
+    at_x, at_y = into_frame(centre, pose[:, None, :2])
     in_x, in_y = jnp.clip(at_x, -half_x, half_x), jnp.clip(at_y, -half_y, half_y)
     gap = jnp.hypot(at_x - in_x, at_y - in_y)
     nearest = _out_of_frame(centre, in_x, in_y)
@@ -77,12 +77,12 @@ def _rectangles(pose: Array, level: Level) -> Array:
     reach = jnp.maximum(half_x, half_y)
     end = jnp.stack([reach * jnp.cos(along), reach * jnp.sin(along)], axis=-1)
     viewer = pose[:, None]
-    one, other = (_into_frame(viewer, centre[:, :2] + sign * end) for sign in (-1.0, 1.0))
+    one, other = (into_frame(viewer, centre[:, :2] + sign * end) for sign in (-1.0, 1.0))
     is_left = one[0] * other[1] - one[1] * other[0] >= 0.0  # the other, seen from the robot
     right = _shown(*(jnp.where(is_left, a, b) for a, b in zip(one, other, strict=True)))
     left = _shown(*(jnp.where(is_left, b, a) for a, b in zip(one, other, strict=True)))
     thin = jnp.minimum(half_x, half_y)
-    rows = (1.0, *_shown(*_into_frame(viewer, nearest)), *right, *left, thin)
+    rows = (1.0, *_shown(*into_frame(viewer, nearest)), *right, *left, thin)
     is_there = jnp.concatenate([level.obstacle_present, jnp.ones(model.WALLS, bool)])
     return _nearest(gap, is_there, rows, NEAREST_RECTANGLES)
 
@@ -99,7 +99,7 @@ def _nearest(distance: Array, is_there: Array, rows: tuple[Any, ...], count: int
     return found.reshape(len(distance), -1)
 
 
-def _into_frame(frame: Array, point: Array) -> tuple[Array, Array]:
+def into_frame(frame: Array, point: Array) -> tuple[Array, Array]:
     """Turns points [..., 2] of the arena into coordinates in frames [..., 3]."""
     x, y = point[..., 0] - frame[..., 0], point[..., 1] - frame[..., 1]
     cos, sin = jnp.cos(frame[..., 2]), jnp.sin(frame[..., 2])

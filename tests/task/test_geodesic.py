@@ -75,7 +75,7 @@ def test_a_gap_too_narrow_for_a_robot_is_no_way() -> None:
     assert barred[0] == np.inf
 
 
-def test_an_absent_obstacle_is_in_nobodys_way() -> None:
+def test_an_absent_obstacle_bars_no_path() -> None:
     drawn = _level([-0.3, 0.0], [0.3, 0.0], [WALL])
     absent = drawn._replace(obstacle_present=np.zeros(1, bool))
     assert _distance(absent) == pytest.approx(0.6, abs=ROUND)
