@@ -70,11 +70,11 @@ class CurriculumConfig(Section):
             "share of the arenas on earlier stages; null: 0.2 [mixed]", above=0.0, below=1.0
         ),
     )
-    score: Literal["learnability", "progress"] | None = field(
+    score: Literal["learnability", "progress", "failure"] | None = field(
         default=None,
         metadata=about(
-            "learnability: p (1 - p) of success p; progress: how fast it changes; null: "
-            "learnability [adaptive]"
+            "learnability: p (1 - p) of success p; progress: how fast it changes; failure: 1 - p; "
+            "null: learnability [adaptive]"
         ),
     )
     floor: float | None = field(

@@ -97,7 +97,8 @@ def adaptive(
     arXiv:2304.12877; Rutherford et al. 2024, "No Regrets: Investigating and Improving Regret
     Approximations for Curriculum Discovery", arXiv:2408.15099). `progress` is how far success has
     changed of late, for better or worse, so that what is forgotten comes back (Kanitscheider et
-    al. 2021, arXiv:2106.14876).
+    al. 2021, arXiv:2106.14876). `failure` is 1 - p: where all stages can be solved, the one that
+    never succeeds is practised most, which `learnability` leaves to the floor.
 
     Args:
       curriculum: as in `sequential`.
@@ -111,7 +112,7 @@ def adaptive(
     """
     stages = curriculum.weights.shape[0]
     assert options.score is not None  # an option of this mode: the config has filled it in
-    found = {"learnability": _learnability, "progress": _progress}[options.score](curriculum.record)
+    found = _SCORES[options.score](curriculum.record)
     total = jnp.sum(found)
     share = jnp.where(total > 0.0, found / jnp.where(total > 0.0, total, 1.0), 1.0 / stages)
     floor = jnp.asarray(schedule.floor)
@@ -124,9 +125,6 @@ def adaptive(
         weights=jnp.where(verdict.over, weights, curriculum.weights),
         reason=reason.astype(jnp.int32),
     )
-
-
-MODES: dict[str, Mode] = {"sequential": sequential, "mixed": mixed, "adaptive": adaptive}
 
 
 def _step(
@@ -168,3 +166,11 @@ def _progress(record: Record) -> Array:
     most = jnp.max(jnp.where(known, record.progress, 0.0))
     unknown = jnp.where(jnp.any(known), most, 1.0)
     return jnp.where(known, record.progress, unknown)
+
+
+def _failure(record: Record) -> Array:
+    return 1.0 - jnp.where(jnp.isnan(record.fast), 0.0, record.fast)
+
+
+_SCORES = {"learnability": _learnability, "progress": _progress, "failure": _failure}
+MODES: dict[str, Mode] = {"sequential": sequential, "mixed": mixed, "adaptive": adaptive}

@@ -72,6 +72,10 @@ class AlgoConfig(Section):
         default=None,
         metadata=about("numbers that are remembered; null: 64 [memory=gru]", 1, 1024),
     )
+    memory_kernels: Any = field(
+        default=None,
+        metadata=about("module that computes the memory on a GPU", derived=True, stored=False),
+    )
     critic: Literal["observation", "state"] = field(
         default="observation",
         metadata=about(

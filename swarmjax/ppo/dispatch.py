@@ -54,6 +54,24 @@ def resolve(config: AlgoConfig, observation_size: int, action_size: int) -> Back
     return "blocks" if whole and _has_fast() else "autodiff"
 
 
+def bind_memory(config: AlgoConfig) -> AlgoConfig:
+    """Gives a config the kernels that compute its memory, on a GPU that takes them.
+
+    Args:
+        config: Of the learner.
+
+    Returns:
+        The config; as it is without memory, or where `resolve` would not choose kernels.
+    """
+    asked = config.memory != "none" and config.update_backend == "auto" and _has_fast()
+    if not asked or not _has_tensor_cores() or _is_full_precision():
+        return config
+    from swarmjax.ppo.fast import recurrence
+
+    fitting = recurrence.fits(config.memory_size or 0)
+    return replace(config, memory_kernels=recurrence) if fitting else config
+
+
 def find(backend: Backend) -> Learn | None:
     """Returns what learns by a backend; None for autodiff, which `learner` does itself."""
     if backend == "fused":
@@ -100,7 +118,7 @@ def _fuses(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
         )
     if config.update_backend == "fused" and not fitting:
         raise _unfit(config, observation_size, action_size)
-    if config.update_backend == "auto" and jax.config.jax_default_matmul_precision in _FULL:
+    if config.update_backend == "auto" and _is_full_precision():
         return False
     return fitting
 
@@ -128,6 +146,11 @@ def _fits(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
     if config.torso is not None:  # the kernels know hidden layers alone
         return False
     return fused.fits(config, observation_size, action_size)
+
+
+def _is_full_precision() -> bool:
+    """Whether products are to be computed without tensor cores, where kernels are slower."""
+    return jax.config.jax_default_matmul_precision in _FULL
 
 
 def _has_tensor_cores() -> bool:

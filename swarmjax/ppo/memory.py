@@ -45,10 +45,12 @@ class Gru(nn.Module):
         size: H.
         uniform: Whether kernels and biases begin within 1 / sqrt(H), as those of PyTorch's GRU
             (`torch.nn.RNNBase.reset_parameters`).
+        kernels: Module whose `remember` and `remember_all` compute the same on a GPU; None: XLA.
     """
 
     size: int
     uniform: bool = False
+    kernels: Any = None
 
     @nn.compact
     def __call__(
@@ -63,18 +65,32 @@ class Gru(nn.Module):
                 remembers nothing of what was before.
 
         Returns:
-            What the heads take, features beside memory [.., F + H], and the memory [B, H] after.
+            What the heads take beside the features, the memory [.., H] after each observation,
+            and the memory [B, H] after the last.
         """
+        if self.kernels is not None and not self.is_initializing():
+            return self._by_kernels(features, memory, begins)
         seen = self._layer(_INPUT, "input")(features)
         recurrent = self._layer(_recurrent, "recurrent")
         if begins is None:
             memory = remember(seen, recurrent(memory), memory)
-            return jnp.concatenate([features, memory], axis=-1), memory
+            return memory, memory
         chex.assert_equal_shape_prefix([features, begins], begins.ndim)
         recurrent(memory)  # has its weights from here on, also while they are drawn
         weights = recurrent.variables["params"]
         every = remember_all(weights["kernel"], weights["bias"], seen, begins, memory)
-        return jnp.concatenate([features, every], axis=-1), every[-1]
+        return every, every[-1]
+
+    def _by_kernels(
+        self, features: jax.Array, memory: jax.Array, begins: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array]:
+        """Does what a call does, by the kernels."""
+        layers = self.variables["params"]
+        if begins is None:
+            memory = self.kernels.remember(layers, features, memory)
+            return memory, memory
+        every = self.kernels.remember_all(layers, features, begins, memory)
+        return every, every[-1]
 
     def _layer(self, kernel: Any, name: str) -> nn.Dense:
         """Makes what the three gates add up to, side by side."""

@@ -41,9 +41,30 @@ class _Torso(nn.Module):
     @nn.compact
     def __call__(self, features: jax.Array) -> jax.Array:
         for index, width in enumerate(self.config.hidden_sizes):
-            layer = _layer(self.config, features, width, _HIDDEN_GAIN, f"hidden_{index}")
+            kernel, bias = _initializers(self.config, features.shape[-1], _HIDDEN_GAIN)
+            layer = nn.Dense(width, kernel_init=kernel, bias_init=bias, name=f"hidden_{index}")
             features = _ACTIVATIONS[self.config.activation](layer(features))
         return features
+
+
+class _Head(nn.Module):
+    """An affine layer of features and, where there is one, the memory beside them.
+
+    Both are multiplied by rows of one kernel, so that nothing is copied to put them side by side.
+    """
+
+    config: AlgoConfig
+    size: int
+
+    @nn.compact
+    def __call__(self, features: jax.Array, recalled: jax.Array | None) -> jax.Array:
+        seen = features.shape[-1]
+        inputs = seen if recalled is None else seen + recalled.shape[-1]
+        kernel_init, bias_init = _initializers(self.config, inputs, _HEAD_GAIN)
+        kernel = self.param("kernel", kernel_init, (inputs, self.size), jnp.float32)
+        bias = self.param("bias", bias_init, (self.size,), jnp.float32)
+        found = features @ kernel[:seen]
+        return bias + (found if recalled is None else found + recalled @ kernel[seen:])
 
 
 class _Actor(nn.Module):
@@ -60,16 +81,17 @@ class _Actor(nn.Module):
         begins: jax.Array | None = None,
     ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
         features = _torso(self.config)(observation)
+        recalled = None
         if memory is not None:
-            features, memory = _gru(self.config)(features, memory, begins)
-        layer = _layer(self.config, features, self.action_size, _HEAD_GAIN, "mean")
+            recalled, memory = _gru(self.config)(features, memory, begins)
+        head = _Head(self.config, self.action_size, name="mean")
         log_std = self.param(
             "log_std",
             nn.initializers.constant(math.log(self.config.initial_std)),
             (self.action_size,),
             jnp.float32,
         )
-        return _OUTPUTS[self.config.mean_activation](layer(features)), log_std, memory
+        return _OUTPUTS[self.config.mean_activation](head(features, recalled)), log_std, memory
 
 
 class _Critic(nn.Module):
@@ -85,14 +107,15 @@ class _Critic(nn.Module):
         begins: jax.Array | None = None,
     ) -> tuple[jax.Array, jax.Array | None]:
         features = _torso(self.config)(observation)
+        recalled = None
         if memory is not None:
-            features, memory = _gru(self.config)(features, memory, begins)
-        found = _layer(self.config, features, 1, _HEAD_GAIN, "value")(features)[..., 0]
-        return found, memory
+            recalled, memory = _gru(self.config)(features, memory, begins)
+        return _Head(self.config, 1, name="value")(features, recalled)[..., 0], memory
 
 
 def _gru(config: AlgoConfig) -> Gru:
-    return Gru(_memory_size(config), config.initialization == "uniform", name="memory")
+    uniform = config.initialization == "uniform"
+    return Gru(_memory_size(config), uniform, config.memory_kernels, name="memory")
 
 
 def _memory_size(config: AlgoConfig) -> int:
@@ -105,13 +128,13 @@ def _torso(config: AlgoConfig) -> nn.Module:
     return _Torso(config, name="torso") if config.torso is None else config.torso(name="torso")
 
 
-def _layer(config: AlgoConfig, features: jax.Array, width: int, gain: float, name: str) -> nn.Dense:
-    """Makes a layer to apply to `features`; `gain` is that of an orthogonal kernel."""
+def _initializers(config: AlgoConfig, inputs: int, gain: float) -> tuple[Any, Any]:
+    """Returns what draws kernel and bias of a layer; `gain` is that of an orthogonal kernel."""
     if config.initialization == "orthogonal":
-        return nn.Dense(width, kernel_init=nn.initializers.orthogonal(gain), name=name)
+        return nn.initializers.orthogonal(gain), nn.initializers.zeros_init()
     # What `torch.nn.Linear.reset_parameters` comes to: the bound of both is 1 / sqrt(inputs).
-    uniform = functools.partial(ppo_memory.uniform, bound=1.0 / math.sqrt(features.shape[-1]))
-    return nn.Dense(width, kernel_init=uniform, bias_init=uniform, name=name)
+    uniform = functools.partial(ppo_memory.uniform, bound=1.0 / math.sqrt(inputs))
+    return uniform, uniform
 
 
 def init_params(

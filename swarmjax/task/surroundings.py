@@ -56,47 +56,70 @@ def _shown(x: Array, y: Array) -> tuple[Array, Array]:
 
 def _robots(pose: Array, level: Level, arrived: Array) -> Array:
     """Lists the other robots, [R, N * _ROBOT]."""
-    yaw = pose[None, :, 2] - pose[:, None, 2]
-    x, y = into_frame(pose[:, None], pose[None, :, :2])
-    target = _shown(*into_frame(pose[:, None], level.target[None]))
+    viewer = pose[:, None]
+    distance = jnp.hypot(*into_frame(viewer, pose[None, :, :2]))
     is_there = level.present & ~jnp.eye(len(pose), dtype=bool)
-    rows = (1.0, *_shown(x, y), jnp.cos(yaw), jnp.sin(yaw), *target, arrived)
-    return _nearest(jnp.hypot(x, y), is_there, rows, NEAREST_ROBOTS)
+    chosen, is_there = _nearest(distance, is_there, NEAREST_ROBOTS)
+    yaw = pose[chosen, 2] - viewer[..., 2]
+    place, target = (into_frame(viewer, x[chosen, :2]) for x in (pose, level.target))
+    heading = jnp.cos(yaw), jnp.sin(yaw)
+    rows = (1.0, *_shown(*place), *heading, *_shown(*target), arrived[chosen])
+    return _listed(rows, is_there, NEAREST_ROBOTS)
 
 
 def _rectangles(pose: Array, level: Level) -> Array:
     """Lists the boxes and walls, [R, N * _RECTANGLE]."""
-    x, y, yaw, half_x, half_y = model.fixture_rectangles(level.side, level.obstacle, jnp).T
-    # The nearest point: the robot's place in the rectangle's frame, pushed into it.
-    centre = jnp.stack([x, y, yaw], axis=-1)
-    at_x, at_y = into_frame(centre, pose[:, None, :2])
-    in_x, in_y = jnp.clip(at_x, -half_x, half_x), jnp.clip(at_y, -half_y, half_y)
-    gap = jnp.hypot(at_x - in_x, at_y - in_y)
-    nearest = _out_of_frame(centre, in_x, in_y)
+    every = model.fixture_rectangles(level.side, level.obstacle, jnp)
+    is_there = jnp.concatenate([level.obstacle_present, jnp.ones(model.WALLS, bool)])
+    gap = _to_rectangle(pose, every)[1]
+    chosen, is_there = _nearest(gap, is_there, NEAREST_RECTANGLES)
+    found = every[chosen]
+    x, y, yaw, half_x, half_y = jnp.moveaxis(found, -1, 0)
     along = jnp.where(half_x >= half_y, 0.0, 0.5 * jnp.pi) + yaw
     reach = jnp.maximum(half_x, half_y)
+    middle, viewer = jnp.stack([x, y], axis=-1), pose[:, None]
     end = jnp.stack([reach * jnp.cos(along), reach * jnp.sin(along)], axis=-1)
-    viewer = pose[:, None]
-    one, other = (into_frame(viewer, centre[:, :2] + sign * end) for sign in (-1.0, 1.0))
+    one, other = (into_frame(viewer, middle + sign * end) for sign in (-1.0, 1.0))
     is_left = one[0] * other[1] - one[1] * other[0] >= 0.0  # the other, seen from the robot
     right = _shown(*(jnp.where(is_left, a, b) for a, b in zip(one, other, strict=True)))
     left = _shown(*(jnp.where(is_left, b, a) for a, b in zip(one, other, strict=True)))
-    thin = jnp.minimum(half_x, half_y)
-    rows = (1.0, *_shown(*into_frame(viewer, nearest)), *right, *left, thin)
-    is_there = jnp.concatenate([level.obstacle_present, jnp.ones(model.WALLS, bool)])
-    return _nearest(gap, is_there, rows, NEAREST_RECTANGLES)
+    nearest = _shown(*into_frame(viewer, _to_rectangle(pose, found)[0]))
+    rows = (1.0, *nearest, *right, *left, jnp.minimum(half_x, half_y))
+    return _listed(rows, is_there, NEAREST_RECTANGLES)
 
 
-def _nearest(distance: Array, is_there: Array, rows: tuple[Any, ...], count: int) -> Array:
-    """Takes the nearest things [R, N] that are there: [R, count * F], nearest first, then zeros."""
-    is_there = jnp.broadcast_to(is_there, distance.shape)
-    listed = min(count, distance.shape[1])
-    _, chosen = jax.lax.top_k(-jnp.where(is_there, distance, jnp.inf), listed)
-    every = jnp.stack([jnp.broadcast_to(row, distance.shape) for row in rows], axis=-1)
-    every = jnp.where(is_there[..., None], every, 0.0)
-    found = jnp.take_along_axis(every, chosen[..., None], axis=1)
-    found = jnp.pad(found, ((0, 0), (0, count - listed), (0, 0)))
-    return found.reshape(len(distance), -1)
+def _to_rectangle(pose: Array, rectangle: Array) -> tuple[Array, Array]:
+    """Finds the point [R, N, 2] of rectangles [N or R, N, 5] nearest to robots, and how far it is.
+
+    It is the robot's place in the rectangle's frame, pushed into it.
+    """
+    x, y, yaw, half_x, half_y = jnp.moveaxis(rectangle, -1, 0)
+    centre = jnp.stack([x, y, yaw], axis=-1)
+    at_x, at_y = into_frame(centre, pose[:, None, :2])
+    in_x, in_y = jnp.clip(at_x, -half_x, half_x), jnp.clip(at_y, -half_y, half_y)
+    return _out_of_frame(centre, in_x, in_y), jnp.hypot(at_x - in_x, at_y - in_y)
+
+
+def _nearest(distance: Array, is_there: Array, count: int) -> tuple[Array, Array]:
+    """Chooses the nearest `count` of N things at a distance [R, N], or all, nearest first.
+
+    Returns:
+      [R, n] their numbers, and whether they are there.
+    """
+    ranked = jnp.where(is_there, distance, jnp.inf)
+    _, chosen = jax.lax.top_k(-ranked, min(count, distance.shape[1]))
+    there = jnp.broadcast_to(is_there, distance.shape)
+    return chosen, jnp.take_along_axis(there, chosen, axis=1)
+
+
+def _listed(rows: tuple[Any, ...], is_there: Array, count: int) -> Array:
+    """Puts rows of F numbers, [R, n] each, one after the other: [R, count * F], absent ones 0."""
+    every = tuple(jnp.where(is_there, row, 0.0) for row in rows)
+    # Each number is computed before they are interleaved: threads of a GPU that compute different
+    # ones side by side wait for each other.
+    found = jnp.stack(jax.lax.optimization_barrier(every), axis=-1)
+    found = jnp.pad(found, ((0, 0), (0, count - found.shape[1]), (0, 0)))
+    return found.reshape(len(found), -1)
 
 
 def into_frame(frame: Array, point: Array) -> tuple[Array, Array]:

@@ -77,7 +77,8 @@ def load[C: ProgramConfig](config: C, *, by_robot: bool = False) -> tuple[Progra
     """
     world, pieces = load_world(config), extension.load(config.extensions)
     size = world.observation_size
-    algo = networks.bind(config.algo, pieces.networks, size, _state_size(config))
+    bound = networks.bind(config.algo, pieces.networks, size, _state_size(config))
+    algo = dispatch.bind_memory(bound)
     config = replace(config, algo=algo)
     backend = dispatch.resolve(algo, size, ACTION_SIZE)
     return Program(config, world, backend, by_robot), schedule(config)

@@ -54,7 +54,13 @@ def test_the_help_names_the_rows_of_the_algorithm() -> None:
 def test_the_preset_leaves_no_number_of_the_learner_to_a_default() -> None:
     given = files.read_preset("algo", "paper")
     of_gae = {"gae_lambda", "normalize_advantages"}
-    others = of_gae | {"memory_size", "update_backend", "network", "torso"}  # speed, extensions
+    others = of_gae | {
+        "memory_size",
+        "update_backend",
+        "network",
+        "torso",
+        "memory_kernels",
+    }  # speed, extensions
     assert set(given["algo"]) | others == {f.name for f in dataclasses.fields(AlgoConfig)}
     assert PAPER.algo.gae_lambda is None
     rewards = {f.name for f in dataclasses.fields(RewardConfig)} - {"extra"}

@@ -1,0 +1,348 @@
+"""Kernels that take a GRU through sequences, and its gradient back, without leaving the chip.
+
+XLA launches several kernels for each step of a sequence, and writes what they pass on to memory.
+Here a program of the grid holds a tile of sequences and their memory, and goes through all steps.
+
+T stands for control steps, B for sequences, F for features, H for the memory, `tile` for the
+sequences that a program holds, P for programs.
+"""
+
+import functools
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton
+
+# Sequences of a tile. On an H100 a program of 8 warps takes twice as long back through 64 of them,
+# and one of 4 warps longer through 32 (docs/performance.md).
+TILE = 32
+_WARPS, _BACKWARD_WARPS = 4, 8
+# What is seen, and the gradient by it, are the largest arrays: with half as many bytes, training
+# takes 8 % less time on an H100. Rollouts round alike, so that ratios of probabilities begin at 1.
+_SEEN = jnp.bfloat16
+# Widths of a memory: the least operand of a tensor core, and the most whose kernels fit the chip.
+_SIZES = (16, 32, 64)
+
+_Three = tuple[jax.Array, ...]  # of reset, update and candidate
+_Kept = tuple[jax.Array, ...]
+
+
+class _Rows(NamedTuple):
+    """The sequences of a program at a step.
+
+    Attributes:
+        at: [tile], their rows of [T B, ...].
+        exist: [tile], false past the last sequence.
+    """
+
+    at: jax.Array
+    exist: jax.Array
+
+
+class _Unit(NamedTuple):
+    """The weights of reset, update and candidate.
+
+    Attributes:
+        kernels: [H, H] each, of what is recalled.
+        biases: [H] each, of what is recalled.
+        biases_seen: [H] each, of what is seen.
+    """
+
+    kernels: _Three
+    biases: _Three
+    biases_seen: _Three
+
+
+class _Weights(NamedTuple):
+    """The weights of a unit as they come: kernel [H, 3 H] and bias [3 H], and of what is seen."""
+
+    kernel: Any
+    bias: Any
+    bias_seen: Any
+
+
+class _Sequences(NamedTuple):
+    """What a unit goes through: [T B, 3 H], [T B] of 0 or 1, and [B, H] before."""
+
+    seen: Any
+    begins: Any
+    memory: Any
+
+
+class _Gates(NamedTuple):
+    """What a step computes, [tile, H] each.
+
+    Attributes:
+        reset: 0..1.
+        update: 0..1.
+        candidate: -1..1.
+        recalled: What the candidate recalls, before `reset`.
+    """
+
+    reset: jax.Array
+    update: jax.Array
+    candidate: jax.Array
+    recalled: jax.Array
+
+
+def fits(size: int) -> bool:
+    """Says whether the kernels take a memory of H numbers."""
+    return size in _SIZES
+
+
+def remember_all(
+    layers: Mapping[str, Mapping[str, jax.Array]],
+    features: jax.Array,
+    begins: jax.Array,
+    memory: jax.Array,
+    interpret: bool = False,
+) -> jax.Array:
+    """Computes what `memory.Gru` remembers after each observation, but for rounding.
+
+    Features are rounded to bfloat16, and so is what the gates see of them. Other products have
+    JAX's precision, `jax.default_matmul_precision`.
+
+    Args:
+        layers: `input` and `recurrent` of the unit, each with `kernel` [F or H, 3 H] and `bias`
+            [3 H]; `fits` accepts H.
+        features: [T, B, F].
+        begins: [T, B], whether an episode begins with the step.
+        memory: [B, H] before the first.
+        interpret: Run the kernels as ordinary JAX, on any device.
+
+    Returns:
+        The memory [T, B, H] after each step.
+    """
+    features, kernel = (x.astype(_SEEN) for x in (features, layers["input"]["kernel"]))
+    inner = layers["recurrent"]
+    weights = _Weights(inner["kernel"], inner["bias"], layers["input"]["bias"])
+    begun = begins.astype(jnp.float32).ravel()
+    seen = (features @ kernel).reshape(-1, kernel.shape[1])
+    return _through(weights, _Sequences(seen, begun, memory), interpret)
+
+
+def remember(
+    layers: Mapping[str, Mapping[str, jax.Array]],
+    features: jax.Array,
+    memory: jax.Array,
+    interpret: bool = False,
+) -> jax.Array:
+    """Computes what `memory.Gru` remembers after one observation, but for rounding.
+
+    Args:
+        layers: As `remember_all` takes them.
+        features: [B, F].
+        memory: [B, H] before.
+        interpret: Run the kernel as ordinary JAX, on any device.
+
+    Returns:
+        The memory [B, H] after.
+    """
+    flat = memory.reshape(-1, memory.shape[-1])
+    seen = features.reshape(1, -1, features.shape[-1])
+    after = remember_all(layers, seen, jnp.zeros(seen.shape[:2], bool), flat, interpret)
+    return after.reshape(memory.shape)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _through(weights: _Weights, sequences: _Sequences, interpret: bool) -> jax.Array:
+    """Takes memories through sequences: [T, B, H]."""
+    count, size = sequences.memory.shape
+    steps = len(sequences.seen) // count
+    every = pl.pallas_call(
+        functools.partial(_forward, steps),
+        grid=(pl.cdiv(count, TILE),),
+        out_shape=jax.ShapeDtypeStruct((steps * count, size), jnp.float32),
+        compiler_params=triton.CompilerParams(num_warps=_WARPS, num_stages=1),
+        interpret=interpret,
+    )(weights, sequences)
+    return every.reshape(steps, count, size)
+
+
+def _through_forward(weights: _Weights, sequences: _Sequences, interpret: bool) -> tuple[Any, Any]:
+    """Computes `_through`, and keeps what its gradient needs."""
+    every = _through(weights, sequences, interpret)
+    return every, (weights, sequences, every)
+
+
+def _through_backward(
+    interpret: bool, kept: tuple[_Weights, _Sequences, jax.Array], slope: jax.Array
+) -> tuple[_Weights, _Sequences]:
+    """Takes the gradient [T, B, H] by what is remembered back to all that it came from."""
+    weights, sequences, every = kept
+    steps, count, size = every.shape
+    programs = pl.cdiv(count, TILE)
+    shapes = {
+        "kernel": jax.ShapeDtypeStruct((programs * size, 3 * size), jnp.float32),
+        "sums": jax.ShapeDtypeStruct((programs, 4 * size), jnp.float32),
+        "seen": jax.ShapeDtypeStruct(sequences.seen.shape, sequences.seen.dtype),
+        "memory": jax.ShapeDtypeStruct((count, size), jnp.float32),
+    }
+    found = pl.pallas_call(
+        functools.partial(_backward, steps),
+        grid=(programs,),
+        out_shape=shapes,
+        compiler_params=triton.CompilerParams(num_warps=_BACKWARD_WARPS, num_stages=1),
+        interpret=interpret,
+    )(weights, sequences, every.reshape(-1, size), slope.reshape(-1, size))
+    by_kernel = found["kernel"].reshape(programs, size, 3 * size).sum(axis=0)
+    gates, recalled, candidate = jnp.split(found["sums"].sum(axis=0), (2 * size, 3 * size))
+    by_bias, by_bias_seen = (jnp.concatenate([gates, x]) for x in (recalled, candidate))
+    # Nothing has a slope by where episodes begin.
+    by_begins = jnp.zeros_like(sequences.begins)
+    return (
+        _Weights(by_kernel, by_bias, by_bias_seen),
+        _Sequences(found["seen"], by_begins, found["memory"]),
+    )
+
+
+_through.defvjp(_through_forward, _through_backward)
+
+
+def _forward(steps: int, weights: _Weights, sequences: _Sequences, every: Any) -> None:
+    """A program: a tile of sequences from the first step to the last, of references."""
+    unit, (count, size) = _read_unit(weights), sequences.memory.shape
+    own = _own(count)
+
+    def step(t: jax.Array, before: jax.Array) -> jax.Array:
+        rows = _rows(own, t * count)
+        before = before * _goes_on(sequences.begins, rows)
+        gates = _gates(sequences.seen, rows, before, unit)
+        after = gates.candidate + gates.update * (before - gates.candidate)
+        _write(every, rows, 0, after)
+        return after
+
+    jax.lax.fori_loop(0, steps, step, _load(sequences.memory, own, 0, size))
+
+
+def _backward(
+    steps: int,
+    weights: _Weights,
+    sequences: _Sequences,
+    every: Any,
+    slope: Any,
+    found: dict[str, Any],
+) -> None:
+    """A program: a tile of sequences from the last step to the first, of references."""
+    unit, (count, size) = _read_unit(weights), sequences.memory.shape
+    own = _own(count)
+
+    def step(i: jax.Array, sofar: Any) -> Any:
+        later, products, totals = sofar
+        t = steps - 1 - i
+        rows = _rows(own, t * count)
+        goes_on = _goes_on(sequences.begins, rows)
+        before = _before(every, sequences.memory, t, own) * goes_on
+        gates = _gates(sequences.seen, rows, before, unit)
+        slopes, by_recalled, by_before = _slopes(later + _load(slope, rows, 0, size), gates, before)
+        for gate, value in enumerate(slopes):
+            _write(found["seen"], rows, gate * size, value)
+        for value, kernel in zip(by_recalled, unit.kernels, strict=True):
+            by_before = by_before + jnp.dot(value, kernel.T)
+        product = tuple(jnp.dot(before.T, value) for value in by_recalled)
+        total = tuple(jnp.sum(value, axis=0) for value in (*by_recalled, slopes[2]))
+        return by_before * goes_on, *jax.tree.map(jnp.add, (products, totals), (product, total))
+
+    square, row = jnp.zeros((size, size), jnp.float32), jnp.zeros(size, jnp.float32)
+    begun = jnp.zeros((TILE, size), jnp.float32), (square,) * 3, (row,) * 4
+    later, products, totals = jax.lax.fori_loop(0, steps, step, begun)
+    _write(found["memory"], own, 0, later)
+    _write_sums(found, products, totals)
+
+
+def _write_sums(
+    found: dict[str, Any], products: tuple[jax.Array, ...], totals: tuple[jax.Array, ...]
+) -> None:
+    """Writes what a program has summed: by the kernel, gate by gate, and by the biases."""
+    program, size = pl.program_id(0), len(totals[0])
+    columns = jnp.arange(size)
+    for gate, product in enumerate(products):
+        at = (program * size + columns)[:, None], (gate * size + columns)[None, :]
+        triton.store(found["kernel"].at[at], product)
+    for gate, total in enumerate(totals):
+        triton.store(found["sums"].at[program, gate * size + columns], total)
+
+
+def _gates(seen: Any, rows: _Rows, before: jax.Array, unit: _Unit) -> _Gates:
+    """Computes what `memory.remember` does before it mixes."""
+    size = before.shape[1]
+
+    def of(gate: int) -> tuple[jax.Array, jax.Array]:
+        found = _load(seen, rows, gate * size, size) + unit.biases_seen[gate][None, :]
+        return found, jnp.dot(before, unit.kernels[gate]) + unit.biases[gate][None, :]
+
+    reset, update = (_logistic(jnp.add(*of(gate))) for gate in (0, 1))
+    candidate, recalled = of(2)
+    return _Gates(reset, update, jnp.tanh(candidate + reset * recalled), recalled)
+
+
+def _slopes(slope: jax.Array, gates: _Gates, before: jax.Array) -> tuple[_Three, _Three, jax.Array]:
+    """Takes the slope by the memory after back through the gates.
+
+    With r, u the gates, n = tanh(x + r c) the candidate and h' = n + u (h - n): the slopes by n,
+    u and h are 1 - u, h - n and u, and those of tanh and logistic are 1 - n^2 and r (1 - r).
+
+    Returns:
+        Slopes by what is seen and by what is recalled, gate by gate, and by the memory before.
+    """
+    reset, update, candidate, recalled = gates
+    by_candidate = slope * (1.0 - update) * (1.0 - candidate * candidate)
+    by_update = slope * (before - candidate) * update * (1.0 - update)
+    by_reset = by_candidate * recalled * reset * (1.0 - reset)
+    seen = (by_reset, by_update, by_candidate)
+    return seen, (by_reset, by_update, by_candidate * reset), slope * update
+
+
+def _logistic(x: jax.Array) -> jax.Array:
+    return 1.0 / (1.0 + jnp.exp(-x))
+
+
+def _own(count: int) -> _Rows:
+    """The sequences of this program at the first step. Interpreted, a loop cannot ask for them."""
+    at = pl.program_id(0) * TILE + jnp.arange(TILE)
+    return _Rows(at, at < count)
+
+
+def _rows(own: _Rows, first: jax.Array) -> _Rows:
+    """The same sequences, at a step whose first row is `first`."""
+    return own._replace(at=first + own.at)
+
+
+def _goes_on(begins: Any, rows: _Rows) -> jax.Array:
+    """Whether an episode goes on, [tile, 1], 0 or 1."""
+    return 1.0 - triton.load(begins.at[rows.at], mask=rows.exist, other=0.0)[:, None]
+
+
+def _before(every: Any, memory: Any, step: jax.Array, own: _Rows) -> jax.Array:
+    """Reads the memory [tile, H] before a step."""
+    count, size = memory.shape
+    earlier = _rows(own, (step - 1) * count)
+    begun = _load(memory, own._replace(exist=own.exist & (step == 0)), 0, size)
+    return begun + _load(every, earlier._replace(exist=own.exist & (step > 0)), 0, size)
+
+
+def _read_unit(weights: _Weights) -> _Unit:
+    kernel, size = weights.kernel, weights.kernel.shape[0]
+    columns = [gate * size + jnp.arange(size) for gate in range(3)]
+    rows = jnp.arange(size)[:, None]
+    kernels = [triton.load(kernel.at[rows, each[None, :]]) for each in columns]
+    biases, seen = ([triton.load(ref.at[each]) for each in columns] for ref in weights[1:])
+    return _Unit((*kernels,), (*biases,), (*seen,))
+
+
+def _load(ref: Any, rows: _Rows, first: int, size: int) -> jax.Array:
+    """Reads [tile, H] from column `first` on, zeros of sequences that do not exist."""
+    columns = first + jnp.arange(size)
+    mask = rows.exist[:, None] & (columns >= 0)[None, :]
+    found = triton.load(ref.at[rows.at[:, None], columns[None, :]], mask=mask, other=0.0)
+    return found.astype(jnp.float32)
+
+
+def _write(ref: Any, rows: _Rows, first: int, x: jax.Array) -> None:
+    """Writes [tile, H] from column `first` on, but for sequences that do not exist."""
+    columns = first + jnp.arange(x.shape[1])
+    mask = rows.exist[:, None] & (columns >= 0)[None, :]
+    triton.store(ref.at[rows.at[:, None], columns[None, :]], x.astype(ref.dtype), mask=mask)
