@@ -222,3 +222,15 @@ def test_learners_side_by_side_come_to_what_each_does_alone() -> None:
         mine = jax.tree.map(lambda x, i=i: x[i], together)
         # Products of matrices side by side, through four steps of Adam of up to 1e-3.
         chex.assert_trees_all_close(mine, alone, rtol=1e-4, atol=1e-5)
+
+
+# s6 with 65,536 arenas, worlds with 4,096 in 32 minibatches, and one arena.
+@pytest.mark.parametrize(
+    ("sequences_", "minibatches", "steps", "expected"),
+    [(327_680, 8, 32, 10_240), (81_920, 32, 64, 854), (5, 1, 32, 5), (10**6, 1, 32, 62_500)],
+)
+def test_an_accelerator_takes_a_minibatch_in_four_tiles_if_they_are_large(
+    monkeypatch: pytest.MonkeyPatch, sequences_: int, minibatches: int, steps: int, expected: int
+) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert sequences.tile_size(sequences_, minibatches, steps) == expected

@@ -23,10 +23,13 @@ from swarmjax.shards import ALONE, Shards
 # Sequences of a tile. On a CPU tiles of 32 take no longer than whole minibatches where all robots
 # take part, and fill up where few do.
 CPU_TILE = 32
-# Samples of a tile elsewhere. An accelerator waits for one step after the other, so a large tile
-# takes it little longer than a small one. A minibatch is then mostly one tile, filled up with
-# absent robots. With default layers a tile takes about 12 GB for each learner and seed.
-TILE_SAMPLES = 2**21
+# Samples of a tile elsewhere, at least and at most. An accelerator waits for one step after the
+# other, so a large tile takes it little longer than a small one. With default layers a tile of the
+# most takes about 12 GB for each learner and seed.
+TILE_SAMPLES = 2**16, 2**21
+# Tiles of a full minibatch elsewhere, between these: where most robots are absent, most are left
+# out.
+_TILES = 4
 
 
 class Dealt(NamedTuple):
@@ -168,10 +171,14 @@ def tile_size(sequences: int, minibatches: int, steps: int) -> int:
         steps: T, of a sequence.
 
     Returns:
-        At most `CPU_TILE` or `TILE_SAMPLES`, at least 1.
+        At least 1, and between the bounds above.
     """
-    most = CPU_TILE if jax.default_backend() == "cpu" else max(1, TILE_SAMPLES // steps)
     fullest = -(-sequences // minibatches)
+    if jax.default_backend() == "cpu":
+        most = CPU_TILE
+    else:
+        least, limit = (max(1, samples // steps) for samples in TILE_SAMPLES)
+        most = min(max(least, -(-fullest // _TILES)), limit)
     return -(-fullest // -(-fullest // most))
 
 
