@@ -1,7 +1,7 @@
 """Tries the wheel with the oldest and the newest versions that pyproject.toml allows.
 
-    uv run python .ci/versions.py                     # oldest, then newest
-    uv run python .ci/versions.py newest              # one of them
+    uv run python .ci/versions.py                     # oldest, newest, newest with Playground
+    uv run python .ci/versions.py newest              # one of them: oldest, newest, playground
     uv run python .ci/versions.py --python 3.13       # another Python
 
 Each goes into an environment of its own, without the tree and without its constraints. There the
@@ -23,9 +23,11 @@ from pathlib import Path
 
 PROJECT = Path(__file__).resolve().parent.parent
 UV = os.environ.get("UV", "uv")  # `uv run` sets it
-RESOLUTIONS = {"oldest": "lowest-direct", "newest": "highest"}
+RESOLUTIONS = {"oldest": "lowest-direct", "newest": "highest", "playground": "highest"}
+# Libraries that share an environment with swarmjax: more extras, and what calls them.
+EXTRAS = {"playground": ["playground"]}
 TOLD = ("jax", "flax", "optax", "orbax-checkpoint", "chex", "numpy", "mujoco-mjx", "warp-lang")
-TOLD += ("hydra-core", "omegaconf", "matplotlib", "rich", "tensorboardx")
+TOLD += ("hydra-core", "omegaconf", "matplotlib", "rich", "tensorboardx", "playground", "brax")
 # Tests of what calls JAX, Flax, Optax and MuJoCo most; brax is not installed, and a test that
 # switches JAX to 64 bits does so as only JAX 0.8 and later can.
 TESTS = [
@@ -45,6 +47,15 @@ for robot in ("planar", "wheeled"):
     state, outcome = jax.jit(env.step)(state, jax.numpy.zeros((4, 3, 2)))
     assert state.observation.shape == (4, 3, 10) and outcome.reward.shape == (4, 3)
 assert swarmjax.load_policy("runs/a/policy.npz")
+"""
+PLAYGROUND_CALLS = """
+import jax, swarmjax
+from mujoco_playground import registry
+from swarmjax.adapters.playground import SwarmMjxEnv
+mine = SwarmMjxEnv(swarmjax.make_env("mine.yaml", arenas=1))
+for env in (mine, registry.load("CartpoleBalance")):
+    state = jax.jit(env.reset)(jax.random.key(0))
+    assert jax.jit(env.step)(state, jax.numpy.zeros(env.action_size)).reward.shape == ()
 """
 # A user's file: Pyright must find what is wrong in the last line, or calls the comment unnecessary.
 TYPED = """
@@ -72,12 +83,13 @@ COMMANDS = {
     "Python": ["python", "-c", PYTHON_CALLS],
     "types": ["pyright", "--pythonpath", "python", "typed.py"],
 }
+MORE_COMMANDS = {"playground": {"Playground": ["python", "-c", PLAYGROUND_CALLS]}}
 
 
 def main(arguments: Sequence[str]) -> int:
     """Tries one set of versions after the other; returns 1 if anything failed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("which", nargs="*", help="oldest, newest or both")
+    parser.add_argument("which", nargs="*", help=f"{', '.join(RESOLUTIONS)}; default: all")
     parser.add_argument("--python", default=sys.executable, help="version or path of Python")
     given = parser.parse_args(arguments)
     which = given.which or list(RESOLUTIONS)
@@ -92,7 +104,7 @@ def main(arguments: Sequence[str]) -> int:
 def _try(name: str, python: str, folder: Path) -> bool:
     """Tries a set of versions, tells what came of each step, and whether all passed."""
     environment = folder / name
-    if not _step(f"{name}: install", *_install(environment, python, RESOLUTIONS[name])):
+    if not _step(f"{name}: install", *_install(environment, python)):
         return False
     _tell(environment)
     work = folder / f"{name}-work"
@@ -109,20 +121,21 @@ def _try(name: str, python: str, folder: Path) -> bool:
     return all(passed)
 
 
-def _install(environment: Path, python: str, resolution: str) -> tuple[list[list[str]], Path]:
+def _install(environment: Path, python: str) -> tuple[list[list[str]], Path]:
     """The commands that make an environment, and where to run them: away from the constraints."""
     dist = environment.with_name(f"{environment.name}-dist")
     dist.mkdir()
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
     # uv takes the lowest of what it is asked for itself alone, not of what a wheel asks for.
-    asked = [*project["dependencies"], *extras["onnx"], *extras["warp"]]
+    also = ("onnx", "warp", *EXTRAS.get(environment.name, []))
+    asked = [*project["dependencies"], *(one for extra in also for one in extras[extra])]
     (dist / "asked.txt").write_text("\n".join(asked))
     into = [UV, "pip", "install", "--quiet", "--python", str(environment / "bin/python")]
     commands = [
         [UV, "build", "--quiet", "--python", python, "--out-dir", str(dist), str(PROJECT)],
         [UV, "venv", "--quiet", "--python", python, str(environment)],
-        [*into, "--resolution", resolution, "--upgrade", "-r", "asked.txt"],
+        [*into, "--resolution", RESOLUTIONS[environment.name], "--upgrade", "-r", "asked.txt"],
         # What runs the tests comes as it is, and moves nothing that was resolved.
         [*into, *TOOLS, f"swarmjax-{project['version']}-py3-none-any.whl"],
     ]
@@ -133,7 +146,8 @@ def _commands(environment: Path) -> list[tuple[str, list[str]]]:
     """What is run, with the paths of the environment's programs, and of this one's Pyright."""
     paths = {name: str(environment / "bin" / name) for name in ("python", "swarmjax")}
     paths["pyright"] = str(Path(sys.executable).with_name("pyright"))
-    return [(what, [paths.get(word, word) for word in words]) for what, words in COMMANDS.items()]
+    commands = (COMMANDS | MORE_COMMANDS.get(environment.name, {})).items()
+    return [(what, [paths.get(word, word) for word in words]) for what, words in commands]
 
 
 def _step(name: str, commands: list[list[str]], folder: Path) -> bool:

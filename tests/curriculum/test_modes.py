@@ -46,6 +46,7 @@ COHORT = 4  # updates
 SEQUENTIAL, MIXED = (CurriculumConfig(mode=mode) for mode in ("sequential", "mixed"))
 ADAPTIVE = CurriculumConfig(mode="adaptive")
 PROGRESS = CurriculumConfig(mode="adaptive", score="progress")
+FAILURE = CurriculumConfig(mode="adaptive", score="failure")
 
 _advance = jax.jit(curriculum.advance, static_argnums=(2, 3))
 
@@ -188,6 +189,9 @@ NAN = math.nan
         (PROGRESS, [0.9, 0.5, 0.2, NAN], [0.8, 0.5, 0.5, NAN], [0.1, 0.0, 0.3, 0.3]),
         (PROGRESS, [0.9, 0.5, NAN, NAN], [0.9, 0.5, NAN, NAN], [1.0] * 4),
         (PROGRESS, [NAN] * 4, [NAN] * 4, [1.0] * 4),
+        # 1 - p; what is unknown has failed.
+        (FAILURE, [0.9, 0.5, 0.0, NAN], [0.0] * 4, [0.1, 0.5, 1.0, 1.0]),
+        (FAILURE, [1.0] * 4, [0.0] * 4, [1.0] * 4),
     ],
 )
 def test_adaptive_weighs_by_its_score(
