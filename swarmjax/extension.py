@@ -63,6 +63,7 @@ class RewardTerm(Piece):
         "arrival",
         "contact",
         "robot_contact",
+        "touching",
         "step_penalty",
     )
 

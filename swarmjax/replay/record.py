@@ -111,6 +111,7 @@ class Steps(NamedTuple):
         sensor_range: m.
         arrives: [..., R] whether the robot arrived in this step; by `hold`, whether all did.
         contact_begins: [..., R, 3] whether a contact of each kind began in this step.
+        touching: [..., R, 3] whether the robot touches something of each kind after the step.
         outside: [..., R] whether the robot had not arrived when the step began; None: all had not.
     """
 
@@ -120,6 +121,7 @@ class Steps(NamedTuple):
     sensor_range: float
     arrives: np.ndarray
     contact_begins: np.ndarray
+    touching: np.ndarray
     outside: np.ndarray | None = None
 
 
@@ -140,6 +142,7 @@ def terms(steps: Steps, weights: RewardConfig) -> dict[str, np.ndarray]:
         "arrival": steps.arrives,
         "contact": steps.contact_begins.sum(axis=-1),
         "robot_contact": steps.contact_begins[..., gaps.KINDS.index("robot")],
+        "touching": steps.touching.any(axis=-1),
         "step_penalty": under_way,
     }
     weighted = {name: getattr(weights, name) * term for name, term in found.items()}
@@ -264,6 +267,7 @@ def _cut(
         sensor_range=task.sensor_range,
         arrives=arrives,
         contact_begins=np.diff(frames.contacts, axis=0),
+        touching=frames.touching[1:],
         outside=~before,
     )
     earned = terms(steps, earning) | _own(own, steps, frames)

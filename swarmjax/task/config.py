@@ -42,6 +42,9 @@ class RewardConfig(Section):
     robot_contact: float = field(
         default=0.0, metadata=_weight("besides, per contact event with another robot")
     )
+    touching: float = field(
+        default=0.0, metadata=_weight("per control step in which the robot touches something")
+    )
     step_penalty: float = field(
         default=-0.002, metadata=_weight("per control step that begins before arrival")
     )

@@ -290,7 +290,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
         world.electronics, memory, state.factors, sight, clock, jnp
     )
     begins, apart = _count_contacts(world, state, pose)
-    earned = _earned(world, state, sight, arrives, begins & active[:, None])
+    earned = _earned(world, state, sight, arrives, begins & active[:, None], apart == 0.0)
     path, earned = _follow_path(world, state, pose, earned)
     earned = _fill(world, earned, state, action, pose)
     gained = reward.total(earned, world.task.reward, world.terms)
@@ -334,7 +334,12 @@ def _count_contacts(world: World, state: EnvState, pose: Array) -> tuple[Array, 
 
 
 def _earned(
-    world: World, state: EnvState, sight: Sight, arrives: Array, begins: Array
+    world: World,
+    state: EnvState,
+    sight: Sight,
+    arrives: Array,
+    begins: Array,
+    touching: Array,
 ) -> reward.Step:
     """Puts together what the built-in terms of the reward look at."""
     return reward.Step(
@@ -345,6 +350,7 @@ def _earned(
         arrives,
         begins,
         None if world.task.arrival == "latch" else ~state.arrived,
+        touching,
     )
 
 

@@ -254,6 +254,7 @@ def _step(robots: int) -> Step:
         sensor_range=epuck.SENSOR_RANGE,
         arrives=there,
         contact_begins=_shape(robots, len(KINDS), dtype=jnp.bool_),
+        touching=_shape(robots, len(KINDS), dtype=jnp.bool_),
         outside=there,
         pose_before=_shape(robots, 3),
         pose=_shape(robots, 3),

@@ -31,6 +31,7 @@ class Step(NamedTuple):
       contact_begins: [R, 3] whether a contact of each kind began in this step.
       outside: [R] whether the robot had not arrived when the step began; None where that is so of
         all that earn, as by `task.arrival=latch`.
+      touching: [R, 3] whether the robot touches something of each kind after the step.
       path_before: [R] along the shortest path to the target, m; None where the weights do not ask,
         and in an extension.
       path: [R] after the step, m.
@@ -49,6 +50,7 @@ class Step(NamedTuple):
     arrives: Array
     contact_begins: Array
     outside: Any = None
+    touching: Any = None
     path_before: Any = None
     path: Any = None
     pose_before: Any = None
@@ -90,6 +92,14 @@ def robot_contact(step: Step) -> Array:
     return step.contact_begins[..., KINDS.index("robot")].astype(jnp.float32)
 
 
+def touching(step: Step) -> Array:
+    """1 where the robot touches something after the step, of whatever kind.
+
+    `contact` alone is paid once however long a robot then leans against a wall.
+    """
+    return jnp.any(step.touching, axis=-1).astype(jnp.float32)
+
+
 def step_penalty(step: Step) -> Array:
     """1 for every control step that begins before arrival."""
     return _before_arrival(step, jnp.ones_like(step.distance))
@@ -107,6 +117,7 @@ TERMS: dict[str, Callable[[Step], Array]] = {
     "arrival": arrival,
     "contact": contact,
     "robot_contact": robot_contact,
+    "touching": touching,
     "step_penalty": step_penalty,
 }
 

@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 
 import extensions
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -42,19 +43,19 @@ def steer(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_reward_is_that_of_training(seed, off):
     draw = np.random.default_rng(seed)
     weights = dataclasses.replace(WEIGHTS, **dict.fromkeys(off, 0.0))
-    given = (
-        draw.uniform(0.0, 2.0, 6).astype(np.float32),
-        draw.uniform(0.0, 2.0, 6).astype(np.float32),
-        draw.uniform(0.02, 0.08, (6, 8)).astype(np.float32),
-        0.04,
-        draw.random(6) < 0.5,
-        draw.random((6, 3)) < 0.3,
-    )
-    found = replay_record.terms(Steps(*given), weights)
+    given = {
+        "distance_before": draw.uniform(0.0, 2.0, 6).astype(np.float32),
+        "distance": draw.uniform(0.0, 2.0, 6).astype(np.float32),
+        "infrared": draw.uniform(0.02, 0.08, (6, 8)).astype(np.float32),
+        "sensor_range": 0.04,
+        "arrives": draw.random(6) < 0.5,
+        "contact_begins": draw.random((6, 3)) < 0.3,
+        "touching": draw.random((6, 3)) < 0.3,
+    }
+    found = replay_record.terms(Steps(**given), weights)
     # What a replay leaves out, and says so: it has no map of paths.
     assert set(found) == set(reward.TERMS) - off - {"path_progress"}
-    arrays = (jnp.asarray(each) if isinstance(each, np.ndarray) else each for each in given)
-    expected = reward.total(reward.Step(*arrays), weights)
+    expected = reward.total(reward.Step(**jax.tree.map(jnp.asarray, given)), weights)
     # Float32 holds rewards of a few units to some 1e-7.
     np.testing.assert_allclose(sum(found.values(), np.zeros(6)), expected, atol=1e-6)
 
@@ -67,6 +68,7 @@ def test_equation_3_by_hand():
         sensor_range=0.04,
         arrives=np.array([False, True]),
         contact_begins=np.ones((2, 3), bool),
+        touching=np.ones((2, 3), bool),
     )
     paper = RewardConfig(proximity=-0.001, contact=0.0, step_penalty=0.0)
     found = replay_record.terms(steps, paper)

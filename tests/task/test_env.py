@@ -367,6 +367,26 @@ def test_a_contact_of_robots_is_charged_to_the_one_on_its_way(
     np.testing.assert_allclose(charged.sum(axis=0), [0.0, -0.5, 0.0], atol=1e-5)
 
 
+def test_leaning_is_charged_in_every_step(
+    tiny_world: World, start: EnvState, actions: np.ndarray, episode: Episode
+) -> None:
+    task = tiny_world.task
+    priced = dataclasses.replace(task, reward=dataclasses.replace(task.reward, touching=-0.5))
+    step = functools.partial(env.step, dataclasses.replace(tiny_world, task=priced))
+    arena = jax.tree.map(lambda x: x[BUMPING], start)
+    drive = jax.jit(lambda state, chosen: jax.lax.scan(step, state, chosen))
+    _, came = drive(arena, jnp.asarray(actions[:, BUMPING]))
+    side, obstacle = (np.asarray(x) for x in (arena.level.side, arena.level.obstacle))
+    gap = np.stack(
+        [gaps.gaps(pose, side, obstacle, HULL, np) for pose in episode.pose[1:, BUMPING]]
+    )
+    leans = (gap <= 0.0).any(axis=-1) & np.asarray(came.valid)
+    assert leans.sum(axis=0)[0] > 5, "it keeps pushing"
+    charged = np.asarray(came.reward) - episode.came.reward[:, BUMPING]
+    # 1e-5: another program, whose roundings contacts multiply.
+    np.testing.assert_allclose(charged, -0.5 * leans, atol=1e-5)
+
+
 # --- one arena and the others
 
 

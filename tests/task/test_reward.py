@@ -28,6 +28,7 @@ def step() -> reward.Step:
         sensor_range=RANGE,
         arrives=jnp.array([False, False, True, False]),
         contact_begins=jnp.array([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 0]], bool),
+        touching=jnp.array([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]], bool),
         path_before=jnp.array([0.75, 0.5, 0.0625, 0.5]),
         path=jnp.array([0.5, 0.625, 0.03125, 0.5]),
     )
@@ -42,6 +43,7 @@ def step() -> reward.Step:
         ("arrival", [0, 0, 1, 0]),
         ("contact", [0, 1, 2, 0]),
         ("robot_contact", [0, 1, 1, 0]),  # robots are the first of the three kinds
+        ("touching", [0, 1, 1, 1]),  # once, whatever the kinds; no contact need begin
         ("step_penalty", [1, 1, 1, 1]),
     ],
 )
