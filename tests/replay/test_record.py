@@ -26,7 +26,13 @@ from swarmjax.task.config import RewardConfig, TaskConfig
 from swarmjax.task.stage_files import load_levels
 
 WEIGHTS = RewardConfig(
-    progress=2.0, proximity=-0.01, arrival=0.5, contact=-0.3, robot_contact=-0.2, step_penalty=-1e-4
+    progress=2.0,
+    proximity=-0.01,
+    arrival=0.5,
+    contact=-0.3,
+    robot_contact=-0.2,
+    touching=-0.25,
+    step_penalty=-1e-4,
 )
 
 
