@@ -188,8 +188,8 @@ _MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
         (
             _GOOD,
             {"format": 1},
-            r"meta.format is 1, but this version reads 2, 3 with meta.network, and 4 with "
-            "meta.memory or a history: export the policy",
+            r"meta.format is 1, but this version reads 2, 3 with meta.network, 4 with "
+            "meta.memory or a history, and 5 with neighbours: export the policy",
         ),
         (_GOOD, {"activation": "gelu"}, r'meta.activation is "gelu": expected tanh or relu or sw'),
         (_GOOD, {"policy": "mine"}, r'meta.policy is "mine": expected shared or independent'),

@@ -24,6 +24,7 @@ from swarmjax.task import (
     arrival,
     extended,
     geodesic,
+    hearing,
     observation,
     pieces,
     reward,
@@ -39,6 +40,8 @@ from swarmjax.task.episode import Episode
 from swarmjax.task.factors import Factors
 from swarmjax.task.level import Level, Spacing
 from swarmjax.task.stage_config import StageConfig, make_room
+
+COMMAND_SIZE = 2  # forward speed and turn rate
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +74,11 @@ class World:
     def observation_size(self) -> int:
         """Entries of what a policy takes, O: of `task.history` observations together."""
         return self.task.history * self.electronics.layout.size
+
+    @property
+    def action_size(self) -> int:
+        """Numbers of an action, U: the command, then what is broadcast."""
+        return COMMAND_SIZE + self.electronics.neighbours.message_size
 
 
 @struct.dataclass
@@ -214,6 +222,7 @@ def reset(world: World, level: Level) -> EnvState:
     clock, arrived = jnp.zeros((), jnp.int32), jnp.zeros(robots, bool)
     sight = _look(world, level.start, level, factors)
     sight = _look_by_extension(world, sight, level.start, level, arrived, clock)
+    sight = _hear(world, sight, level.start, level, None)
     memory, seen = task_electronics.begin(world.electronics, factors, sight, clock, jnp)
     nothing = jnp.zeros((robots, world.observation_size), seen.dtype)
     return EnvState(
@@ -270,15 +279,17 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
       world: the compiled environment.
       state: the arena; `sim` is the physics' data. Whatever else a caller keeps with an arena, by
         a class of its own made from `EnvState`, passes through.
-      action: [R, 2], -1..1 spans the command's range, what is beyond is clipped.
+      action: [R, U], -1..1 spans the command's range, what is beyond is clipped; what follows the
+        two of the command is broadcast (`task.neighbours.message_size`).
 
     Returns:
       The new state, and what the step came to.
     """
-    chex.assert_shape(action, (state.level.present.shape[0], 2))
+    chex.assert_shape(action, (state.level.present.shape[0], world.action_size))
     level, rule = state.level, world.task.arrival
     active = level.present & arrival.drives(rule, state.arrived)
     clock = state.clock + 1
+    action, said = _speak(world, action, active)
     data, memory, pose, sound = _move(world, state, action, active)
     sight = _look(world, pose, level, state.factors)
     within = active & (sight.distance <= world.task.target_radius)
@@ -286,6 +297,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     complete = jnp.all(arrived | ~level.present)
     arrives = level.present & complete if rule == "hold" else within
     sight = _look_by_extension(world, sight, pose, level, arrived, clock)
+    sight = _hear(world, sight, pose, level, said)
     memory, seen = task_electronics.sense(
         world.electronics, memory, state.factors, sight, clock, jnp
     )
@@ -409,6 +421,26 @@ def _look_by_extension(
         return sight
     view = task_electronics.view(sight, pose, level, arrived, clock)
     return sight._replace(own=extended.look(world.electronics.own, view))
+
+
+def _speak(world: World, action: Array, active: Array) -> tuple[Array, Array | None]:
+    """Takes actions [R, U] apart into commands [R, 2] and what is broadcast [R, M]."""
+    size = world.electronics.neighbours.message_size
+    if not size:
+        return action, None
+    return action[:, :COMMAND_SIZE], hearing.broadcast(action, size, active, jnp)
+
+
+def _hear(world: World, sight: Sight, pose: Array, level: Level, said: Array | None) -> Sight:
+    """Adds who can be heard at poses [R, 3], with what they said [R, M]; None: nothing yet."""
+    settings = world.electronics.neighbours
+    if not settings.count:
+        return sight
+    if said is None:
+        said = jnp.zeros((len(pose), settings.message_size))
+    hidden = hearing.hidden(pose, level.obstacle, jnp)
+    found = hearing.reachable(pose, level.present, hidden, said, settings.range, jnp)
+    return sight._replace(heard=found)
 
 
 def _fill(
