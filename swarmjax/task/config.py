@@ -59,8 +59,7 @@ class NeighboursConfig(Section):
         default=0, metadata=about("nearest robots that are heard; 0: robots do not hear", 0, 32)
     )
     range: float = field(
-        # Garattoni et al. 2015, "Software infrastructure for e-puck (and TAM)"; AutoMoDe's
-        # reference models RM1.1 and RM3 have a board that reaches about as far.
+        # AutoMoDe's reference models have a board; that it reaches about as far is assumed.
         default=0.7,
         metadata=about("between centres, m", above=0.0, high=10.0),
     )
