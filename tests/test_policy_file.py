@@ -97,12 +97,12 @@ _GOOD = policies.arrays()
 _RECALLS = policies.remembering(_GOOD, 5)
 _STACKS = policies.stacked(_GOOD, 3)
 _HEARS, _HEARD = policies.hearing(_GOOD, 2, 1)
-_HEARD = {"format": 5} | _HEARD
+_HEARS_META: dict[str, Any] = {"format": 5} | _HEARD
 
 
 def _heard(**changes: Any) -> dict[str, Any]:
-    layout = _HEARD["observation"]
-    return _HEARD | {"observation": layout | {"neighbours": layout["neighbours"] | changes}}
+    layout = _HEARS_META["observation"]
+    return _HEARS_META | {"observation": layout | {"neighbours": layout["neighbours"] | changes}}
 
 
 _MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
@@ -134,11 +134,11 @@ _MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
         (_HEARS, _heard(range=0), r"meta.observation.neighbours.range is 0: expected a number ab"),
         (_HEARS, _heard(count=9), r"meta.observation.neighbours takes 45 entries, but m"),
         (_HEARS, _heard(message_size=2), r"meta.action.names is \["),
-        (_HEARS, _HEARD | {"format": 2}, r"meta.format is 2, but this version reads 2, 3 with"),
-        (_HEARS, _HEARD | {"network": "mine"}, r"meta.observation.neighbours is there beside"),
+        (_HEARS, _HEARS_META | {"format": 2}, r"meta.format is 2, but this version reads 2, 3"),
+        (_HEARS, _HEARS_META | {"network": "mine"}, r"meta.observation.neighbours is there beside"),
         (
             {key: array for key, array in _HEARS.items() if key != "actor/hearing/bias"},
-            _HEARD,
+            _HEARS_META,
             r"actor/hearing/bias is missing",
         ),
         (

@@ -220,9 +220,8 @@ def reset(world: World, level: Level) -> EnvState:
     robots, obstacles = level.present.shape[0], level.obstacle_present.shape[0]
     factors = task_factors.draw(level.seed, world.realism, world.robot, robots, obstacles, jnp)
     clock, arrived = jnp.zeros((), jnp.int32), jnp.zeros(robots, bool)
-    sight = _look(world, level.start, level, factors)
+    sight = _look(world, level.start, level, factors, None)
     sight = _look_by_extension(world, sight, level.start, level, arrived, clock)
-    sight = _hear(world, sight, level.start, level, None)
     memory, seen = task_electronics.begin(world.electronics, factors, sight, clock, jnp)
     nothing = jnp.zeros((robots, world.observation_size), seen.dtype)
     return EnvState(
@@ -279,8 +278,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
       world: the compiled environment.
       state: the arena; `sim` is the physics' data. Whatever else a caller keeps with an arena, by
         a class of its own made from `EnvState`, passes through.
-      action: [R, U], -1..1 spans the command's range, what is beyond is clipped; what follows the
-        two of the command is broadcast (`task.neighbours.message_size`).
+      action: [R, U], -1..1 spans the command, what is beyond is clipped; from the third: broadcast.
 
     Returns:
       The new state, and what the step came to.
@@ -289,15 +287,13 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     level, rule = state.level, world.task.arrival
     active = level.present & arrival.drives(rule, state.arrived)
     clock = state.clock + 1
-    action, said = _speak(world, action, active)
     data, memory, pose, sound = _move(world, state, action, active)
-    sight = _look(world, pose, level, state.factors)
+    sight = _look(world, pose, level, state.factors, _speak(world, action, active))
     within = active & (sight.distance <= world.task.target_radius)
     arrived = arrival.arrived(rule, state.arrived, within)
     complete = jnp.all(arrived | ~level.present)
     arrives = level.present & complete if rule == "hold" else within
     sight = _look_by_extension(world, sight, pose, level, arrived, clock)
-    sight = _hear(world, sight, pose, level, said)
     memory, seen = task_electronics.sense(
         world.electronics, memory, state.factors, sight, clock, jnp
     )
@@ -398,8 +394,8 @@ def _move(
     return data, memory, jnp.where(sound, after, before), sound
 
 
-def _look(world: World, pose: Array, level: Level, factors: Factors) -> Sight:
-    """Works out what there is to be sensed at poses [R, 3]."""
+def _look(world: World, pose: Array, level: Level, factors: Factors, said: Array | None) -> Sight:
+    """Works out what there is to be sensed at poses [R, 3], where this was said [R, M]."""
     distance, bearing = observation.to_target(pose, level.target, jnp)
     radius, reach = world.robot.hull_radius, world.electronics.reach
     mount, shades = task_electronics.mount(factors), task_electronics.reflectance(factors)
@@ -410,7 +406,7 @@ def _look(world: World, pose: Array, level: Level, factors: Factors) -> Sight:
         ray, bright = infrared.sights(*arena, shades, mount, jnp)
     # Looked at by several: without the barrier XLA works rays out anew for each, on a GPU.
     ray, bright = jax.lax.optimization_barrier((ray, bright))
-    return Sight(ray, bright, distance, bearing)
+    return _hear(world, Sight(ray, bright, distance, bearing), pose, level, said)
 
 
 def _look_by_extension(
@@ -423,12 +419,10 @@ def _look_by_extension(
     return sight._replace(own=extended.look(world.electronics.own, view))
 
 
-def _speak(world: World, action: Array, active: Array) -> tuple[Array, Array | None]:
-    """Takes actions [R, U] apart into commands [R, 2] and what is broadcast [R, M]."""
+def _speak(world: World, action: Array, active: Array) -> Array | None:
+    """Takes what is broadcast [R, M] out of actions [R, U]; None if nothing is."""
     size = world.electronics.neighbours.message_size
-    if not size:
-        return action, None
-    return action[:, :COMMAND_SIZE], hearing.broadcast(action, size, active, jnp)
+    return hearing.broadcast(action, size, active, jnp) if size else None
 
 
 def _hear(world: World, sight: Sight, pose: Array, level: Level, said: Array | None) -> Sight:
@@ -449,6 +443,8 @@ def _fill(
     """Adds what only the terms of an extension look at, if there are any."""
     if not world.terms:
         return step
+    if world.action_size > COMMAND_SIZE:  # terms see what moves the robot
+        action = action[:, :COMMAND_SIZE]
     return step._replace(
         outside=~state.arrived,
         pose_before=physics.poses(world.physics, state.sim),

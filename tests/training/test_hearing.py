@@ -24,7 +24,12 @@ WORDS = [
 ]
 KINDS = {
     "plain": [],
-    "both": ["algo.memory=gru", "algo.memory_size=4", "algo.critic=state", "realism=real"],
+    "both": [
+        "algo.memory=gru",
+        "algo.memory_size=4",
+        "algo.critic=state",
+        "realism.packet_loss=0.3",
+    ],
 }
 
 
