@@ -105,9 +105,13 @@ class Swarm:
 
     @property
     def action_space(self) -> Space:
-        """One robot's action, [2]: -1..1 spans the commands; what is beyond is clipped."""
-        ones = np.ones(programs.ACTION_SIZE, np.float32)
-        return Space(ones.shape, policy_file.ACTION_NAMES, ("1", "1"), -ones, ones)
+        """One robot's action, [U]: -1..1 spans the commands; what is beyond is clipped.
+
+        Behind the two of the command is what the robot broadcasts, if it does.
+        """
+        ones = np.ones(self.world.action_size, np.float32)
+        names, _ = policy_file.action_layout(self.world.electronics.neighbours.message_size)
+        return Space(ones.shape, names, ("1",) * len(names), -ones, ones)
 
     def pose(self, state: SwarmState) -> Array:
         """[A, R, 3] x (m), y (m), yaw (rad) of the robots; absent ones stand outside."""
@@ -140,7 +144,7 @@ class Swarm:
 
         Args:
             state: before.
-            action: [A, R, 2], -1..1 spans the commands; what is beyond is clipped.
+            action: [A, R, U], -1..1 spans the commands; what is beyond is clipped.
 
         Returns:
             The state after, and the step's outcome: observation [A, R, O], reward, terminated,

@@ -12,6 +12,7 @@ import numpy as np
 
 FORMAT = 2
 MEMORY_FORMAT = 4  # of a policy that remembers, by a memory or a history
+HEARING_FORMAT = 5  # of a policy that hears neighbours, whether it remembers or not
 MAX_BYTES = 2**30  # of all arrays; those of two layers of 64 take 20 kB
 _MAX_LIST = 2**16  # bytes of the list of members, of which a name takes a hundred
 MAX_LETTERS = 2**20  # of `meta`, each four bytes
@@ -44,6 +45,13 @@ class Policy(NamedTuple):
     network: Any = None  # with `meta["network"]`: normalised [..., R, k O] to features
     # of format 4: kernel [L, F, 3 H] and bias [L, 3 H] of what is seen, and of what is recalled
     memory: tuple[np.ndarray, ...] | None = None
+    # of format 5: kernel [L, W, E] and bias [L, E] of what is made of each neighbour
+    hearing: tuple[np.ndarray, ...] | None = None
+
+    @property
+    def neighbours(self) -> dict[str, Any]:
+        """What is heard: `count`, `range` (m) and `message_size`; empty if nothing."""
+        return self.meta["observation"].get("neighbours", {})
 
     @property
     def history(self) -> int:
@@ -72,8 +80,10 @@ def load(path: str | Path | IO[bytes]) -> Policy:
         history = meta.get("observation", {}).get("history", 1)
         if type(history) is not int or history < 1:
             raise ValueError(f"meta.observation.history is {json.dumps(history)[:80]}")
+        hears = "neighbours" in meta["observation"]
         wanted = MEMORY_FORMAT if "memory" in meta or history > 1 else FORMAT
-        if meta["format"] == MEMORY_FORMAT and "network" in meta:
+        wanted = HEARING_FORMAT if hears else wanted
+        if meta["format"] in (MEMORY_FORMAT, HEARING_FORMAT) and "network" in meta:
             raise ValueError("its network is code of an extension")
         if meta["format"] != wanted:
             raise ValueError(f"meta.format is {json.dumps(meta['format'])[:80]}, not {wanted}")
@@ -82,11 +92,14 @@ def load(path: str | Path | IO[bytes]) -> Policy:
         memory = (
             tuple(arrays.pop(f"actor/memory/{n}") for n in MEMORY) if "memory" in meta else None
         )
+        parts = ("kernel", "bias")
+        hearing = tuple(arrays.pop(f"actor/hearing/{n}") for n in parts) if hears else None
         names = [*(f"hidden_{i}" for i in range((len(arrays) - 6) // 2)), "mean"]
         layers = [(arrays[f"actor/{n}/kernel"], arrays[f"actor/{n}/bias"]) for n in names]
         rest = [arrays[n] for n in ("actor/log_std", "normalizer/mean", "normalizer/std")]
         rest += [meta["policy"] == "shared", meta["observation"]["encoding"]]
-        return Policy(*[layers, *rest, *meta["action"]["high"], meta, found], memory=memory)
+        rest += [*meta["action"]["high"][:2], meta, found]
+        return Policy(*[layers, *rest], memory=memory, hearing=hearing)
     except Exception as error:  # whatever a damaged file makes zipfile, NumPy and json raise
         reason = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
         raise PolicyError(f"{path} cannot be read as a policy: {reason[:200]}.") from None
@@ -188,6 +201,8 @@ def step(
         memory = x[..., : policy.carried]
     x = (x - policy.mean[mine]) / policy.std[mine]
     x = (policy.network or np.asarray)(np.clip(x, -limit, limit))
+    if policy.hearing is not None:
+        x = _hear([part[mine] for part in policy.hearing], policy, x)
     *hidden, (kernel, bias) = policy.layers
     for weights, offset in hidden:
         x = _ACTIVATIONS[policy.meta["activation"]](np.vecmat(x, weights[mine]) + offset[mine])
@@ -213,6 +228,15 @@ def _check(policy: Policy, memory: np.ndarray | None, observation: np.ndarray) -
         raise PolicyError(f"memory is {found}: give {wanted}, as `begin` returns it.")
 
 
+def _hear(parts: list[np.ndarray], policy: Policy, x: np.ndarray) -> np.ndarray:
+    """Returns the observation with the sum over neighbours of one layer in the place of them."""
+    (kernel, bias), count = parts, policy.neighbours["count"]
+    first = x.shape[-1] - count * kernel.shape[1]
+    rows = x[..., first:].reshape(*x.shape[:-1], count, kernel.shape[1])
+    each = _ACTIVATIONS[policy.meta["activation"]](np.matmul(rows, kernel) + bias[:, None])
+    return np.concatenate([x[..., :first], (each * rows[..., :1]).sum(-2)], axis=-1)
+
+
 def _remember(parts: list[np.ndarray], memory: np.ndarray, features: np.ndarray) -> np.ndarray:
     """Returns the memory after a gated recurrent unit (GRU), reset gate behind the product."""
     seen, recalled = (
@@ -232,7 +256,9 @@ def command(policy: Policy, action: np.ndarray) -> np.ndarray:
     """Scales actions [..., U], clipped to -1..1, to commands.
 
     Returns:
-        [..., U]: speed, 0..max_speed (m/s), and turn rate (rad/s, left positive).
+        [..., U]: speed, 0..max_speed (m/s), and turn rate (rad/s, left positive); of a policy that
+        broadcasts, what it does, -1..1, follows.
     """
-    speed, turn = np.moveaxis(np.clip(action, -1, 1), -1, 0)
-    return np.stack([(speed + 1) * (0.5 * policy.max_speed), turn * policy.max_turn_rate], -1)
+    speed, turn, *said = np.moveaxis(np.clip(action, -1, 1), -1, 0)
+    drive = [(speed + 1) * (0.5 * policy.max_speed), turn * policy.max_turn_rate]
+    return np.stack([*drive, *said], -1)

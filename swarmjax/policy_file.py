@@ -12,7 +12,7 @@ import re
 import zipfile
 from collections.abc import Callable, Mapping, Sequence, Set
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from swarmjax.config import ConfigError
 from swarmjax.config.reading import parse_json
 from swarmjax.policy import (
     FORMAT,
+    HEARING_FORMAT,
     MAX_BYTES,
     MAX_ENTRIES,
     MAX_LETTERS,
@@ -41,13 +42,14 @@ ARRIVALS = ("latch", "hold")
 
 _MOST_MEMORY = 1024  # numbers that a robot remembers
 _MOST_HISTORY = 64  # observations that a policy takes
+_MOST_HEARD = 32  # neighbours, and numbers that each broadcasts
 NETWORK_FORMAT = 3  # of a policy whose network is code that its file does not hold
 _NETWORK = "network/"
 _DTYPE = np.dtype("<f4")
 _MOST = float(np.finfo(np.float32).max)  # numbers of `meta` are computed with in float32
 _MOST_LIMIT = 1e6  # standard deviations; beyond, sums of float32 may overflow
 _MEMBER = re.compile(
-    r"(actor/(hidden_\d{1,3}|mean|memory/(input|recurrent))/(kernel|bias)|actor/log_std|"
+    r"(actor/(hidden_\d{1,3}|mean|hearing|memory/(input|recurrent))/(kernel|bias)|actor/log_std|"
     r"normalizer/(mean|std)|meta|digest|"
     r"network/(\w{1,64}/){0,8}\w{1,64})\.npy",
     re.ASCII,
@@ -188,8 +190,8 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     if meta.get("format") != _format(meta):
         raise PolicyError(
             f"meta.format is {_show(meta.get('format'))}, but this version reads {FORMAT}, "
-            f"{NETWORK_FORMAT} with meta.network, and {MEMORY_FORMAT} with meta.memory or a "
-            "history: export the policy from its run again."
+            f"{NETWORK_FORMAT} with meta.network, {MEMORY_FORMAT} with meta.memory or a history, "
+            f"and {HEARING_FORMAT} with neighbours: export the policy from its run again."
         )
     if own and not _is_name(meta["network"]):
         raise PolicyError(f"meta.network is {_show(meta['network'])}: expected a name.")
@@ -205,15 +207,23 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
         expected = "1 for a shared policy" if meta["policy"] == "shared" else "1 or more"
         raise PolicyError(f"meta.learners is {_show(learners)}: expected {expected}.")
     _check_optional(meta)
-    recalled = _check_memory(meta)
+    recalled, heard = _check_memory(meta), _check_neighbours(meta)
     size = _check_observation(meta["observation"]) * _check_history(meta)
-    _check_action(meta["action"])
+    if heard.size > size:
+        raise PolicyError(
+            f"meta.observation.neighbours takes {heard.size} entries, but meta.observation.names "
+            f"has {size}: expected those of neighbours among them."
+        )
+    actions = _check_action(meta["action"], heard.messages)
     _check_embodiment(meta)
-    _check_arrays(arrays, (learners, size, recalled), own=own)
+    _check_arrays(arrays, _Sizes(learners, size, recalled, heard, actions), own=own)
 
 
 def _format(meta: Mapping[str, Any]) -> int:
     """Returns the number of the format of a file that says this of itself."""
+    layout = meta.get("observation")
+    if isinstance(layout, Mapping) and "neighbours" in layout:
+        return HEARING_FORMAT
     if "memory" in meta or _has_history(meta):
         return MEMORY_FORMAT
     return NETWORK_FORMAT if "network" in meta else FORMAT
@@ -257,6 +267,56 @@ def _check_memory(meta: Mapping[str, Any]) -> int:
             f"meta.memory.size is {_show(meta['memory']['size'])}: expected 1 to {_MOST_MEMORY}."
         )
     return meta["memory"]["size"]
+
+
+class _Heard(NamedTuple):
+    """How many neighbours are heard, and how many numbers each broadcasts."""
+
+    robots: int = 0
+    messages: int = 0
+
+    @property
+    def width(self) -> int:
+        """Entries of a neighbour: whether there is one, distance, cosine, sine, message."""
+        return 4 + self.messages
+
+    @property
+    def size(self) -> int:
+        """Entries of all of them."""
+        return self.robots * self.width
+
+
+class _Sizes(NamedTuple):
+    """L, O, H (0 without memory), what is heard and U."""
+
+    learners: int
+    size: int
+    recalled: int
+    heard: _Heard
+    actions: int
+
+
+def _check_neighbours(meta: Mapping[str, Any]) -> _Heard:
+    """Checks what the file says of neighbours and returns it."""
+    if "neighbours" not in meta["observation"]:
+        return _Heard()
+    if "network" in meta:
+        raise PolicyError(
+            "meta.observation.neighbours is there beside meta.network: expected one of them."
+        )
+    where = "meta.observation.neighbours"
+    _entry(meta["observation"], "neighbours", dict, "meta.observation")
+    held = meta["observation"]["neighbours"]
+    for key, least in (("count", 1), ("message_size", 0)):
+        _entry(held, key, int, where)
+        if not least <= held[key] <= _MOST_HEARD:
+            raise PolicyError(
+                f"{where}.{key} is {_show(held[key])}: expected {least} to {_MOST_HEARD}."
+            )
+    _check_positive(held, "range", where)
+    if meta["observation"].get("history", 1) != 1:
+        raise PolicyError(f"{where} is there beside a history: expected one of them.")
+    return _Heard(held["count"], held["message_size"])
 
 
 def _refuse_in[T](path: Path, make: Callable[[], T]) -> T:
@@ -474,21 +534,37 @@ def _check_positive(layout: Mapping[str, Any], key: str, where: str) -> None:
         raise PolicyError(f"{where}.{key} is {_show(value)}: expected a number above 0.")
 
 
-def _check_action(layout: Mapping[str, Any]) -> None:
-    for key, expected in (("names", ACTION_NAMES), ("units", ACTION_UNITS)):
+def action_layout(messages: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names the numbers of an action, U, and their units.
+
+    Args:
+        messages: How many numbers a robot broadcasts.
+    """
+    said = tuple(f"message_{i}" for i in range(messages))
+    return (*ACTION_NAMES, *said), (*ACTION_UNITS, *("1" for _ in said))
+
+
+def _check_action(layout: Mapping[str, Any], messages: int) -> int:
+    """Checks the layout of the action and returns its size U."""
+    every = action_layout(messages)
+    for key, expected in zip(("names", "units"), every, strict=True):
         found = layout.get(key)
         if not isinstance(found, list | tuple) or tuple(found) != expected:
             raise PolicyError(
                 f"meta.action.{key} is {_show(found)}: expected {_show(list(expected))}."
             )
     for key in ("low", "high"):
-        _check_numbers(layout, key, len(ACTION_NAMES), "meta.action")
+        _check_numbers(layout, key, len(every[0]), "meta.action")
     low, high = list(layout["low"]), list(layout["high"])
-    if (np.array(high, np.float32) <= 0).any() or low != [0, -high[1]]:
+    said = [1] * messages
+    sound = low == [0, -high[1], *(-x for x in said)] and high[2:] == said
+    if (np.array(high, np.float32) <= 0).any() or not sound:
         raise PolicyError(
             f"meta.action.low is {_show(low)} and high is {_show(high)}: expected "
-            "a speed from 0 up and a turn rate within plus or minus one limit."
+            "a speed from 0 up and a turn rate within plus or minus one limit"
+            f"{', and messages within -1 to 1' if messages else ''}."
         )
+    return len(every[0])
 
 
 def _check_embodiment(meta: Mapping[str, Any]) -> None:
@@ -526,14 +602,12 @@ def _is_number(value: object) -> TypeGuard[float]:
 # Arrays
 
 
-def _check_arrays(
-    arrays: Mapping[str, np.ndarray], sizes: tuple[int, int, int], *, own: bool
-) -> None:
+def _check_arrays(arrays: Mapping[str, np.ndarray], sizes: _Sizes, *, own: bool) -> None:
     """Checks names, then types, shapes and values.
 
-    `sizes` are L, O and H, the last 0 without memory; `own` says that the network is code.
+    `own` says that the network is code.
     """
-    learners, size, _ = sizes
+    learners, size = sizes.learners, sizes.size
     depth = _depth(arrays, own=own)
     first = arrays.get(f"actor/{'hidden_0' if depth else 'mean'}/kernel")
     known = own and first is not None and first.ndim == 3
@@ -581,13 +655,19 @@ def _depth(arrays: Mapping[str, np.ndarray], *, own: bool) -> int:
 
 
 def _shapes(
-    arrays: Mapping[str, np.ndarray], sizes: tuple[int, int, int], width: int, depth: int
+    arrays: Mapping[str, np.ndarray], sizes: _Sizes, width: int, depth: int
 ) -> dict[str, tuple[int, ...]]:
     """Returns the shape that each array should have; a bias says how wide its layer is.
 
-    `sizes` are L, O and H, `width` is what the first layer takes.
+    `width` is what the first layer takes of a policy that does not hear.
     """
-    shapes, (learners, size, recalled) = {}, sizes
+    shapes, (learners, size, recalled, heard, actions) = {}, sizes
+    if heard.robots:
+        bias = arrays.get("actor/hearing/bias")
+        inner = bias.shape[-1] if bias is not None and bias.ndim == 2 else 0
+        shapes["actor/hearing/kernel"] = (learners, heard.width, inner)
+        shapes["actor/hearing/bias"] = (learners, inner)
+        width += inner - heard.size
     for i in range(depth):
         bias = arrays.get(f"actor/hidden_{i}/bias")
         inner = bias.shape[-1] if bias is not None and bias.ndim == 2 else 0
@@ -601,7 +681,6 @@ def _shapes(
         for part in ("input", "recurrent"):
             shapes[f"actor/memory/{part}/bias"] = (learners, gates)
         width += recalled
-    actions = len(ACTION_NAMES)
     shapes["actor/mean/kernel"] = (learners, width, actions)
     shapes["actor/mean/bias"] = shapes["actor/log_std"] = (learners, actions)
     shapes["normalizer/mean"] = shapes["normalizer/std"] = (learners, size)

@@ -96,6 +96,15 @@ def _history(count: int) -> dict[str, Any]:
 _GOOD = policies.arrays()
 _RECALLS = policies.remembering(_GOOD, 5)
 _STACKS = policies.stacked(_GOOD, 3)
+_HEARS, _HEARD = policies.hearing(_GOOD, 2, 1)
+_HEARS_META: dict[str, Any] = {"format": 5} | _HEARD
+
+
+def _heard(**changes: Any) -> dict[str, Any]:
+    layout = _HEARS_META["observation"]
+    return _HEARS_META | {"observation": layout | {"neighbours": layout["neighbours"] | changes}}
+
+
 _MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
 
 
@@ -119,6 +128,18 @@ _MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
             _RECALLS,
             _MEMORY | {"memory": {"kind": "gru", "size": 4}},
             r"actor/mean/kernel has shape \[1, 8, 2\]: expected \[1, 7, 2\]",
+        ),
+        (_HEARS, _heard(count=0), r"meta.observation.neighbours.count is 0: expected 1 to 32"),
+        (_HEARS, _heard(message_size=33), r"meta.observation.neighbours.message_size is 33: exp"),
+        (_HEARS, _heard(range=0), r"meta.observation.neighbours.range is 0: expected a number ab"),
+        (_HEARS, _heard(count=9), r"meta.observation.neighbours takes 45 entries, but m"),
+        (_HEARS, _heard(message_size=2), r"meta.action.names is \["),
+        (_HEARS, _HEARS_META | {"format": 2}, r"meta.format is 2, but this version reads 2, 3"),
+        (_HEARS, _HEARS_META | {"network": "mine"}, r"meta.observation.neighbours is there beside"),
+        (
+            {key: array for key, array in _HEARS.items() if key != "actor/hearing/bias"},
+            _HEARS_META,
+            r"actor/hearing/bias is missing",
         ),
         (
             _GOOD,
@@ -188,8 +209,8 @@ _MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
         (
             _GOOD,
             {"format": 1},
-            r"meta.format is 1, but this version reads 2, 3 with meta.network, and 4 with "
-            "meta.memory or a history: export the policy",
+            r"meta.format is 1, but this version reads 2, 3 with meta.network, 4 with "
+            "meta.memory or a history, and 5 with neighbours: export the policy",
         ),
         (_GOOD, {"activation": "gelu"}, r'meta.activation is "gelu": expected tanh or relu or sw'),
         (_GOOD, {"policy": "mine"}, r'meta.policy is "mine": expected shared or independent'),

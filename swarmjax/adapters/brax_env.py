@@ -52,7 +52,7 @@ class SwarmBraxEnv(_base.Env):
     @property
     def action_size(self) -> int:
         """Numbers that a robot is commanded with."""
-        return 2
+        return self.robots.action_size
 
     @property
     def backend(self) -> str:
@@ -77,12 +77,12 @@ class SwarmBraxEnv(_base.Env):
 
         Args:
             state: before.
-            action: [N, 2] floats; what is beyond -1..1 is clipped.
+            action: [N, U] floats; what is beyond -1..1 is clipped.
 
         Raises:
             ValueError: the action has a wrong shape; TypeError: a wrong dtype.
         """
-        check(action, (self.num_envs, 2))
+        check(action, (self.num_envs, self.action_size))
         steps = state.pipeline_state.arenas.clock[self.robots.arena] + 1.0
         now, came = self.robots.step(state.pipeline_state, action)
         idle = came.truncated | ~came.valid

@@ -94,20 +94,20 @@ class SwarmMultiAgentEnv(_base):
         return self._by_agent(self.robots.observe(state))
 
     def get_avail_actions(self, state: SwarmState) -> _ByAgent:
-        """[2] by agent: False where the robot stands and does not act."""
+        """[U] by agent: False where the robot stands and does not act."""
         arrived = state.arenas.arrived[0, self.robots.index]
         free = ~arrived | (self.robots.swarm.world.task.arrival == "hold")
-        return self._by_agent(jnp.repeat(free[:, None], 2, axis=1))
+        return self._by_agent(jnp.repeat(free[:, None], self.robots.action_size, axis=1))
 
     def _by_agent(self, x: Array) -> _ByAgent:
         return {agent: x[i] for i, agent in enumerate(self.agents)}
 
     def _stack(self, actions: _ByAgent) -> Array:
-        """[N, 2]."""
+        """[N, U]."""
         if missing := sorted(set(self.agents) - set(actions)):
             raise ValueError(f"actions lack {missing}: give one of each agent.")
         for agent in self.agents:
-            check(actions[agent], (2,), f"{agent}: ")
+            check(actions[agent], (self.robots.action_size,), f"{agent}: ")
         return jnp.stack([actions[agent] for agent in self.agents])
 
 

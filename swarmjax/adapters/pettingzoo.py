@@ -106,13 +106,14 @@ class SwarmParallelEnv(_base):
         self._session.close()
 
     def _stack(self, actions: dict[str, Any]) -> np.ndarray:
-        """[N, 2] what all robots are told; 0 for those that stand."""
-        stacked = np.zeros((len(self.possible_agents), 2), np.float32)
+        """[N, U] what all robots are told; 0 for those that stand."""
+        size = self.action_spaces[self.possible_agents[0]].shape[0]
+        stacked = np.zeros((len(self.possible_agents), size), np.float32)
         if wrong := (set(self.agents) - set(actions)) | (set(actions) - set(self.possible_agents)):
             raise errors.InvalidAction(f"actions lack, or have too many, {sorted(wrong)}.")
         for agent in self.agents:
             action = np.asarray(actions[agent])
-            if sentence := fault(action, (2,)):
+            if sentence := fault(action, (size,)):
                 raise errors.InvalidAction(f"{agent}: {sentence}")
             stacked[self.possible_agents.index(agent)] = action
         return stacked

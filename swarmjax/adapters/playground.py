@@ -77,7 +77,7 @@ class SwarmMjxEnv(_playground.MjxEnv):
         """
         check(action, (self.action_size,))
         late = state.data.arenas.clock[0] + 1 >= self.episode_length
-        now, came = self.robots.step(state.data, action.reshape(-1, 2))
+        now, came = self.robots.step(state.data, action.reshape(-1, self.robots.action_size))
         done = came.over[0] & ~(late & came.truncated.any())
         return state.replace(
             data=now,
@@ -94,8 +94,8 @@ class SwarmMjxEnv(_playground.MjxEnv):
 
     @property
     def action_size(self) -> int:
-        """Two numbers a robot."""
-        return 2 * len(self.robots)
+        """Those of all robots: two each, and what they broadcast."""
+        return self.robots.action_size * len(self.robots)
 
     @property
     def mj_model(self) -> Any:

@@ -55,6 +55,11 @@ class RobotRow:
         """[N] the arena of each robot."""
         return self.index // self.swarm.num_robots
 
+    @property
+    def action_size(self) -> int:
+        """Numbers of one robot's action, U: the command, then what it broadcasts, if it does."""
+        return self.swarm.world.action_size
+
     def observe(self, state: SwarmState) -> Array:
         """[N, O] what to act on."""
         return self._gather(state.observation)
@@ -64,14 +69,14 @@ class RobotRow:
 
         Args:
             state: before.
-            action: [N, 2], -1..1 spans the commands; what is beyond is clipped.
+            action: [N, U], -1..1 spans the commands; what is beyond is clipped.
 
         Returns:
             The state after, and the outcome.
         """
         arenas, robots = self.swarm.num_arenas, self.swarm.num_robots
-        places = jnp.zeros((arenas * robots, 2)).at[self.index].set(action)
-        state, came = self.swarm.step(state, places.reshape(arenas, robots, 2))
+        places = jnp.zeros((arenas * robots, self.action_size)).at[self.index].set(action)
+        state, came = self.swarm.step(state, places.reshape(arenas, robots, -1))
         return state, RobotStep(
             observation=self.observe(state),
             last=self._gather(came.observation),

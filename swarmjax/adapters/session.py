@@ -52,7 +52,7 @@ class Session:
         """Starts a control step, and does not wait for it.
 
         Args:
-            action: [N, 2] floats; what is beyond -1..1 is clipped.
+            action: [N, U] floats; what is beyond -1..1 is clipped.
 
         Returns:
             What it comes to, on the device.
@@ -66,7 +66,7 @@ class Session:
         if self._state is None:
             raise errors.ResetNeeded("step was called before reset: call reset first.")
         action = np.asarray(action)
-        if sentence := fault(action, (len(self._robots), 2)):
+        if sentence := fault(action, (len(self._robots), self._robots.action_size)):
             raise errors.InvalidAction(sentence)
         self._state, came = self._step(self._state, action.astype(np.float32))
         return came

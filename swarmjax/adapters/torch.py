@@ -63,7 +63,7 @@ class SwarmTorchEnv:
         """Makes a control step.
 
         Args:
-            action: [N, 2] float32 tensor; what is beyond -1..1 is clipped.
+            action: [N, U] float32 tensor; what is beyond -1..1 is clipped.
 
         Returns:
             Tensors.
@@ -75,7 +75,7 @@ class SwarmTorchEnv:
         self._check_open()
         if self._state is None:
             raise ValueError("step was called before reset: call reset first.")
-        check(action, (len(self), 2))
+        check(action, (len(self), self._robots.action_size))
         self._state, came = self._step(self._state, to_jax(action.float()))
         return RobotStep(*map(to_torch, came))
 

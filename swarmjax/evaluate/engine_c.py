@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol
 import mujoco
 import numpy as np
 
-from swarmjax import policy, policy_file
+from swarmjax import policy
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import measures, rays
 from swarmjax.evaluate.judge import Judge
@@ -28,7 +28,7 @@ from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps, noise
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.noise import Stream
-from swarmjax.task import arrival, electronics, level, observation
+from swarmjax.task import arrival, electronics, hearing, level, observation
 from swarmjax.task import factors as task_factors
 from swarmjax.task.electronics import Memory, Sight
 from swarmjax.task.factors import Factors
@@ -94,7 +94,7 @@ class _ByPolicy(NamedTuple):
     ) -> tuple[np.ndarray | None, np.ndarray]:
         normal: Any = 0.0
         if self.judge.config.action == "sampled":
-            shape = (arenas.pose.shape[1], len(policy_file.ACTION_NAMES))
+            shape = (arenas.pose.shape[1], self.judge.policy.log_std.shape[1])
             clock = arenas.outcome.clock
             normal = noise.normal(arenas.seed, clock, Stream.ACTION, shape, np)
         return policy.step(self.judge.policy, memory, arenas.observation, normal)
@@ -178,6 +178,7 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     outcome = _no_outcome(len(levels), judge.spacing.robots)
     sight = look(judge, data, factors, pose, target, obstacle)
     sight = _look_by_extension(judge, sight, pose, begun, outcome.arrived, outcome.clock)
+    sight = _hear(judge, data, sight, pose, obstacle, None)
     memory, seen = electronics.begin(judge.electronics, factors, sight, outcome.clock, np)
     return Arenas(
         model=model,
@@ -289,7 +290,8 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
         if judge.policy.carried:
             raise PolicyError("the policy remembers: give the action, as `by_policy` chooses it.")
         _, action = by_policy(judge).act(None, arenas)
-    memory, pose, impulse = _drive(judge, arenas, action, arrival.drives(task.arrival, before))
+    active = arrival.drives(task.arrival, before)
+    memory, pose, impulse = _drive(judge, arenas, action[..., :2], active)
     sight = look(judge, arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)
     arrived = arrival.arrived(task.arrival, before, sight.distance <= task.target_radius)
     touches = touching(judge, arenas.data)
@@ -297,6 +299,8 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
     begins, apart = gaps.count_contacts(gap, arenas.apart, task.control_step, np)
     clock = arenas.outcome.clock + 1
     sight = _look_by_extension(judge, sight, pose, arenas.level, arrived, clock)
+    said = hearing.broadcast(action, judge.electronics.neighbours.message_size, active, np)
+    sight = _hear(judge, arenas.data, sight, pose, arenas.obstacle, said)
     memory, seen = electronics.sense(judge.electronics, memory, arenas.factors, sight, clock, np)
     step = _Step(arrived, begins, touches, impulse, sight.ray < task.sensor_range)
     anchor, outcome = _tally(arenas, pose, step)
@@ -317,6 +321,25 @@ def _look_by_extension(
     if judge.own is None:
         return sight
     return sight._replace(own=judge.own(electronics.view(sight, pose, levels, arrived, clock)))
+
+
+def _hear(
+    judge: Judge,
+    data: np.ndarray,
+    sight: Sight,
+    pose: np.ndarray,
+    obstacle: np.ndarray,
+    said: np.ndarray | None,
+) -> Sight:
+    """Adds who can be heard, with what they said [A, R, M]; None: nothing yet."""
+    settings = judge.electronics.neighbours
+    if not settings.count:
+        return sight
+    if said is None:
+        said = np.zeros((*pose.shape[:2], settings.message_size), np.float32)
+    hidden = rays.hidden(judge.scene, data, pose, obstacle, settings.range)
+    present = np.ones(pose.shape[:2], bool)  # the judge has no other robots
+    return sight._replace(heard=hearing.reachable(pose, present, hidden, said, settings.range, np))
 
 
 class _Step(NamedTuple):

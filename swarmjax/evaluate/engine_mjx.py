@@ -35,11 +35,11 @@ from swarmjax.sim.config import SimConfig
 from swarmjax.sim.noise import Stream
 from swarmjax.task import electronics, env, level, placement
 from swarmjax.task import stage as task_stage
+from swarmjax.task.config import NeighboursConfig
 from swarmjax.task.env import EnvState, World
 from swarmjax.task.level import Level, Spacing
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import rollout
-from swarmjax.training.program import ACTION_SIZE
 
 LARGEST_BOX = 0.3  # m; the largest that a stage takes
 _ACTIVATIONS = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}
@@ -176,13 +176,14 @@ def play(
         world,
         steps,
         (trained.encoding, trained.history, trained.meta["observation"]["limit"]),
+        judge.neighbours(trained),
         (trained.max_speed, trained.max_turn_rate),
         trained.meta["activation"],
         sampled,
         None if trained.network is None else trained.network.module,
     )
     network = None if trained.network is None else trained.network.params
-    weights = trained.layers, trained.mean, trained.std, network, trained.memory
+    weights = trained.layers, trained.mean, trained.std, network, trained.hearing, trained.memory
     outcome, broken = run(weights, trained.log_std, levels)
     if np.any(broken):
         raise ConfigError(
@@ -197,6 +198,7 @@ def _program(
     world: World,
     steps: int,
     seen: tuple[electronics.Encoding, int, float],
+    heard: NeighboursConfig,
     limits: tuple[float, float],
     activation: str,
     sampled: bool,
@@ -207,12 +209,12 @@ def _program(
     mine = replace(
         world,
         drive=world.drive._replace(max_speed=speed, max_turn_rate=turn_rate),
-        task=replace(world.task, history=history),
-        electronics=replace(world.electronics, encoding=encoding),
+        task=replace(world.task, history=history, neighbours=heard),
+        electronics=replace(world.electronics, encoding=encoding, neighbours=heard),
     )
 
     def play(weights: Any, log_std: Array, levels: Level) -> tuple[dict[str, Array], Array]:
-        mean = partial(_mean_action, activation, limit, weights, network)
+        mean = partial(_mean_action, activation, limit, weights, network, heard.count)
         act = partial(_act, mean, log_std if sampled else None)
         memory = _begin(weights[-1], levels.present.shape)
         arenas, counts, broken = _run(mine, act, levels, steps, memory)
@@ -242,14 +244,22 @@ def _act(
 
 
 def _mean_action(
-    activation: str, limit: float, weights: Any, network: Any, memory: Any, observation: Array
+    activation: str,
+    limit: float,
+    weights: Any,
+    network: Any,
+    count: int,
+    memory: Any,
+    observation: Array,
 ) -> tuple[Any, Array]:
     """What `policy.step` says without noise, [E, R, U]: in full precision, where a GPU has less."""
-    layers, mean, std, params, parts = weights
+    layers, mean, std, params, hearing, parts = weights
     robots = slice(observation.shape[-2])
     x = jnp.clip((observation - mean[robots]) / std[robots], -limit, limit)
     if network is not None:
         x = policy_network.features(network, params, x)
+    if hearing is not None:
+        x = _hear(_ACTIVATIONS[activation], hearing, count, x)
     *hidden, last = layers
     for layer in hidden:
         x = _ACTIVATIONS[activation](_dense(x, layer, robots))
@@ -258,6 +268,15 @@ def _mean_action(
         memory = remember(seen, recalled, memory)
         x = jnp.concatenate([x, memory], axis=-1)
     return memory, _dense(x, last, robots)
+
+
+def _hear(activate: Callable[[Array], Array], layer: Any, count: int, x: Array) -> Array:
+    """What `policy.step` makes of the neighbours in x [E, R, O], in full precision."""
+    kernel, bias = (jnp.asarray(part)[: x.shape[-2]] for part in layer)
+    first = x.shape[-1] - count * kernel.shape[1]
+    rows = x[..., first:].reshape(*x.shape[:-1], count, kernel.shape[1])
+    each = jnp.matmul(rows, kernel, precision=jax.lax.Precision.HIGHEST) + bias[:, None]
+    return jnp.concatenate([x[..., :first], (activate(each) * rows[..., :1]).sum(-2)], axis=-1)
 
 
 def _dense(x: Array, layer: tuple[ArrayLike, ArrayLike], robots: slice) -> Array:
@@ -310,7 +329,8 @@ def _choose(
     seen = rollout.to_learners(arenas.observation, count)
     mine = None if memory is None else rollout.to_learners(memory, count)
     if sampled:
-        shape = (arenas.observation.shape[-2], ACTION_SIZE)
+        actions = learners.params["actor"]["log_std"].shape[-1]
+        shape = (arenas.observation.shape[-2], actions)
         drawn = noise.normal(arenas.level.seed, arenas.clock, Stream.ACTION, shape, jnp)
         action, _, after = jax.vmap(
             lambda learner, o, n, m: ppo.recall_act(learner, config, o, n, m)

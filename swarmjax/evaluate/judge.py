@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from swarmjax import extension
+from swarmjax.config import build
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.rays import RayScene
 from swarmjax.extension import Extensions, LevelDrawing, Observation
@@ -21,6 +22,7 @@ from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors as task_factors
 from swarmjax.task import level, observation, shapes
 from swarmjax.task import stage as task_stage
+from swarmjax.task.config import NeighboursConfig
 from swarmjax.task.electronics import Electronics
 from swarmjax.task.observation import View
 from swarmjax.task.stage_config import StageConfig
@@ -88,7 +90,9 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
     example = shapes.expand(example, config.shape)
     compiled, ids = _compile(config, example.obstacle[:, 3:] if half is None else half)
     geom_robot, geom_kind = _geoms(compiled, ids)
-    electronics = task_electronics.load(config.task, config.realism, trained.encoding, own)
+    electronics = task_electronics.load(
+        config.task, config.realism, trained.encoding, own, neighbours(trained)
+    )
     return Judge(
         config=config,
         policy=trained,
@@ -112,6 +116,11 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
         substeps=substeps(config),
         own=_look_by(own),
     )
+
+
+def neighbours(trained: Policy) -> NeighboursConfig:
+    """Returns what a policy was trained to hear, and to broadcast."""
+    return build(NeighboursConfig, trained.neighbours, "meta.observation.neighbours.")
 
 
 def substeps(config: EvaluateConfig) -> int:
@@ -191,8 +200,8 @@ def check_policy(
         extension.check_needs(needs, extensions, str(path), ["level"])
     layout = trained.meta["observation"]
     own = _observations(extensions, trained)
-    for key, expected in observation.describe(trained.encoding, own).items():
-        found = layout[key]
+    for key, expected in observation.describe(trained.encoding, own, neighbours(trained)).items():
+        found = layout.get(key)
         if found != expected:
             raise PolicyError(
                 f"{path} was trained on other observations than this robot makes: its "

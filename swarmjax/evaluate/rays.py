@@ -1,6 +1,7 @@
 """The judge's infrared rays: MuJoCo's own, cast on the real shapes. No JAX."""
 
 from dataclasses import dataclass
+from typing import cast
 
 import mujoco
 import numpy as np
@@ -79,6 +80,41 @@ def cast_rays(
     seen[near] = np.where(leaves.any(axis=-1), 0.0, np.minimum(ahead, limit))
     geoms[near] = met[:, 0]
     return seen, geoms
+
+
+def hidden(
+    scene: RayScene, data: np.ndarray, pose: np.ndarray, obstacle: np.ndarray, reach: float
+) -> np.ndarray:
+    """Tells by MuJoCo's rays whether a wall or a box is between two robots' centres.
+
+    Args:
+        scene: What rays are cast in.
+        data: [A] of `MjData`, positions up to date, each of a model whose boxes have its sizes.
+        pose: [A, R, 3] x (m), y (m), yaw (rad).
+        obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+        reach: Beyond which nobody asks, m.
+
+    Returns:
+        [A, R, R] bool; False of pairs beyond reach.
+    """
+    place, half = pose[..., :2], np.linalg.norm(obstacle[..., 3:], axis=-1)
+    along = place[:, None] - place[:, :, None]
+    distance = np.linalg.norm(along, axis=-1)
+    middle = 0.5 * (place[:, None] + place[:, :, None])
+    # Circles about the line and the box: most pairs have no box that they need a ray for.
+    near = _apart(middle, obstacle[..., :2]) <= half[:, None, None] + 0.5 * distance[..., None]
+    asked = (distance <= reach) & np.triu(np.ones(distance.shape[1:], bool), 1)
+    found = np.zeros(distance.shape, bool)
+    for arena, i, j, box in zip(*np.nonzero(near & asked[..., None]), strict=True):
+        geom, where = scene.ids.obstacle_geom[box], cast("mujoco.MjData", data[arena])
+        start = np.array([*place[arena, i], epuck.SENSOR_HEIGHT])
+        toward = np.array([*along[arena, i, j], 0.0])  # as long as the line: 1 is its end
+        frame = (where.geom_xpos[geom], where.geom_xmat[geom], where.model.geom_size[geom])
+        kind = where.model.geom_type[geom]
+        share = mujoco.mju_rayGeom(*frame, start, toward, kind)
+        # Beyond the far face is -1 too, and a start inside tells where the ray leaves.
+        found[arena, i, j] |= 0.0 <= share < 1.0
+    return found | found.swapaxes(1, 2)
 
 
 def brightness(scene: RayScene, shades: infrared.Reflectance, geom: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ Commands that run a policy take hull, sensors, speeds, task, realism and stage f
 their words say otherwise. The judge's body stays what the command says: wheels.
 """
 
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple
@@ -22,7 +23,8 @@ from swarmjax.task.config import TaskConfig, describe
 _TASK = ("control_step", "target_radius", "arrival", "observations")
 BODY = "wheeled"  # of a judge, unless a word or a file names another
 _TOLD = ("robot", "task", "realism")  # what a line names that a word set otherwise
-_OWN = "task.history"  # each policy brings its own, as it does its network
+# Each policy brings its own, as it does its network; whom it hears is part of what it takes.
+_OWN = ("task.history", *(f"task.neighbours.{key}" for key in ("count", "range", "message_size")))
 
 
 class Trained(NamedTuple):
@@ -62,6 +64,8 @@ def trained(meta: Mapping[str, Any], path: str) -> Trained:
     task = {key: meta["task"][key] for key in _TASK if key in meta["task"]}
     task["sensor_range"] = meta["sensors"]["range"]
     task["history"] = meta["observation"].get("history", 1)
+    if "neighbours" in meta["observation"]:
+        task["neighbours"] = meta["observation"]["neighbours"]
     sensors = {"infrared": meta["sensors"]["response"], "name": meta["sensors"]["preset"]}
     realism = meta.get("realism") or config.get("realism") or sensors
     stages = meta.get("stages") or meta["config"].get("stage") or []
@@ -111,7 +115,7 @@ def load[C: Section](
     if stage is None and found and found[0].stages:
         stage = found[0].stages[-1]
     settings = stage_files.load_levels(cls, [*(words[0] if words else ()), *typed], stage)
-    _check_history(settings, dict(zip(metas, found, strict=True)))
+    _check_own(settings, dict(zip(metas, found, strict=True)))
     return settings, _say(settings, typed)
 
 
@@ -144,7 +148,7 @@ def _check_alike(
     for path, mine in zip(paths[1:], words[1:], strict=True):
         for word in sorted(set(mine) ^ set(words[0])):
             key = word.partition("=")[0]
-            if key not in told and key != _OWN:
+            if key not in told and key not in _OWN:
                 first, other = (_value(each, key) for each in (words[0], mine))
                 raise ConfigError(
                     f"{paths[0]} and {path} were trained differently, with {key} {first} and "
@@ -152,18 +156,20 @@ def _check_alike(
                 )
 
 
-def _check_history(settings: Any, found: Mapping[str, Trained]) -> None:
-    """Refuses another history than the first policy's, which is in the settings unless typed.
+def _check_own(settings: Any, found: Mapping[str, Trained]) -> None:
+    """Refuses another history or hearing than the first policy's, which the settings have.
 
     Each policy is judged with its own: its network takes that one and no other.
     """
-    given = settings.task.history
-    for path, held in [(path, each.task.history) for path, each in found.items()][:1]:
-        if given != held:
-            raise ConfigError(
-                f"{_OWN} is {given}, but {path} was trained with {held}: leave {_OWN} out, since "
-                "each policy is judged with its own."
-            )
+    for path, each in list(found.items())[:1]:
+        for key in _OWN:
+            read = operator.attrgetter(key.removeprefix("task."))
+            given, held = read(settings.task), read(each.task)
+            if given != held:
+                raise ConfigError(
+                    f"{key} is {given}, but {path} was trained with {held}: leave {key} out, since "
+                    "each policy is judged with its own."
+                )
 
 
 def _value(words: list[str], key: str) -> str:

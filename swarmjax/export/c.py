@@ -64,6 +64,28 @@ _HISTORY_CODE = """static void remember(const float *observation, float *recalle
 }
 
 """
+# The sum over neighbours of one layer, in the place of their entries, as in `policy.step`.
+_HEARING_CODE = """static void hear(unsigned learner, float *x)
+{
+    float sum[WIDTH] = {0.0f}, each[WIDTH];
+    for (unsigned k = 0; k < COUNT; k++) {
+        const float *row = x + FIRST + k * ROW;
+        layer(HEARING_KERNEL[learner], HEARING_BIAS[learner], ROW, WIDTH, row, each);
+        activate(each, WIDTH);
+        for (unsigned i = 0; i < WIDTH; i++) {
+            sum[i] += row[0] * each[i];
+        }
+    }
+    for (unsigned i = 0; i < WIDTH; i++) {
+        x[FIRST + i] = sum[i];
+    }
+}
+
+"""
+_SAID_CODE = """    for (unsigned i = 2; i < POLICY_ACTIONS; i++) {
+        command[i] = clip(action[i], 1.0f);
+    }
+"""
 _BEGIN_CODE = """void policy_begin(PolicyMemory *memory)
 {
     for (unsigned i = 0; i < POLICY_MEMORY; i++) {
@@ -94,7 +116,7 @@ def render(trained: Policy) -> dict[str, bytes]:
         `policy.c`, `policy.h`, `policy_test.c`, `Makefile` and `README.md`.
     """
     values = _about(trained) | _layout(trained) | _memory(trained)
-    code = values | _code(trained)
+    code = values | _code(trained) | _hearing(trained)
     return {
         "policy.h": _fill("policy.h", values),
         "policy.c": _fill("policy.c", code),
@@ -113,7 +135,8 @@ def _about(trained: Policy) -> dict[str, str]:
     robot, task = trained.meta["robot"], trained.meta["task"]
     sizes, learners = _sizes(trained), len(trained.mean)
     weights = [part for layer in trained.layers for part in layer]
-    arrays = [trained.mean, trained.std, trained.log_std, *weights, *(trained.memory or ())]
+    arrays = [trained.mean, trained.std, trained.log_std, *weights]
+    arrays += [*(trained.memory or ()), *(trained.hearing or ())]
     parameters = sum(array.size for array in arrays)
     several = f"{learners} policies, one for each robot."
     return {
@@ -135,8 +158,17 @@ def _about(trained: Policy) -> dict[str, str]:
 
 
 def _sizes(trained: Policy) -> list[int]:
-    """The sizes of the layers, from the observations to the action."""
-    return [trained.mean.shape[1], *(bias.shape[1] for _, bias in trained.layers)]
+    """The sizes of the layers, from what the first one takes to the action."""
+    taken = trained.mean.shape[1]
+    if trained.hearing is not None:
+        taken = _first(trained) + trained.hearing[1].shape[1]
+    return [taken, *(bias.shape[1] for _, bias in trained.layers)]
+
+
+def _first(trained: Policy) -> int:
+    """The entry at which neighbours begin, of a policy that hears."""
+    assert trained.hearing is not None  # the callers have looked
+    return trained.mean.shape[1] - trained.neighbours["count"] * trained.hearing[0].shape[1]
 
 
 def _seen(trained: Policy) -> int:
@@ -152,7 +184,23 @@ def _recalled(trained: Policy) -> int:
 def _widest(trained: Policy) -> int:
     """The most numbers that a layer takes."""
     *inputs, last, _ = _sizes(trained)
-    return max([*inputs, last + _recalled(trained)])
+    return max([trained.mean.shape[1], *inputs, last + _recalled(trained)])
+
+
+def _hearing(trained: Policy) -> dict[str, str]:
+    """The parts of the code that are about neighbours; empty for a policy that does not hear."""
+    said = _SAID_CODE if trained.log_std.shape[1] > 2 else ""
+    if trained.hearing is None:
+        return {"hearing_code": "", "hearing_call": "", "said": said}
+    code, kernel = _HEARING_CODE, trained.hearing[0]
+    for word, value in (
+        ("WIDTH", kernel.shape[2]),
+        ("COUNT", trained.neighbours["count"]),
+        ("ROW", kernel.shape[1]),
+        ("FIRST", _first(trained)),
+    ):
+        code = code.replace(word, str(value))
+    return {"hearing_code": code, "hearing_call": "    hear(learner, a);\n", "said": said}
 
 
 def _memory(trained: Policy) -> dict[str, str]:
@@ -222,6 +270,10 @@ def _arrays(trained: Policy) -> Iterable[str]:
     for i, (kernel, bias) in enumerate(trained.layers):
         yield _array(f"KERNEL_{i}", kernel.swapaxes(1, 2).reshape(len(kernel), -1))
         yield _array(f"BIAS_{i}", bias)
+    if trained.hearing is not None:
+        kernel, bias = trained.hearing
+        yield _array("HEARING_KERNEL", kernel.swapaxes(1, 2).reshape(len(kernel), -1))
+        yield _array("HEARING_BIAS", bias)
     if trained.memory is not None:
         for name, part in zip(
             ("SEEN", "RECALLED"), (trained.memory[:2], trained.memory[2:]), strict=True

@@ -29,6 +29,11 @@ def expressible(meta: Mapping[str, Any], form: str, sensors: str) -> None:
         )
     if form != "webots":
         return
+    if "neighbours" in meta["observation"]:
+        raise PolicyError(
+            "format is webots, but the policy hears neighbours, and the controller has no board "
+            "for range and bearing: give format=c or onnx, and a controller of your own."
+        )
     known = webots_controller.QUANTITIES
     unknown = [name for name in meta["observation"]["names"] if name not in known]
     if unknown:

@@ -61,6 +61,10 @@ class AlgoConfig(Section):
     torso: Any = field(
         default=None, metadata=about("module of an extension's network", derived=True, stored=False)
     )
+    hearing: Any = field(
+        default=None,
+        metadata=about("where neighbours stand in an observation", derived=True, stored=False),
+    )
     hidden_sizes: tuple[int, ...] = field(
         default=(64, 64), metadata=about("widths of the hidden layers", 1, 4096)
     )

@@ -102,6 +102,8 @@ def _fuses(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
     """Whether the kernels compute the gradient; refuses them where they cannot be had."""
     if config.update_backend == "autodiff" or config.critic == "state":
         return False
+    if config.hearing is not None:  # the kernels know no layer in front of the hidden ones
+        return False
     if not _has_fast():
         if config.update_backend == "auto":
             return False

@@ -283,8 +283,21 @@ def update(
     moments = learner.normalizer
     if config.normalize_observations:
         moments = normalizer.update(moments, batch.observation, batch.valid, shards)
+        moments = _leave_neighbours(moments, config)
     learned = replace(learner, params=params, optimizer_state=optimizer_state, normalizer=moments)
     return learned, metrics
+
+
+def _leave_neighbours(moments: Normalizer, config: AlgoConfig) -> Normalizer:
+    """Leaves what is heard as it is: it is scaled already, and its order must not matter."""
+    if config.hearing is None:
+        return moments
+    heard = slice(config.hearing.first, config.hearing.last)
+    return replace(
+        moments,
+        mean=moments.mean.at[heard].set(0.0),
+        variance=moments.variance.at[heard].set(1.0),
+    )
 
 
 def _is_finite(batch: Batch) -> jax.Array:

@@ -7,7 +7,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import chex
 import jax
@@ -31,6 +31,22 @@ _OUTPUTS = {"linear": lambda mean: mean, "tanh": nn.tanh}
 # than there is to earn, and the policy follows its errors (docs/results.md, "Why seeds were slow").
 _HIDDEN_GAIN = math.sqrt(2.0)
 _HEAD_GAIN = 0.01
+
+
+class Hearing(NamedTuple):
+    """Where neighbours stand in an observation: `rows` of `width` entries each, from `first` on.
+
+    The first entry of a row says whether there is a neighbour, 1, or not, 0.
+    """
+
+    first: int
+    rows: int
+    width: int
+
+    @property
+    def last(self) -> int:
+        """The entry behind them."""
+        return self.first + self.rows * self.width
 
 
 class _Torso(nn.Module):
@@ -80,7 +96,7 @@ class _Actor(nn.Module):
         memory: jax.Array | None = None,
         begins: jax.Array | None = None,
     ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
-        features = _torso(self.config)(observation)
+        features = _torso(self.config)(_hear(self.config, observation))
         recalled = None
         if memory is not None:
             recalled, memory = _gru(self.config)(features, memory, begins)
@@ -106,11 +122,38 @@ class _Critic(nn.Module):
         memory: jax.Array | None = None,
         begins: jax.Array | None = None,
     ) -> tuple[jax.Array, jax.Array | None]:
-        features = _torso(self.config)(observation)
+        features = _torso(self.config)(_hear(self.config, observation))
         recalled = None
         if memory is not None:
             recalled, memory = _gru(self.config)(features, memory, begins)
         return _Head(self.config, 1, name="value")(features, recalled)[..., 0], memory
+
+
+def _hear(config: AlgoConfig, seen: jax.Array) -> jax.Array:
+    """Adds neighbours up: one layer (`hearing`) for each of them, and the sum of what comes out.
+
+    The form of a function of a set: Zaheer et al. 2017, "Deep Sets", theorem 2. So their order is
+    of no matter, and neither is how many robots there are.
+
+    Args:
+        config: Says where they stand.
+        seen: [B, O] or, of a critic that sees more, [B, O + P].
+
+    Returns:
+        [B, O - K W + E], or with P besides, E as wide as the first hidden layer; `seen` itself of
+        robots that do not hear.
+    """
+    hearing = config.hearing
+    if hearing is None:
+        return seen
+    rows = seen[..., hearing.first : hearing.last]
+    rows = rows.reshape(*seen.shape[:-1], hearing.rows, hearing.width)
+    kernel, bias = _initializers(config, hearing.width, _HIDDEN_GAIN)
+    width = config.hidden_sizes[0]
+    layer = nn.Dense(width, kernel_init=kernel, bias_init=bias, name="hearing")
+    each = _ACTIVATIONS[config.activation](layer(rows)) * rows[..., :1]
+    parts = [seen[..., : hearing.first], jnp.sum(each, axis=-2), seen[..., hearing.last :]]
+    return jnp.concatenate(parts, axis=-1)
 
 
 def _gru(config: AlgoConfig) -> Gru:
@@ -233,7 +276,7 @@ def recall_action(
     Returns:
         Mean and standard deviation as `action_distribution`, and the memory [B, H] after.
     """
-    _check_input(params["actor"], observation)
+    _check_input(params["actor"], observation, config)
     actor = _Actor(config, params["actor"]["log_std"].shape[-1])
     output = actor.apply({"params": params["actor"]}, observation, memory, begins)
     mean, log_std, after = cast("tuple[jax.Array, jax.Array, jax.Array | None]", output)
@@ -262,7 +305,7 @@ def recall_value(
     Returns:
         The value [B], or [T, B], and the memory [B, H] after.
     """
-    _check_input(params["critic"], observation)
+    _check_input(params["critic"], observation, config)
     output = _Critic(config).apply({"params": params["critic"]}, observation, memory, begins)
     return cast("tuple[jax.Array, jax.Array | None]", output)
 
@@ -323,11 +366,31 @@ def entropy(std: jax.Array) -> jax.Array:
     return jnp.sum(jnp.log(std) + 0.5 * math.log(2.0 * math.pi * math.e))
 
 
-def _check_input(network: Params, observation: jax.Array) -> None:
+def _check_input(network: Params, observation: jax.Array, config: AlgoConfig) -> None:
     """Holds an observation to the size that hidden layers take; other networks check it."""
     first = network.get("torso", {}).get("hidden_0", {})
     if "kernel" in first:
-        chex.assert_axis_dimension(observation, -1, first["kernel"].shape[-2])
+        size = first["kernel"].shape[-2]
+        if config.hearing is not None:
+            size += config.hearing.last - config.hearing.first - config.hidden_sizes[0]
+        chex.assert_axis_dimension(observation, -1, size)
+
+
+def bind_hearing(config: AlgoConfig, observation_size: int, count: int, width: int) -> AlgoConfig:
+    """Tells a config where neighbours stand in an observation: at its end.
+
+    Args:
+        config: Of the learner.
+        observation_size: O.
+        count: K, how many neighbours are heard; 0: robots do not hear.
+        width: W, entries of each.
+
+    Returns:
+        The config with its `hearing`; as it is where robots do not hear.
+    """
+    if not count:
+        return config
+    return replace(config, hearing=Hearing(observation_size - count * width, count, width))
 
 
 def bind(

@@ -193,7 +193,7 @@ def record(
     while len(frames) <= judge.config.step_limit and not over.all():
         memory, action = driver.act(memory, arenas)
         arenas = engine_c.step(judge, arenas, action)
-        frames.append(_look(judge, arenas, np.clip(action, -1.0, 1.0)))
+        frames.append(_look(judge, arenas, np.clip(action[..., :2], -1.0, 1.0)))
         over |= frames[-1].arrived.all(axis=-1)
         report(1)
     every = Frame(*(np.stack(field) for field in zip(*frames, strict=True)))

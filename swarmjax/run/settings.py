@@ -241,6 +241,7 @@ class TrainConfig(ProgramConfig):
                 f"task.history is {self.task.history}, but algo.memory is {self.algo.memory}: "
                 "choose one, task.history=1 or algo.memory=none."
             )
+        self._check_hearing()
         if self.algo.exploration == "scheduled" and self.budget > MAX_COUNT:
             raise ConfigError(
                 f"budget is {self.budget}, but algo.exploration is scheduled by control steps that "
@@ -250,6 +251,20 @@ class TrainConfig(ProgramConfig):
             raise ConfigError(
                 "curriculum.normalizer is relearn, but algo.normalize_observations is false: "
                 "give keep or algo.normalize_observations=true."
+            )
+
+    def _check_hearing(self) -> None:
+        """Refuses what a network that hears does not go with."""
+        count = self.task.neighbours.count
+        if count and self.algo.update_backend == "fused":
+            raise ConfigError(
+                f"algo.update_backend is fused, but task.neighbours.count is {count}: give auto or "
+                "autodiff, or task.neighbours.count=0."
+            )
+        if count and self.algo.network not in (None, "mlp"):
+            raise ConfigError(
+                f"algo.network is {self.algo.network}, but task.neighbours.count is {count}, which "
+                "goes with hidden layers alone: give algo.network=mlp or task.neighbours.count=0."
             )
 
     def _check_budget(self) -> None:

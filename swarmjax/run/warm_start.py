@@ -163,6 +163,11 @@ def _check_alike(init_from: str, stored: TrainConfig, settings: TrainConfig) -> 
             settings.task.history,
             f"task.history={stored.task.history}",
         ),
+        *(
+            (f"task.neighbours.{key}", *values, f"task.neighbours.{key}={values[0]}")
+            for key in ("count", "message_size")
+            for values in [[getattr(x.task.neighbours, key) for x in (stored, settings)]]
+        ),
         ("encoding of observations", seen, needed, f"task.encoding={seen}"),
     ):
         if held != wanted:

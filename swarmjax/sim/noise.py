@@ -50,6 +50,9 @@ class Stream(enum.IntEnum):
     TARGET_DISTANCE = 36
     TARGET_BEARING = 37
     ACTION = 38
+    PACKET = 39
+    RANGE = 40
+    BEARING = 41
 
 
 def bits(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: Any) -> Array:

@@ -154,6 +154,18 @@ class RealismConfig(Section):
     target_bearing_noise: float | None = field(
         default=None, metadata=about("deviation, rad; a robot and control step", 0.0, math.pi)
     )
+    packet_loss: float | None = field(
+        default=None,
+        metadata=about(
+            "probability that a robot does not hear a neighbour; a pair and control step", 0.0, 1.0
+        ),
+    )
+    neighbour_distance_noise: float | None = field(
+        default=None, metadata=about("deviation, m; a pair and control step", 0.0, 10.0)
+    )
+    neighbour_bearing_noise: float | None = field(
+        default=None, metadata=about("deviation, rad; a pair and control step", 0.0, math.pi)
+    )
 
     def _check(self) -> None:
         if self.infrared != "ideal":

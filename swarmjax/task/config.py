@@ -55,6 +55,40 @@ class RewardConfig(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
+class NeighboursConfig(Section):
+    """What a robot hears of others: range, bearing and the numbers that they broadcast."""
+
+    count: int = field(
+        default=0, metadata=about("nearest robots that are heard; 0: robots do not hear", 0, 32)
+    )
+    range: float = field(
+        # AutoMoDe's reference models have a board; that it reaches about as far is assumed.
+        default=0.7,
+        metadata=about("between centres, m", above=0.0, high=10.0),
+    )
+    message_size: int = field(
+        default=0, metadata=about("numbers that a robot broadcasts in a control step", 0, 32)
+    )
+
+    @property
+    def width(self) -> int:
+        """Entries of an observation that belong to one neighbour, W; 0 if robots do not hear."""
+        return 4 + self.message_size if self.count else 0
+
+    @property
+    def size(self) -> int:
+        """Entries of an observation that belong to all neighbours, K W."""
+        return self.count * self.width
+
+    def _check(self) -> None:
+        if self.message_size and not self.count:
+            raise ConfigError(
+                f"message_size is {self.message_size}, but count is 0 and nobody hears: give a "
+                "count of 1 or more, or message_size=0."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
 class TaskConfig(Section):
     """What a robot is asked to do, and what it senses."""
 
@@ -90,7 +124,15 @@ class TaskConfig(Section):
         default=1,
         metadata=about("observations that the policy takes: the current and earlier ones", 1, 64),
     )
+    neighbours: NeighboursConfig = field(default_factory=NeighboursConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
+
+    def _check(self) -> None:
+        if self.history > 1 and self.neighbours.count:
+            raise ConfigError(
+                f"history is {self.history}, but neighbours.count is {self.neighbours.count}: "
+                "choose one, history=1 or neighbours.count=0; algo.memory=gru goes with hearing."
+            )
 
 
 def describe(robot: RobotConfig, task: TaskConfig, realism: RealismConfig) -> str:

@@ -18,13 +18,15 @@ from swarmjax.sim.drive import Drive
 from swarmjax.sim.motor import Motor
 from swarmjax.sim.noise import Stream
 from swarmjax.sim.realism_config import RealismConfig
-from swarmjax.task import observation
-from swarmjax.task.config import TaskConfig, resolve_encoding
+from swarmjax.task import hearing, observation
+from swarmjax.task.config import NeighboursConfig, TaskConfig, resolve_encoding
 from swarmjax.task.factors import Factors
+from swarmjax.task.hearing import Heard
 from swarmjax.task.level import Level
 from swarmjax.task.observation import Encoding, Layout, Readings, View
 
 Array = Any
+_DEAF = NeighboursConfig()
 _SLACK = 1e-4  # of a period: a sample that is due now is not put off by rounding
 
 
@@ -38,6 +40,7 @@ class Electronics:
       sensor_range: beyond which it observes no infrared distance, m.
       control_step: s.
       own: observations of an extension that follow the built-in ones.
+      neighbours: what is heard of other robots.
     """
 
     realism: RealismConfig
@@ -45,11 +48,12 @@ class Electronics:
     sensor_range: float
     control_step: float
     own: tuple[Observation, ...] = ()
+    neighbours: NeighboursConfig = _DEAF
 
     @cached_property
     def layout(self) -> Layout:
         """What the entries of an observation are."""
-        return observation.layout(self.encoding, self.own)
+        return observation.layout(self.encoding, self.own, self.neighbours)
 
     @property
     def reach(self) -> float:
@@ -87,6 +91,7 @@ class Sight(NamedTuple):
       distance: [..., R] to the target, m.
       bearing: [..., R] of the target, rad.
       own: [..., R, E] observations of an extension; None without any.
+      heard: who can hear whom; None if robots do not hear.
     """
 
     ray: Array
@@ -94,6 +99,7 @@ class Sight(NamedTuple):
     distance: Array
     bearing: Array
     own: Array | None = None
+    heard: Heard | None = None
 
 
 def view(sight: Sight, pose: Array, level: Level, arrived: Array, clock: Array) -> View:
@@ -129,6 +135,7 @@ def load(
     realism: RealismConfig,
     encoding: Encoding | None = None,
     own: Sequence[Observation] = (),
+    neighbours: NeighboursConfig | None = None,
 ) -> Electronics:
     """Puts the electronics together.
 
@@ -137,6 +144,7 @@ def load(
       realism: the factors.
       encoding: what a policy was trained to observe; None follows the task.
       own: observations of an extension.
+      neighbours: what a policy was trained to hear; None follows the task.
 
     Returns:
       The electronics.
@@ -147,6 +155,7 @@ def load(
         sensor_range=task.sensor_range,
         control_step=task.control_step,
         own=tuple(own),
+        neighbours=task.neighbours if neighbours is None else neighbours,
     )
 
 
@@ -284,7 +293,11 @@ def _read(
     """Reads what there is now."""
     sample = _read_infrared(electronics, factors, sight, clock, xp)
     distance, bearing = _find_target(electronics.realism, factors, sight, clock, xp)
-    return Readings(sample, distance, bearing, sight.own)
+    heard = None
+    if sight.heard is not None:
+        told = (electronics.neighbours, electronics.realism, factors.seed)
+        heard = hearing.listen(sight.heard, *told, clock, xp)
+    return Readings(sample, distance, bearing, sight.own, heard)
 
 
 def _is_due(clock: Array, period: Array, control_step: float, xp: Any) -> Array:

@@ -24,6 +24,7 @@ from swarmjax.task import (
     arrival,
     extended,
     geodesic,
+    hearing,
     observation,
     pieces,
     reward,
@@ -39,6 +40,8 @@ from swarmjax.task.episode import Episode
 from swarmjax.task.factors import Factors
 from swarmjax.task.level import Level, Spacing
 from swarmjax.task.stage_config import StageConfig, make_room
+
+COMMAND_SIZE = 2  # forward speed and turn rate
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +74,11 @@ class World:
     def observation_size(self) -> int:
         """Entries of what a policy takes, O: of `task.history` observations together."""
         return self.task.history * self.electronics.layout.size
+
+    @property
+    def action_size(self) -> int:
+        """Numbers of an action, U: the command, then what is broadcast."""
+        return COMMAND_SIZE + self.electronics.neighbours.message_size
 
 
 @struct.dataclass
@@ -212,7 +220,7 @@ def reset(world: World, level: Level) -> EnvState:
     robots, obstacles = level.present.shape[0], level.obstacle_present.shape[0]
     factors = task_factors.draw(level.seed, world.realism, world.robot, robots, obstacles, jnp)
     clock, arrived = jnp.zeros((), jnp.int32), jnp.zeros(robots, bool)
-    sight = _look(world, level.start, level, factors)
+    sight = _look(world, level.start, level, factors, None)
     sight = _look_by_extension(world, sight, level.start, level, arrived, clock)
     memory, seen = task_electronics.begin(world.electronics, factors, sight, clock, jnp)
     nothing = jnp.zeros((robots, world.observation_size), seen.dtype)
@@ -270,17 +278,17 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
       world: the compiled environment.
       state: the arena; `sim` is the physics' data. Whatever else a caller keeps with an arena, by
         a class of its own made from `EnvState`, passes through.
-      action: [R, 2], -1..1 spans the command's range, what is beyond is clipped.
+      action: [R, U], -1..1 spans the command, what is beyond is clipped; from the third: broadcast.
 
     Returns:
       The new state, and what the step came to.
     """
-    chex.assert_shape(action, (state.level.present.shape[0], 2))
+    chex.assert_shape(action, (state.level.present.shape[0], world.action_size))
     level, rule = state.level, world.task.arrival
     active = level.present & arrival.drives(rule, state.arrived)
     clock = state.clock + 1
     data, memory, pose, sound = _move(world, state, action, active)
-    sight = _look(world, pose, level, state.factors)
+    sight = _look(world, pose, level, state.factors, _speak(world, action, active))
     within = active & (sight.distance <= world.task.target_radius)
     arrived = arrival.arrived(rule, state.arrived, within)
     complete = jnp.all(arrived | ~level.present)
@@ -392,8 +400,8 @@ def _move(
     return data, memory, jnp.where(sound, after, before), sound
 
 
-def _look(world: World, pose: Array, level: Level, factors: Factors) -> Sight:
-    """Works out what there is to be sensed at poses [R, 3]."""
+def _look(world: World, pose: Array, level: Level, factors: Factors, said: Array | None) -> Sight:
+    """Works out what there is to be sensed at poses [R, 3], where this was said [R, M]."""
     distance, bearing = observation.to_target(pose, level.target, jnp)
     radius, reach = world.robot.hull_radius, world.electronics.reach
     mount, shades = task_electronics.mount(factors), task_electronics.reflectance(factors)
@@ -404,7 +412,7 @@ def _look(world: World, pose: Array, level: Level, factors: Factors) -> Sight:
         ray, bright = infrared.sights(*arena, shades, mount, jnp)
     # Looked at by several: without the barrier XLA works rays out anew for each, on a GPU.
     ray, bright = jax.lax.optimization_barrier((ray, bright))
-    return Sight(ray, bright, distance, bearing)
+    return _hear(world, Sight(ray, bright, distance, bearing), pose, level, said)
 
 
 def _look_by_extension(
@@ -417,12 +425,32 @@ def _look_by_extension(
     return sight._replace(own=extended.look(world.electronics.own, view))
 
 
+def _speak(world: World, action: Array, active: Array) -> Array | None:
+    """Takes what is broadcast [R, M] out of actions [R, U]; None if nothing is."""
+    size = world.electronics.neighbours.message_size
+    return hearing.broadcast(action, size, active, jnp) if size else None
+
+
+def _hear(world: World, sight: Sight, pose: Array, level: Level, said: Array | None) -> Sight:
+    """Adds who can be heard at poses [R, 3], with what they said [R, M]; None: nothing yet."""
+    settings = world.electronics.neighbours
+    if not settings.count:
+        return sight
+    if said is None:
+        said = jnp.zeros((len(pose), settings.message_size))
+    hidden = hearing.hidden(pose, level.obstacle, jnp)
+    found = hearing.reachable(pose, level.present, hidden, said, settings.range, jnp)
+    return sight._replace(heard=found)
+
+
 def _fill(
     world: World, step: reward.Step, state: EnvState, action: Array, pose: Array
 ) -> reward.Step:
     """Adds what only the terms of an extension look at, if there are any."""
     if not world.terms:
         return step
+    if world.action_size > COMMAND_SIZE:  # terms see what moves the robot
+        action = action[:, :COMMAND_SIZE]
     return step._replace(
         outside=~state.arrived,
         pose_before=physics.poses(world.physics, state.sim),

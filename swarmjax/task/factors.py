@@ -16,7 +16,15 @@ from swarmjax.sim.realism_config import RealismConfig
 Array = Any
 
 # What is drawn afresh at each control step and needs the seed as well.
-_PER_STEP = ("speed_noise", "stall", "target_distance_noise", "target_bearing_noise")
+_PER_STEP = (
+    "speed_noise",
+    "stall",
+    "target_distance_noise",
+    "target_bearing_noise",
+    "packet_loss",
+    "neighbour_distance_noise",
+    "neighbour_bearing_noise",
+)
 
 
 class Factors(NamedTuple):

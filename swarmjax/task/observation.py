@@ -12,7 +12,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from swarmjax import epuck
+from swarmjax.config import to_dict
 from swarmjax.extension import Observation
+from swarmjax.task.config import NeighboursConfig
 
 Array = Any
 Encoding = Literal["metric", "webots"]
@@ -27,12 +29,14 @@ class Readings(NamedTuple):
       distance: [...] to the target, m.
       bearing: [...] of the target, rad.
       own: [..., E] what observations of an extension return; None if there are none.
+      heard: [..., K W] of the nearest neighbours; None if robots do not hear.
     """
 
     infrared: Array
     distance: Array
     bearing: Array
     own: Array | None = None
+    heard: Array | None = None
 
 
 class Coding(NamedTuple):
@@ -100,19 +104,37 @@ class Layout(NamedTuple):
         return len(self.names)
 
 
-def layout(encoding: Encoding, own: Sequence[Observation] = ()) -> Layout:
-    """Lays an observation out: the built-in inputs, then those of an extension.
+def layout(
+    encoding: Encoding,
+    own: Sequence[Observation] = (),
+    neighbours: NeighboursConfig | None = None,
+) -> Layout:
+    """Lays an observation out: the built-in inputs, those of an extension, then neighbours.
 
     Args:
       encoding: how built-in quantities are written.
       own: observations of an extension, in the order in which they follow.
+      neighbours: what is heard; None if nothing.
 
     Returns:
       The layout.
     """
     rows = [(name, *each.codings[encoding]) for each in INPUTS for name in each.names]
     rows += [(name, each.unit, each.offset, each.scale) for each in own for name in each.names]
+    rows += [] if neighbours is None else _neighbour_rows(neighbours)
     return Layout(*zip(*rows, strict=True))
+
+
+def _neighbour_rows(neighbours: NeighboursConfig) -> list[tuple[str, str, float, float]]:
+    """Lists name, unit, offset and scale of what is heard, the nearest neighbour first."""
+    one = [("", "1", 1.0), ("_distance", "m", neighbours.range)]
+    one += [(f"_bearing_{part}", "1", 1.0) for part in ("cos", "sin")]
+    one += [(f"_message_{i}", "1", 1.0) for i in range(neighbours.message_size)]
+    return [
+        (f"neighbour_{i}{name}", unit, 0.0, scale)
+        for i in range(neighbours.count)
+        for name, unit, scale in one
+    ]
 
 
 def stacked_names(names: Sequence[str], history: int) -> tuple[str, ...]:
@@ -150,18 +172,25 @@ NAMES = LAYOUTS["metric"].names
 SIZE = LAYOUTS["metric"].size
 
 
-def describe(encoding: Encoding, own: Sequence[Observation] = ()) -> dict[str, Any]:
+def describe(
+    encoding: Encoding,
+    own: Sequence[Observation] = (),
+    neighbours: NeighboursConfig | None = None,
+) -> dict[str, Any]:
     """Describes what a policy observes, as plain data for its file.
 
     Args:
       encoding: how built-in quantities are written.
       own: observations of an extension.
+      neighbours: what is heard; None if nothing.
 
     Returns:
-      `names`, `encoding`, and the layout's `units`, `offset` and `scale`.
+      `names`, `encoding`, and the layout's `units`, `offset` and `scale`; with hearing also
+      `neighbours`: `count`, `range` (m) and `message_size`.
     """
-    found = {key: list(value) for key, value in layout(encoding, own)._asdict().items()}
-    return {"encoding": encoding, **found}
+    found = {key: list(value) for key, value in layout(encoding, own, neighbours)._asdict().items()}
+    heard = {} if not neighbours or not neighbours.count else {"neighbours": to_dict(neighbours)}
+    return {"encoding": encoding, **found, **heard}
 
 
 def to_target(pose: Array, target: Array, xp: Any) -> tuple[Array, Array]:
@@ -194,6 +223,7 @@ def observe(readings: Readings, layout: Layout, xp: Any) -> Array:
     """
     parts = [each.read(readings) for each in INPUTS]
     parts += [] if readings.own is None else [readings.own]
+    parts += [] if readings.heard is None else [readings.heard]
     entries = xp.concatenate(parts, axis=-1).astype(xp.float32)
     offset, scale = (np.array(x, np.float32) for x in (layout.offset, layout.scale))
     if not offset.any() and (scale == 1.0).all():

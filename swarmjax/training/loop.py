@@ -21,7 +21,7 @@ from swarmjax.shards import Shards
 from swarmjax.sim import gaps
 from swarmjax.task.episode import Ended
 from swarmjax.training import episodes, promotion, rollout
-from swarmjax.training.program import ACTION_SIZE, Program
+from swarmjax.training.program import Program
 from swarmjax.training.rollout import Arena
 
 # Two rounds of a loop as one, so that what a round hands to the next need not be copied first: the
@@ -68,11 +68,9 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
     run_key, learner_key, level_key = jax.random.split(start_key, 3)
     curriculum = curricula.init(schedule, config.curriculum, program.mode)
     starts = _draw_first(program, schedule, curriculum, level_key)
-    size = program.world.observation_size
+    size, actions = program.world.observation_size, program.world.action_size
     learners = jax.vmap(
-        lambda key: ppo.init(
-            key, config.algo, size, ACTION_SIZE, config.updates, program.state_size
-        )
+        lambda key: ppo.init(key, config.algo, size, actions, config.updates, program.state_size)
     )(jax.random.split(learner_key, config.learners))
     return TrainState(
         learners=learners,

@@ -17,7 +17,7 @@ from swarmjax.task.env import World
 from swarmjax.training import episodes
 from swarmjax.training.config import ProgramConfig
 
-ACTION_SIZE = 2
+ACTION_SIZE = env.COMMAND_SIZE  # of robots that broadcast nothing
 MAX_ROWS = 4096  # updates that a call can report, over all seeds; a longer chunk is several calls
 
 
@@ -76,11 +76,12 @@ def load[C: ProgramConfig](config: C, *, by_robot: bool = False) -> tuple[Progra
         piece of an extension does not fit.
     """
     world, pieces = load_world(config), extension.load(config.extensions)
+    heard = config.task.neighbours
     size = world.observation_size
-    bound = networks.bind(config.algo, pieces.networks, size, _state_size(config))
-    algo = dispatch.bind_memory(bound)
+    algo = networks.bind(config.algo, pieces.networks, size, _state_size(config))
+    algo = dispatch.bind_memory(networks.bind_hearing(algo, size, heard.count, heard.width))
     config = replace(config, algo=algo)
-    backend = dispatch.resolve(algo, size, ACTION_SIZE)
+    backend = dispatch.resolve(algo, size, world.action_size)
     return Program(config, world, backend, by_robot), schedule(config)
 
 

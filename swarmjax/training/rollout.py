@@ -26,7 +26,7 @@ from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
 from swarmjax.task.episode import Ended, Robots
 from swarmjax.task.stage import Stage
-from swarmjax.training.program import ACTION_SIZE, Program
+from swarmjax.training.program import Program
 
 # Cohort of an episode that counts for none: curricula number theirs from 0, and -1 is the one
 # before the first.
@@ -312,7 +312,7 @@ def _step(
     (arenas, judged, begun), (key, number) = carry, now
     count = judged.value.shape[0]
     mine = to_learners(arenas.observation, count)
-    noise = _noise(program.shards, key, mine.shape[:-1])
+    noise = _noise(program.shards, key, (*mine.shape[:-1], program.world.action_size))
     config = program.config.algo
     acting = explore(program, learners, number)
     action, log_prob, memory = _act(config, acting, mine, noise, arenas.recall)
@@ -358,9 +358,9 @@ def _act(
 
 
 def _noise(shards: Shards, key: Array, shape: tuple[int, ...]) -> Array:
-    """Draws the noise [L, A, N, U] of actions; `shape` is [L, A, N]."""
-    learners, arenas, robots = shape
-    size = (learners, arenas // shards.local_streams, robots, ACTION_SIZE)
+    """Draws the noise of actions; `shape` is [L, A, N, U]."""
+    learners, arenas, *rest = shape
+    size = (learners, arenas // shards.local_streams, *rest)
     return shards.draw(key, lambda key: jax.random.normal(key, size), axis=1)
 
 

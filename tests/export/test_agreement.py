@@ -20,6 +20,7 @@ from swarmjax.export import onnx as export_onnx
 from swarmjax.policy import Policy
 from swarmjax.ppo import networks, normalizer
 from swarmjax.ppo.config import AlgoConfig
+from swarmjax.task.config import NeighboursConfig
 
 OBSERVATIONS = 10_000
 # What is asked for. Sums of 64 float32 terms differ in their order alone: actions up to 2.5 units
@@ -67,9 +68,10 @@ def _by_c(trained: Policy, seen: np.ndarray, folder: Path) -> np.ndarray:
     built = [*("gcc", *flags, "policy.c", "-lm", "-o", "policy.so")]
     subprocess.run(built, cwd=folder, check=True)
     act = ctypes.CDLL(str(folder / "policy.so")).policy_action
-    action = np.zeros((*seen.shape[:2], 2), np.float32)
+    actions = trained.log_std.shape[1]
+    action = np.zeros((*seen.shape[:2], actions), np.float32)
     into = ctypes.c_void_p
-    width, step, size = seen.shape[2] * 4, 8, seen.shape[1]
+    width, step, size = seen.shape[2] * 4, 4 * actions, seen.shape[1]
     source, target = seen.ctypes.data, action.ctypes.data
     for i in range(seen.shape[0] * size):
         act(i % size, into(source + i * width), into(target + i * step))
@@ -164,7 +166,7 @@ def _by_c_steps(trained: Policy, seen: np.ndarray, begins: np.ndarray, folder: P
     flags = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC")
     subprocess.run(["gcc", *flags, "policy.c", "-lm", "-o", "policy.so"], cwd=folder, check=True)
     library, into = ctypes.CDLL(str(folder / "policy.so")), ctypes.c_void_p
-    action = np.zeros((*seen.shape[:2], 2), np.float32)
+    action = np.zeros((*seen.shape[:2], trained.log_std.shape[1]), np.float32)
     memory = np.ones((seen.shape[1], trained.carried), np.float32)
     for step, begun in enumerate(begins):
         for robot in range(seen.shape[1]):
@@ -201,3 +203,58 @@ def test_all_forms_of_a_policy_that_remembers_agree_over_a_thousand_steps(
         np.testing.assert_allclose(action, expected, rtol=0, atol=TOLERANCE, err_msg=name)
     # And it matters: the same observations after others, or none, give other actions.
     assert np.abs(expected - _by_numpy_steps(trained, seen, begins | True)).max() > 0.1
+
+
+HEARD, SAID = 3, 2
+
+
+def _by_flax_hearing(arrays: Arrays, seen: np.ndarray, kind: str, begins: np.ndarray) -> np.ndarray:
+    """Actions [T, R, U] of the networks that were trained, with a memory or without."""
+    memory = {"memory": "gru", "memory_size": MEMORY} if kind == "gru" else {}
+    size, heard = seen.shape[-1], NeighboursConfig(count=HEARD, message_size=SAID)
+    config = networks.bind_hearing(AlgoConfig(**memory), size, heard.count, heard.width)
+
+    def act(mine: dict[str, jax.Array], observation: jax.Array) -> jax.Array:
+        def layer(name: str) -> dict[str, jax.Array]:
+            return {part: mine[f"actor/{name}/{part}"] for part in ("kernel", "bias")}
+
+        actor = {name: layer(name) for name in ("hearing", "mean")}
+        actor |= {"torso": {f"hidden_{i}": layer(f"hidden_{i}") for i in range(2)}}
+        actor |= {"log_std": mine["actor/log_std"]}
+        none = None
+        if kind == "gru":
+            actor["memory"] = {part: layer(f"memory/{part}") for part in ("input", "recurrent")}
+            none = jnp.zeros(MEMORY)
+        mean, std = (mine[f"normalizer/{name}"] for name in ("mean", "std"))
+        moments = normalizer.Normalizer(count=jnp.ones(()), mean=mean, variance=std**2)
+        features = normalizer.normalize(moments, observation, 10.0)
+        began = None if none is None else begins
+        return networks.recall_action({"actor": actor}, config, features, none, began)[0]
+
+    mapped = jax.jit(jax.vmap(act, in_axes=(0, 1), out_axes=1))
+    return np.asarray(mapped({name: jnp.asarray(array) for name, array in arrays.items()}, seen))
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs Debian's package gcc")
+@pytest.mark.parametrize("learners", [1, 3])
+@pytest.mark.parametrize("kind", ["none", "gru"])
+def test_all_forms_of_a_policy_that_hears_agree(kind: str, learners: int, tmp_path: Path) -> None:
+    plain = policies.arrays(hidden=AlgoConfig().hidden_sizes, learners=learners)
+    arrays, said = policies.hearing(plain, HEARD, SAID, **several(learners))
+    if kind == "gru":
+        arrays, said = policies.recalling("gru", arrays, MEMORY, **said)
+    trained = saved(tmp_path / "policy.npz", arrays, **said)
+    seen = policies.seen(trained, STEPS)
+    begins = np.arange(STEPS) % 300 == 0
+    expected = _by_numpy_steps(trained, seen, begins)
+    remembers = kind == "gru"
+    found = {
+        "Flax": _by_flax_hearing(arrays, seen, kind, begins),
+        "ONNX": _by_onnx_steps(trained, seen, begins) if remembers else _by_onnx(trained, seen),
+        "C": _by_c_steps(trained, seen, begins, tmp_path / "c")
+        if remembers
+        else _by_c(trained, seen, tmp_path / "c"),
+    }
+    assert expected.shape == (STEPS, learners, 2 + SAID)
+    for name, action in found.items():
+        np.testing.assert_allclose(action, expected, rtol=0, atol=TOLERANCE, err_msg=name)

@@ -245,6 +245,17 @@ def test_import_needs_neither_jax_nor_hydra():
         # Checks across keys.
         (["task.history=4", "algo.memory=gru"], "task.history is 4, but algo.memory is gru: "
          "choose one, task.history=1 or algo.memory=none."),
+        (["task.neighbours.message_size=2"], "task.neighbours.message_size is 2, but count is 0 "
+         "and nobody hears: give a count of 1 or more, or message_size=0."),
+        (["task.neighbours.count=33"], "task.neighbours.count is 33: give 0 to 32."),
+        (["task.neighbours.count=2", "task.history=3"], "task.history is 3, but neighbours.count "
+         "is 2: choose one, history=1 or neighbours.count=0; algo.memory=gru goes with hearing."),
+        (["task.neighbours.count=2", "algo.update_backend=fused"], "algo.update_backend is fused, "
+         "but task.neighbours.count is 2: give auto or autodiff, or task.neighbours.count=0."),
+        (["task.neighbours.count=2", "algo.network=mine"], "algo.network is mine, but "
+         "task.neighbours.count is 2, which goes with hidden layers alone: give algo.network=mlp "
+         "or task.neighbours.count=0."),
+        (["realism.packet_loss=1.5"], "realism.packet_loss is 1.5: give 0 to 1."),
         (["robot.track=0.08"], "robot.track is 0.08, but hull_radius is 0.037 and the wheels lie "
          "inside the hull: give less than 0.074."),
         (["stage=s6", "stage.robots=6", "sim.max_robots=5"], "stage.robots is 6, but "

@@ -278,6 +278,10 @@ def test_a_started_run_resumes_without_the_run_it_started_from(
             "task.history is 1, but here it is 3: give task.history=1",
         ),
         (
+            ["task.neighbours.count=2"],
+            "task.neighbours.count is 0, but here it is 2: give task.neighbours.count=0",
+        ),
+        (
             ["algo.activation=relu"],
             "algo.activation is tanh, but here it is relu: give algo.activation=tanh",
         ),

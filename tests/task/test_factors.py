@@ -50,6 +50,9 @@ STEP: dict[str, Any] = {
     "stall": 0.01,
     "target_distance_noise": 0.005,
     "target_bearing_noise": 0.0524,
+    "packet_loss": 0.85,
+    "neighbour_distance_noise": 0.015,
+    "neighbour_bearing_noise": 0.0873,
 }
 FIELDS = {name: name for name in EPISODE} | {
     "wheel_mismatch": "wheel_radius",

@@ -55,6 +55,9 @@ REAL = {
     "observation_latency": (0, 1),
     "target_distance_noise": 0.005,
     "target_bearing_noise": 0.0524,  # 3 degrees: 3 * 3.1416 / 180 = 0.05236
+    "packet_loss": 0.85,
+    "neighbour_distance_noise": 0.015,
+    "neighbour_bearing_noise": 0.0873,  # 5 degrees: 5 * 3.1416 / 180 = 0.08727
 }
 FACTORS = sorted(REAL.keys() - {"name", "infrared", "stall_time", "hull_friction"})
 LOADS = [load_train, lambda words: load_levels(EvaluateConfig, ["policy=p", *words])]

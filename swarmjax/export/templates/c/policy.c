@@ -48,7 +48,7 @@ void policy_observe(const float quantity[POLICY_OBSERVATIONS],
     }
 }
 
-${memory_code}void policy_action(unsigned learner, const float observation[POLICY_OBSERVATIONS],
+${hearing_code}${memory_code}void policy_action(unsigned learner, const float observation[POLICY_OBSERVATIONS],
                    ${memory_parameter}float action[POLICY_ACTIONS])
 {
     float a[WIDEST], b[WIDEST];
@@ -56,7 +56,7 @@ ${memory_code}void policy_action(unsigned learner, const float observation[POLIC
     for (unsigned i = 0; i < POLICY_OBSERVATIONS; i++) {
         a[i] = clip((observation[i] - MEAN[learner][i]) / STD[learner][i], $limit);
     }
-${history}$layers
+${history}${hearing_call}$layers
 }
 
 void policy_sample(unsigned learner, const float normal[POLICY_ACTIONS],
@@ -72,7 +72,7 @@ void policy_command(const float action[POLICY_ACTIONS], float command[POLICY_ACT
 {
     command[0] = (clip(action[0], 1.0f) + 1.0f) * (0.5f * $max_speed);
     command[1] = clip(action[1], 1.0f) * $max_turn_rate;
-}
+${said}}
 
 void policy_wheel_speeds(const float command[POLICY_ACTIONS], float wheels[2])
 {

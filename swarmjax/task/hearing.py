@@ -1,0 +1,172 @@
+"""Range and bearing: what a robot hears of those around it, and what they broadcast.
+
+As the e-puck's infrared board for local communication (Gutiérrez et al. 2009, "Open E-puck Range &
+Bearing miniaturized board for local communication in swarm robotics") and AutoMoDe's reference
+models have it: distance and bearing of a neighbour, and the few numbers of its packet. Walls inside
+the arena and boxes hide a neighbour; other robots do not. NumPy or JAX.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from swarmjax.sim import infrared, noise
+from swarmjax.sim.noise import Stream
+from swarmjax.sim.realism_config import RealismConfig
+from swarmjax.task.config import NeighboursConfig
+
+Array = Any
+
+
+class Heard(NamedTuple):
+    """What there is to be heard.
+
+    Attributes:
+      distance: [..., R, R] from the one that hears (first) to the one that sends, m; inf where
+        nothing can be heard.
+      bearing: [..., R, R] of the sender from the x axis of the one that hears, rad.
+      message: [..., R, M] what each broadcast in the control step before, -1..1.
+    """
+
+    distance: Array
+    bearing: Array
+    message: Array
+
+
+def reachable(
+    pose: Array, present: Array, hidden: Array, message: Array, reach: float, xp: Any
+) -> Heard:
+    """Works out who could hear whom.
+
+    Args:
+      pose: [..., R, 3] x (m), y (m), yaw (rad).
+      present: [..., R] whether the robot takes part.
+      hidden: [..., R, R] whether a wall or a box is between two robots.
+      message: [..., R, M] what each broadcast.
+      reach: between centres, m.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      What there is to be heard.
+    """
+    x, y, distance = _apart(pose, xp)
+    bearing = xp.arctan2(y, x) - pose[..., :, None, 2]
+    other = ~np.eye(pose.shape[-2], dtype=bool)
+    hears = present[..., :, None] & present[..., None, :] & other & ~hidden & (distance <= reach)
+    return Heard(xp.where(hears, distance, xp.inf), bearing, message)
+
+
+def hidden(pose: Array, obstacle: Array, xp: Any) -> Array:
+    """Tells whether a wall or a box crosses the line between two robots' centres.
+
+    Args:
+      pose: [..., R, 3] x (m), y (m), yaw (rad).
+      obstacle: [..., M, 5] x (m), y (m), yaw (rad), half edges (m).
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [..., R, R] bool.
+    """
+    x, y, distance = _apart(pose, xp)
+    pace = 1.0 / xp.maximum(distance, 1e-9)
+    shape = distance.shape
+    here = (xp.broadcast_to(pose[..., :, None, axis], shape) for axis in range(2))
+    ray = infrared.Ray(*(part[..., None] for part in (*here, x * pace, y * pace)))
+    box = infrared.turned(obstacle, xp).at((..., None, None, slice(None)))
+    return (infrared.ray_box(ray, box, xp) < distance[..., None]).any(axis=-1)
+
+
+def _apart(pose: Array, xp: Any) -> tuple[Array, Array, Array]:
+    """Offsets x and y [..., R, R] of all robots from each (m), and their distances."""
+    x, y = (pose[..., None, :, axis] - pose[..., :, None, axis] for axis in range(2))
+    return x, y, xp.sqrt(x * x + y * y)
+
+
+def listen(
+    heard: Heard,
+    settings: NeighboursConfig,
+    realism: RealismConfig,
+    seed: Array | None,
+    clock: Array,
+    xp: Any,
+) -> Array:
+    """Lists the nearest neighbours of each robot whose packets arrive.
+
+    Args:
+      heard: what there is to be heard.
+      settings: how many are listed.
+      realism: packets that are lost, and noise.
+      seed: [...] uint32 of the episode; None where nothing is random.
+      clock: [...] or [] control steps since the start.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [..., R, K W], nearest first: 1 for one that is there, distance (m), cosine and sine of the
+      bearing, message; 0 where nobody is.
+    """
+    distance, bearing, message = heard
+    robots = distance.shape[-1]
+    lost = _draw(realism.packet_loss, noise.uniform, seed, clock, Stream.PACKET, robots, xp)
+    if lost is not None:
+        distance = xp.where(lost < realism.packet_loss, xp.inf, distance)
+    kept = min(settings.count, robots)
+    order = xp.argsort(distance, axis=-1, stable=True)[..., :kept]
+    is_there = xp.isfinite(xp.take_along_axis(distance, order, axis=-1))
+    off = _draw(
+        realism.neighbour_distance_noise, noise.normal, seed, clock, Stream.RANGE, robots, xp
+    )
+    if off is not None:
+        distance = xp.maximum(distance + realism.neighbour_distance_noise * off, 0.0)
+    off = _draw(
+        realism.neighbour_bearing_noise, noise.normal, seed, clock, Stream.BEARING, robots, xp
+    )
+    if off is not None:
+        bearing = bearing + realism.neighbour_bearing_noise * off
+    parts = [distance, xp.cos(bearing), xp.sin(bearing)]
+    parts += [
+        xp.broadcast_to(message[..., None, :, i], distance.shape)
+        for i in range(settings.message_size)
+    ]
+    rows = [is_there, *(xp.take_along_axis(part, order, axis=-1) for part in parts)]
+    found = xp.stack([xp.where(is_there, row, 0.0) for row in rows], axis=-1)
+    found = found.reshape((*found.shape[:-2], kept * settings.width))
+    lacking = (settings.count - kept) * settings.width
+    nobody = xp.zeros((*found.shape[:-1], lacking), found.dtype)
+    return xp.concatenate([found, nobody], axis=-1) if lacking else found
+
+
+def _draw(
+    size: float | None,
+    draw: Any,
+    seed: Array | None,
+    clock: Array,
+    stream: Stream,
+    robots: int,
+    xp: Any,
+) -> Array | None:
+    """Draws [..., R, R] numbers, those that hear first, if their factor is on.
+
+    What a pair gets does not depend on how many robots there are.
+    """
+    if size is None:
+        return None
+    receiver = noise.bits(seed, clock, stream, (robots,), xp)
+    return draw(receiver, 0, stream, (robots,), xp)
+
+
+def broadcast(action: Array, size: int, active: Array, xp: Any) -> Array:
+    """Takes what robots broadcast out of their actions.
+
+    Args:
+      action: [..., R, 2 + M], or only the first two, of who says nothing.
+      size: M.
+      active: [..., R] who may act; others are silent, and 0 is heard of them.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [..., R, M] within -1..1.
+    """
+    said = xp.clip(action[..., 2:], -1.0, 1.0)
+    if said.shape[-1] < size:
+        said = xp.zeros((*said.shape[:-1], size), action.dtype)
+    return xp.where(active[..., None], said, 0.0)

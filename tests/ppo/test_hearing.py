@@ -1,0 +1,217 @@
+"""Networks that hear: order does not matter, absent ones do not count, and a message is learned."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmjax.ppo import dispatch, learner, networks
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.learner import Batch, LearnerState
+
+OWN, COUNT, WIDTH, STATE = 3, 4, 5, 2
+SIZE = OWN + COUNT * WIDTH
+PLAIN = AlgoConfig(hidden_sizes=(8, 6), initial_std=0.6)
+KINDS = {
+    "plain": {},
+    "gru": {"memory": "gru", "memory_size": 4},
+    "state": {"critic": "state"},
+    "both": {"memory": "gru", "memory_size": 4, "critic": "state"},
+}
+
+
+def _learner(config: AlgoConfig, actions: int = 3, state: int = 0) -> LearnerState:
+    """A learner whose heads are not small."""
+    made = learner.init(jax.random.key(0), config, SIZE, actions, 10, state)
+    leaves, tree = jax.tree.flatten(made.params)
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    drawn = [x + 0.3 * jax.random.normal(key, x.shape) for x, key in zip(leaves, keys, strict=True)]
+    return dataclasses.replace(made, params=jax.tree.unflatten(tree, drawn))
+
+
+def _seen(there: tuple[int, ...] = (1, 1, 1, 0)) -> tuple[np.ndarray, np.ndarray]:
+    """What is seen besides, [OWN], and rows of neighbours [COUNT, WIDTH], zeros where none is."""
+    draw = np.random.default_rng(2)
+    rows = draw.uniform(-1, 1, (COUNT, WIDTH)).astype(np.float32)
+    rows[:, 0] = 1.0
+    return draw.normal(size=OWN).astype(np.float32), rows * np.array(there, np.float32)[:, None]
+
+
+def _think(kind: str, own: np.ndarray, rows: np.ndarray) -> tuple[Any, Any]:
+    """Action and value of one observation."""
+    config = networks.bind_hearing(AlgoConfig(hidden_sizes=(8, 6), **KINDS[kind]), SIZE, 4, WIDTH)
+    state = jnp.array([0.5, -0.5]) if config.critic == "state" else None
+    mine = _learner(config, state=0 if state is None else STATE)
+    memory = networks.begin_memory(config, ())
+    actor, critic = (None, None) if memory is None else memory
+    seen = jnp.concatenate([jnp.asarray(own), jnp.asarray(rows).ravel()])
+    action, _ = learner.recall_mode(mine, config, seen, actor)
+    value, _ = learner.recall_values(mine, config, seen, critic, state)
+    return np.asarray(action), np.asarray(value)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("order", [[1, 2, 0, 3], [3, 2, 1, 0], [0, 3, 1, 2]])
+def test_the_order_of_neighbours_does_not_matter(kind: str, order: list[int]) -> None:
+    own, rows = _seen()
+    for found, expected in zip(
+        _think(kind, own, rows[order]), _think(kind, own, rows), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, atol=2e-6)  # sums of float32 in another order
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_neighbour_more_is_noticed(kind: str) -> None:
+    own, rows = _seen((1, 1, 1, 1))
+    for found, expected in zip(_think(kind, own, _seen()[1]), _think(kind, own, rows), strict=True):
+        assert np.abs(found - expected).max() > 1e-3
+
+
+def test_what_is_heard_is_the_sum_of_one_layer_of_each() -> None:
+    config = networks.bind_hearing(PLAIN, SIZE, COUNT, WIDTH)
+    mine = jax.tree.map(np.asarray, _learner(config).params["actor"])
+    own, rows = _seen()
+    each = np.tanh(rows @ mine["hearing"]["kernel"] + mine["hearing"]["bias"])
+    x = np.concatenate([own, each[:3].sum(axis=0)])  # the fourth is not there
+    for name in ("hidden_0", "hidden_1"):
+        x = np.tanh(x @ mine["torso"][name]["kernel"] + mine["torso"][name]["bias"])
+    expected = x @ mine["mean"]["kernel"] + mine["mean"]["bias"]
+    np.testing.assert_allclose(_think("plain", own, rows)[0], expected, atol=1e-5)
+
+
+def test_a_policy_that_does_not_hear_has_the_weights_that_it_had() -> None:
+    assert networks.bind_hearing(PLAIN, SIZE, 0, 0) is PLAIN
+    assert "hearing" not in learner.init(jax.random.key(0), PLAIN, SIZE, 2, 1).params["actor"]
+
+
+def test_what_is_heard_is_not_normalised_by_what_was_heard_before() -> None:
+    config = networks.bind_hearing(
+        AlgoConfig(hidden_sizes=(8, 6), num_minibatches=1), SIZE, COUNT, WIDTH
+    )
+    draw = np.random.default_rng(0)
+    shape = (4, 8)
+    batch = Batch(
+        observation=jnp.asarray(draw.normal(3.0, 2.0, (*shape, SIZE)), jnp.float32),
+        action=jnp.asarray(draw.normal(size=(*shape, 3)), jnp.float32),
+        log_prob=jnp.full(shape, -3.0),
+        advantage=jnp.asarray(draw.normal(size=shape), jnp.float32),
+        return_=jnp.zeros(shape),
+        valid=jnp.ones(shape, bool),
+    )
+    after, _ = learner.update(_learner(config), config, batch, jax.random.key(0), 10)
+    assert (np.asarray(after.normalizer.mean)[:OWN] > 1.0).all()
+    np.testing.assert_array_equal(after.normalizer.mean[OWN:], 0.0)
+    np.testing.assert_array_equal(after.normalizer.variance[OWN:], 1.0)
+
+
+def test_the_kernels_are_not_taken_for_robots_that_hear(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dispatch, "_has_tensor_cores", lambda: True)
+    heard = networks.bind_hearing(AlgoConfig(), 10 + COUNT * WIDTH, COUNT, WIDTH)
+    assert dispatch.resolve(AlgoConfig(), 10 + COUNT * WIDTH, 2) == "fused"
+    assert dispatch.resolve(heard, 10 + COUNT * WIDTH, 2) == "autodiff"
+
+
+# A probe: two robots, each of which sees a draw that the other one is paid for acting on. What it
+# takes is the sender's message of the control step before, which nobody tells it to send.
+PAIRS, UPDATES, STEPS = 64, 150, 4
+PROBE = AlgoConfig(
+    hidden_sizes=(16, 16),
+    rollout_length=STEPS * 4,
+    epochs=4,
+    num_minibatches=4,
+    discount=0.5,
+    actor_learning_rate=5e-3,
+    critic_learning_rate=5e-3,
+)
+ROW = 5  # there, distance, cosine, sine, message
+
+
+def _look(draw: jax.Array, said: jax.Array) -> jax.Array:
+    """What both robots [B, 2] see: the own draw, and the other one with its message."""
+    one = jnp.ones_like(draw)
+    row = [one, 0.5 * one, one, 0.0 * one, said[:, ::-1]]
+    return jnp.stack([draw, *row], axis=-1)
+
+
+def _live(
+    config: AlgoConfig, deaf: bool, state: LearnerState, carry: Any, key: jax.Array
+) -> tuple[Any, Any]:
+    """A control step of all pairs; episodes of STEPS, in which the draws stay."""
+    draw, said, clock = carry
+    noise, fresh = jax.random.split(key)
+    seen = _look(draw, said)
+    action, log_prob = learner.act(state, config, seen, jax.random.normal(noise, (PAIRS, 2, 2)))
+    heard = jnp.where(deaf, 0.0, jnp.clip(action[..., 1], -1.0, 1.0))
+    # The first step of an episode is not counted: nothing has been said.
+    paid = -jnp.abs(action[..., 0] - draw[:, ::-1]) * (clock > 0)
+    ends = clock + 1 == STEPS
+    drawn = jax.random.rademacher(fresh, draw.shape, jnp.float32)
+    after = (
+        jnp.where(ends, drawn, draw),
+        jnp.where(ends, 0.0, heard),
+        jnp.where(ends, 0, clock + 1),
+    )
+    value = learner.values(state, config, seen)
+    # The episode in which the others are paid by what one says ends with `ends`.
+    return after, (seen, action, log_prob, paid, value, jnp.broadcast_to(ends, paid.shape))
+
+
+def _shared(paid: jax.Array) -> jax.Array:
+    """What both earn, [T, B, 2]: a sender has no other pay for its message."""
+    return paid + paid[..., ::-1]
+
+
+def _iterate(config: AlgoConfig, deaf: bool, carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+    from swarmjax.ppo.gae import generalized_advantages
+
+    state, world = carry
+    roll, learn = jax.random.split(key)
+    keys = jax.random.split(roll, config.rollout_length)
+    live = functools.partial(_live, config, deaf, state)
+    world, (seen, action, log_prob, paid, value, ends) = jax.lax.scan(live, world, keys)
+    following = jnp.concatenate([value[1:], value[-1:]])
+    none = jnp.zeros_like(ends)
+    advantage, return_ = generalized_advantages(
+        _shared(paid), value, following, ends, none, discount=config.discount, gae_lambda=0.95
+    )
+
+    def group(x: jax.Array) -> jax.Array:
+        x = jnp.moveaxis(x, 0, 1)
+        return x.reshape(PAIRS, -1, *x.shape[3:])
+
+    batch = Batch(
+        observation=group(seen),
+        action=group(action),
+        log_prob=group(log_prob),
+        advantage=group(advantage),
+        return_=group(return_),
+        valid=jnp.ones((PAIRS, config.rollout_length * 2), bool),
+    )
+    state, _ = learner.update(state, config, batch, learn, UPDATES)
+    return (state, world), paid.sum() / (paid != 0).sum()
+
+
+def _earned(deaf: bool) -> float:
+    """What robots earn in a step at the end: at best 0, by chance -1."""
+    config = networks.bind_hearing(PROBE, 1 + ROW, 1, ROW)
+    state = learner.init(jax.random.key(0), config, 1 + ROW, 2, UPDATES)
+    keys = jax.random.split(jax.random.key(1), UPDATES)
+    draw = jax.random.rademacher(jax.random.key(2), (PAIRS, 2), jnp.float32)
+    world = (draw, jnp.zeros((PAIRS, 2)), jnp.zeros((), jnp.int32))
+    _, earned = jax.jit(
+        lambda state, world: jax.lax.scan(
+            functools.partial(_iterate, config, deaf), (state, world), keys
+        )
+    )(state, world)
+    return float(earned[-10:].mean())
+
+
+def test_a_task_that_only_a_message_solves_is_learned_with_messages_alone() -> None:
+    # Who hears nothing earns most by any constant within -1..1: a mean of -1, and less by its
+    # exploration. Who hears is off by no more than exploration.
+    assert _earned(deaf=True) < -0.95
+    assert _earned(deaf=False) > -0.5

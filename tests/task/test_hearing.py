@@ -1,0 +1,213 @@
+"""Who hears whom, how it is written down, and what of it the environment makes."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from swarmjax.config import ConfigError
+from swarmjax.sim.config import SimConfig
+from swarmjax.sim.realism_config import RealismConfig
+from swarmjax.task import env, hearing, observation
+from swarmjax.task.config import NeighboursConfig, TaskConfig
+from swarmjax.task.level import Level
+from swarmjax.task.stage_config import StageConfig
+
+XPS = [np, jnp]
+NOBODY = np.array([[9.0, 9.0, 0.0, 0.1, 0.1]], np.float32)
+# One in the middle that looks north, one 0.3 m north of it, one 0.4 m east, one 0.8 m west.
+POSE = np.array([[0, 0, np.pi / 2], [0, 0.3, 0], [0.4, 0, 0], [-0.8, 0, 0]], np.float32)
+SAID = np.array([[0.1], [0.2], [0.3], [0.4]], np.float32)
+PRESENT = np.ones(4, bool)
+
+
+def _listen(
+    xp: Any,
+    pose: np.ndarray = POSE,
+    obstacle: np.ndarray = NOBODY,
+    present: np.ndarray = PRESENT,
+    count: int = 2,
+    said: np.ndarray = SAID,
+    seed: int | None = None,
+    **realism: Any,
+) -> np.ndarray:
+    """What each robot hears, [R, K, W], within 0.7 m."""
+    config = NeighboursConfig(count=count, message_size=said.shape[-1])
+    obstacle, pose = xp.asarray(obstacle, xp.float32), xp.asarray(pose)
+    hidden = hearing.hidden(pose, obstacle, xp)
+    heard = hearing.reachable(pose, xp.asarray(present), hidden, xp.asarray(said), 0.7, xp)
+    drawn = None if seed is None else xp.asarray(seed, xp.uint32)
+    found = hearing.listen(heard, config, RealismConfig(**realism), drawn, xp.asarray(3), xp)
+    return np.asarray(found).reshape(len(pose), count, -1)
+
+
+@pytest.mark.parametrize("xp", XPS)
+def test_neighbours_are_nearest_first_in_the_frame_of_the_one_that_hears(xp: Any) -> None:
+    # The one north is straight ahead; the one east is to the right, at -90 degrees.
+    expected = [[1.0, 0.3, 1.0, 0.0, 0.2], [1.0, 0.4, 0.0, -1.0, 0.3]]
+    np.testing.assert_allclose(_listen(xp)[0], expected, atol=1e-6)  # float32 of a sine
+
+
+@pytest.mark.parametrize("xp", XPS)
+def test_one_out_of_range_hears_nobody(xp: Any) -> None:
+    assert not _listen(xp)[3].any()
+
+
+@pytest.mark.parametrize("xp", XPS)
+def test_an_absent_robot_is_not_heard(xp: Any) -> None:
+    found = _listen(xp, present=np.array([True, False, True, True]))[0]
+    np.testing.assert_allclose(found[:, :2], [[1.0, 0.4], [0.0, 0.0]], atol=1e-7)
+
+
+@pytest.mark.parametrize("xp", XPS)
+def test_a_wall_in_between_hides_both_from_each_other(xp: Any) -> None:
+    wall = np.array([[0.0, 0.15, 0.0, 0.05, 0.01]], np.float32)
+    found = _listen(xp, obstacle=wall)
+    np.testing.assert_allclose(found[0, :, 1], [0.4, 0.0], atol=1e-7)
+    np.testing.assert_allclose(found[1, :, 1], [0.5, 0.0], atol=1e-7)  # the one east alone
+
+
+@pytest.mark.parametrize("xp", XPS)
+def test_a_wall_behind_hides_nobody(xp: Any) -> None:
+    wall = np.array([[0.0, 0.4, 0.0, 0.05, 0.01]], np.float32)
+    np.testing.assert_array_equal(_listen(xp, obstacle=wall), _listen(xp))
+
+
+def test_more_neighbours_than_robots_are_rows_of_zeros() -> None:
+    found = _listen(np, count=6)
+    assert not found[:, 4:].any()
+    np.testing.assert_array_equal(found[:, :2], _listen(np))
+
+
+@pytest.mark.parametrize("xp", XPS)
+def test_packets_are_lost_as_often_as_said(xp: Any) -> None:
+    pose = np.zeros((40, 3), np.float32)
+    pose[:, 0] = 0.01 * np.arange(40)
+    whom = {"pose": pose, "present": np.ones(40, bool), "said": np.zeros((40, 0), np.float32)}
+    found = _listen(xp, count=32, seed=1, packet_loss=0.75, **whom)
+    heard = found[..., 0].sum() / (40 * 39)
+    assert abs(heard - 0.25) < 0.044  # 4 deviations of 1,560 packets
+
+
+def test_a_lost_packet_leaves_no_trace() -> None:
+    assert not _listen(np, seed=1, packet_loss=1.0).any()
+
+
+def test_noise_of_a_pair_does_not_depend_on_how_many_robots_there_are() -> None:
+    noisy = {"seed": 5, "neighbour_distance_noise": 0.02, "neighbour_bearing_noise": 0.1}
+    whole = _listen(np, **noisy)
+    fewer = _listen(np, pose=POSE[:3], present=PRESENT[:3], said=SAID[:3], **noisy)
+    np.testing.assert_array_equal(fewer, whole[:3])
+    assert not np.allclose(whole[0], _listen(np)[0])
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 5))
+def test_numpy_and_jax_hear_the_same(seed: int, count: int) -> None:
+    draw = np.random.default_rng(seed)
+    pose = draw.uniform(-0.6, 0.6, (5, 3)).astype(np.float32)
+    boxes = np.concatenate([draw.uniform(-0.6, 0.6, (3, 3)), draw.uniform(0.01, 0.1, (3, 2))], 1)
+    whom: dict[str, Any] = {"pose": pose, "obstacle": boxes.astype(np.float32), "count": count}
+    whom |= {"present": draw.random(5) < 0.8, "said": draw.uniform(-1, 1, (5, 2))}
+    whom["said"] = whom["said"].astype(np.float32)
+    found = [_listen(xp, seed=seed % 2**31, packet_loss=0.3, **whom) for xp in XPS]
+    np.testing.assert_allclose(found[0], found[1], atol=2e-6)  # float32 of sine and root
+
+
+def test_the_layout_names_what_is_heard() -> None:
+    config = NeighboursConfig(count=2, range=0.5, message_size=1)
+    found = observation.layout("metric", (), config)
+    assert found.names[10:15] == (
+        "neighbour_0",
+        "neighbour_0_distance",
+        "neighbour_0_bearing_cos",
+        "neighbour_0_bearing_sin",
+        "neighbour_0_message_0",
+    )
+    assert found.units[10:15] == ("1", "m", "1", "1", "1")
+    assert found.scale[10:15] == (1.0, 0.5, 1.0, 1.0, 1.0)
+    assert found.size == 10 + 2 * 5
+
+
+def test_robots_that_do_not_hear_observe_as_before() -> None:
+    assert observation.describe("metric", (), NeighboursConfig()) == observation.describe("metric")
+
+
+@pytest.mark.parametrize(
+    ("section", "said", "sentence"),
+    [
+        (NeighboursConfig, {"message_size": 2}, "message_size is 2, but count is 0"),
+        (NeighboursConfig, {"count": 1, "range": 0.0}, "range is 0"),
+        (NeighboursConfig, {"count": 1, "range": 11.0}, "range is 11"),
+        (NeighboursConfig, {"count": 33}, "count is 33"),
+        (RealismConfig, {"packet_loss": 1.5}, "packet_loss is 1.5"),
+        (
+            TaskConfig,
+            {"history": 2, "neighbours": NeighboursConfig(count=1)},
+            "history is 2, but neighbours.count is 1",
+        ),
+    ],
+)
+def test_what_cannot_be_heard_is_refused(section: Any, said: Any, sentence: str) -> None:
+    with pytest.raises(ConfigError, match=sentence):
+        section(**said)
+
+
+@pytest.fixture(scope="module")
+def world() -> env.World:
+    stage = StageConfig(name="two", robots=3, side=1.0, obstacles=1)
+    task = TaskConfig(neighbours=NeighboursConfig(count=2, message_size=2), step_limit=50)
+    return env.load([stage], task=task, sim=SimConfig(max_robots=3, max_obstacles=1, impl="jax"))
+
+
+@pytest.fixture(scope="module")
+def level() -> Level:
+    """The first arrives at once; the third is absent."""
+    return Level(
+        side=np.float32(1.0),
+        present=np.array([True, True, False]),
+        start=np.array([[0, 0, 0], [0.3, 0, np.pi], [6, 6, 0]], np.float32),
+        target=np.array([[0.05, 0], [-0.3, 0.3], [6, 6]], np.float32),
+        obstacle_present=np.array([False]),
+        obstacle=np.array([[-5.5, -5.0, 0.0, 0.05, 0.05]], np.float32),
+        seed=np.uint32(0),
+    )
+
+
+def _play(world: env.World, level: Level, action: np.ndarray, steps: int) -> list[np.ndarray]:
+    """Messages [R, K, M] heard after each step, before the first one at the front."""
+    from swarmjax.sim import physics
+
+    state = env.reset(world, jax.tree.map(jnp.asarray, level))
+    state = dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
+    seen, step = [state.observation], jax.jit(functools.partial(env.step, world))
+    for _ in range(steps):
+        state, _ = step(state, jnp.asarray(action))
+        seen.append(state.observation)
+    return [np.asarray(x)[:, 10:].reshape(3, 2, 6)[..., 4:] for x in seen]
+
+
+def test_messages_are_heard_in_the_next_control_step(world: env.World, level: Level) -> None:
+    action = np.array([[-1, 0, 0.25, -3.0], [-1, 0, 0.5, 0.75], [1, 1, 1, 1]], np.float32)
+    first, second = _play(world, level, action, 1)
+    assert not first.any()  # nobody has said anything
+    np.testing.assert_array_equal(second[:2, 0], [[0.5, 0.75], [0.25, -1.0]])
+    assert not second[:2, 1].any()  # the third is absent
+
+
+def test_a_robot_that_has_arrived_is_near_but_silent(world: env.World, level: Level) -> None:
+    action = np.array([[1, 0, 0.25, 0.5], [-1, 0, 0.5, 0.75], [1, 1, 1, 1]], np.float32)
+    _, arriving, arrived = _play(world, level, action, 2)
+    np.testing.assert_array_equal(arriving[1, 0], [0.25, 0.5])
+    np.testing.assert_array_equal(arrived[1, 0], [0.0, 0.0])
+
+
+def test_an_action_without_its_message_is_refused(world: env.World, level: Level) -> None:
+    with pytest.raises(AssertionError):
+        _play(world, level, np.zeros((3, 2), np.float32), 1)
