@@ -2,7 +2,7 @@
 
 A compiled program says what it takes: its arguments, what it works with, and what it returns but
 for what lies where donated arguments lay. That is a straight line in the number of arenas
-(docs/design.md), so that two small programs, compiled and never run, tell what a large one takes.
+(docs/design-notes.md), so that two small programs, compiled and never run, tell what a large one takes.
 Warp's own temporary arrays are not in it: they lie outside of what JAX takes of a card.
 """
 

@@ -190,7 +190,7 @@ def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjM
 PLANAR = Body(
     gravity=False,
     # A hull's push and its friction are then two numbers, as soft as without friction; the cone of
-    # two edges in the plane is Coulomb's own (docs/design.md, "Hulls that rub").
+    # two edges in the plane is Coulomb's own (docs/design-notes.md, "Hulls that rub").
     cone=mujoco.mjtCone.mjCONE_ELLIPTIC,
     add=_add,
     qpos=_qpos,

@@ -34,7 +34,7 @@ from swarmjax.ppo.networks import Params
 # 128 threads then take all of their 255 registers, and 80 kB on the chip: each of its 132
 # multiprocessors has room for two programs, and as many are there from begin to end.
 LAUNCH = Launch(tile=64, programs=264, warps=4)
-# Faster by 30 % on an H100 (design.md), where a program may take so much of the chip.
+# Faster by 30 % on an H100 (design-notes.md), where a program may take so much of the chip.
 LARGE = Launch(tile=128, programs=264, warps=8)
 # Of a minibatch: with fewer, one tile more or less would make minibatches too unlike.
 _LEAST_TILES = 8
