@@ -24,6 +24,113 @@ _MODE_OPTIONS: dict[str, tuple[tuple[str, ...], float | str | None]] = {
 }
 
 
+_BUFFERED = ("learnability", "value_loss")
+
+
+# The options of a curriculum over levels that has a buffer, and what null stands for.
+_LEVEL_OPTIONS: dict[str, float | int] = {
+    "buffer": 4096,
+    "replay": 0.5,
+    "mutation": 0.0,
+    "temperature": 2.0,
+    "staleness": 0.1,
+    "minimum_episodes": 4,
+}
+_MOST_LEVELS = 2**20
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelsConfig(Section):
+    """Which levels of a stage are trained on.
+
+    An option of the modes with a buffer is null without one, and may be null with one, where it
+    then takes its default.
+    """
+
+    mode: Literal["random", "learnability", "value_loss"] = field(
+        default="random",
+        metadata=about(
+            "random: a new level every episode; learnability: a buffer of those with the largest "
+            "p (1 - p) of success p; value_loss: of those with the largest positive value loss"
+        ),
+    )
+    buffer: int | None = field(
+        default=None,
+        metadata=about(
+            "levels that are kept, an equal part for each stage; null: 4096 "
+            "[learnability, value_loss]",
+            1,
+            _MOST_LEVELS,
+        ),
+    )
+    replay: float | None = field(
+        default=None,
+        metadata=about(
+            "share of episodes that begin on a level of a full buffer; null: 0.5 "
+            "[learnability, value_loss]",
+            above=0.0,
+            below=1.0,
+        ),
+    )
+    mutation: float | None = field(
+        default=None,
+        metadata=about(
+            "share of those that begin on a mutated one: a wall, a box, a start or a target has "
+            "moved; null: 0 [learnability, value_loss]",
+            0.0,
+            1.0,
+        ),
+    )
+    temperature: float | None = field(
+        default=None,
+        metadata=about(
+            "replay goes as rank^(-1 / temperature); null: 2 [learnability, value_loss]",
+            0.01,
+            100.0,
+        ),
+    )
+    staleness: float | None = field(
+        default=None,
+        metadata=about(
+            "share of the replay by how long a level was not played; null: 0.1 "
+            "[learnability, value_loss]",
+            0.0,
+            1.0,
+        ),
+    )
+    minimum_episodes: int | None = field(
+        default=None,
+        metadata=about(
+            "episodes, 16 at most remembered, that a level has had before it is mutated; null: 4 "
+            "[learnability, value_loss]",
+            1,
+            16,
+        ),
+    )
+
+    @property
+    def is_on(self) -> bool:
+        """Whether there is a buffer."""
+        return self.mode in _BUFFERED
+
+    @property
+    def mutates(self) -> bool:
+        """Whether levels are mutated."""
+        return bool(self.mutation)
+
+    def _check(self) -> None:
+        for key, default in _LEVEL_OPTIONS.items():
+            value = getattr(self, key)
+            if not self.is_on and value is not None:
+                raise ConfigError(
+                    f"{key} is {show(value, quote='')}, but mode is {self.mode}, which has no "
+                    f"buffer: {key} is an option of {' and '.join(_BUFFERED)}, so give null or "
+                    f"mode={_BUFFERED[0]}."
+                )
+            if self.is_on and value is None:
+                object.__setattr__(self, key, default)
+
+
 @dataclass(frozen=True, kw_only=True)
 class CurriculumConfig(Section):
     """Who trains on which stage, when that changes, and what a promotion does to the learners.
@@ -113,6 +220,7 @@ class CurriculumConfig(Section):
             "in turn [sequential, mixed]"
         ),
     )
+    levels: LevelsConfig = field(default_factory=LevelsConfig)
 
     def _check(self) -> None:
         for key, (modes, default) in _MODE_OPTIONS.items():

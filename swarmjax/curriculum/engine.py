@@ -19,6 +19,7 @@ from flax import struct
 from jax import Array
 
 from swarmjax.curriculum.config import CurriculumConfig
+from swarmjax.curriculum.levels import LevelBuffer, LevelNumbers
 from swarmjax.extension import LevelDrawing
 from swarmjax.shards import ALONE, Shards
 from swarmjax.task import stage as task_stage
@@ -59,6 +60,7 @@ class Schedule(NamedTuple):
       earlier_share: [] share of the arenas on earlier stages.
       floor: [] share of the arenas that is spread evenly over all stages.
       cohort_updates: [] updates that hold one step limit, int32.
+      levels: numbers of the curriculum over levels; None without one.
     """
 
     stages: Stage
@@ -68,6 +70,7 @@ class Schedule(NamedTuple):
     earlier_share: Array | np.float32
     floor: Array | np.float32
     cohort_updates: Array | np.int32
+    levels: LevelNumbers | None = None
 
 
 class CohortTally(NamedTuple):
@@ -131,6 +134,7 @@ class Curriculum:
       previous: those of the one before.
       record: how each stage goes.
       met: [] the most robots that any stage has had so far, int32.
+      levels: the buffer of the curriculum over levels; None without one.
     """
 
     stage: Array
@@ -142,6 +146,7 @@ class Curriculum:
     previous: CohortTally
     record: Record
     met: Array
+    levels: LevelBuffer | None = None
 
 
 class CohortVerdict(NamedTuple):

@@ -231,6 +231,7 @@ def _load(settings: TrainConfig) -> tuple[Built, Schedule, Any, TrainState]:
     program, schedule = programs.load(settings, by_robot=settings.run.episodes)
     init = jax.jit(mesh.init(program))  # traced once, for the shapes and for the state
     template = init.eval_shape(schedule)
+    memory.check_buffer(settings, seeds.size(template.curriculum.levels), memory.limit())
     memory.check_state(settings, mesh.bytes_each(settings, template), memory.limit())
     return program, schedule, init, template
 

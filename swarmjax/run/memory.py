@@ -2,7 +2,8 @@
 
 A compiled program says what it takes: its arguments, what it works with, and what it returns but
 for what lies where donated arguments lay. That is a straight line in the number of arenas
-(docs/design-notes.md), so that two small programs, compiled and never run, tell what a large one takes.
+(docs/design-notes.md), so that two small programs, compiled and never run, tell what a large one
+takes.
 Warp's own temporary arrays are not in it: they lie outside of what JAX takes of a card.
 """
 
@@ -42,6 +43,27 @@ def _host_memory() -> int | None:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):  # Windows has none of it
         return None
+
+
+def check_buffer(settings: TrainConfig, needed: int, available: int | None) -> None:
+    """Refuses a buffer of levels that is larger than the memory by itself.
+
+    Args:
+      settings: of the run.
+      needed: by the buffers of all seeds, each of which a device holds whole, bytes.
+      available: bytes; None if it is not known, and then nothing is refused.
+
+    Raises:
+      ConfigError: with what is surely too much.
+    """
+    if available is not None and needed > available:
+        levels = settings.curriculum.levels.buffer or 0
+        each = f" for each of {settings.seeds} seeds" if settings.seeds > 1 else ""
+        raise ConfigError(
+            f"curriculum.levels.buffer is {levels}{each}, which needs {_gib(needed)} of memory, "
+            f"and there is {_gib(available)}: give less than {int(levels * available / needed)}, "
+            "or train on a device with more."
+        )
 
 
 def check_state(settings: TrainConfig, needed: int, available: int | None) -> None:

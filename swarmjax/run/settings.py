@@ -21,7 +21,7 @@ from swarmjax.config import (
 from swarmjax.config.section import MAX_COUNT, modernise
 from swarmjax.ppo.config import AlgoConfig, resolve
 from swarmjax.run.directory import CONFIG, MAY_CHANGE
-from swarmjax.task import pieces, stage_files
+from swarmjax.task import mutation, pieces, stage_files
 from swarmjax.task.config import check_realism
 from swarmjax.task.stage_config import make_room
 from swarmjax.training.config import ProgramConfig
@@ -167,6 +167,7 @@ class TrainConfig(ProgramConfig):
         self._check_budget()
         self._check_counts()
         self._check_algo()
+        self._check_levels()
         self._check_episodes()
         check_realism(self.realism, self.robot, self.task, self.task.step_limit)
         if self.arena_devices > 1:
@@ -234,6 +235,19 @@ class TrainConfig(ProgramConfig):
                 f"run.episodes is true, but arenas is {self.arenas} and seeds is {self.seeds}: "
                 f"give at most {MOST_LOGGED} arenas of all seeds together, or run.episodes=false."
             )
+
+    def _check_levels(self) -> None:
+        levels = self.curriculum.levels
+        if not levels.is_on:
+            return
+        if levels.buffer is not None and levels.buffer < len(self.stage):
+            raise ConfigError(
+                f"curriculum.levels.buffer is {levels.buffer}, but there are {len(self.stage)} "
+                f"stages with an equal part each: give at least {len(self.stage)}."
+            )
+        if levels.mutates:
+            for stage in self.stage:
+                mutation.check(stage)
 
     def _check_algo(self) -> None:
         if self.task.history > 1 and self.algo.memory != "none":

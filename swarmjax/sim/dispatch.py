@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from swarmjax.sim.model import Ids
 
 Array = Any
-# Iterations and line-search steps at most; see docs/design-notes.md for what was measured. MJX's Newton
-# method by `jax` is cut off where it is near enough; all else has room to converge.
+# Iterations and line-search steps at most; see docs/design-notes.md for what was measured. MJX's
+# Newton method by `jax` is cut off where it is near enough; all else has room to converge.
 _NEWTON_STEPS = {"planar": (3, 5), "wheeled": (30, 20)}
 _MOST_STEPS = (100, 50)  # MuJoCo's own
 # Of discs: the tightest jam of tests/sim/test_solver.py takes 150 to 200. With 100 it was 1.9e-4
@@ -32,7 +32,7 @@ _MOST_SWEEPS = 200
 # Where hulls rub, forces come to rest more slowly: a jam of friction 1.5 takes 400 sweeps to be
 # as near as one without friction, and MJX's Newton method by `jax` as many steps as wheels do.
 _MOST_RUBBING_SWEEPS = 400
-# In a jam of more wheeled robots the solver made for them leaves up to 7 mm/s (design-notes.md, 38).
+# In a jam of more wheeled robots the solver made for them leaves up to 7 mm/s (design note 38).
 MOST_WHEELED = 5
 
 

@@ -104,6 +104,23 @@ def uniform_count(spacing: Spacing) -> int:
     return 8 + 2 * spacing.obstacles + 3 * spacing.robots
 
 
+def write_out(uniforms: Array, spacing: Spacing, layouts: int, xp: Any) -> Array:
+    """Adds to a level's uniform numbers those of its layout, which follow from its seed.
+
+    Args:
+      uniforms: [uniform_count(spacing)] float32 in [0, 1).
+      spacing: sizes.
+      layouts: how many of them to add.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      [uniform_count(spacing) + layouts] numbers, of which `sample` draws the same level.
+    """
+    seed = _seed(_split(uniforms, spacing), xp)
+    added = noise.uniform(seed, 0, Stream.LAYOUT, (layouts,), xp)
+    return xp.concatenate([uniforms, added])
+
+
 def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     """Draws a level of a stage.
 
@@ -113,7 +130,8 @@ def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     gets past any two that have arrived: every target stays reachable in any order of arrival.
 
     Args:
-      uniforms: [uniform_count(spacing)] float32 in [0, 1).
+      uniforms: [uniform_count(spacing)] float32 in [0, 1), and after them those of the layout, if
+        they do not follow from the level's seed (`write_out`).
       stage: fields [].
       spacing: sizes.
       xp: `numpy` or `jax.numpy`; both draw the same level.
@@ -131,7 +149,8 @@ def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
         choose = partial(xp.where, stage.map.mapped)
         level = Level(*(choose(m, other) for m, other in zip(mapped, level, strict=True)))
     for kind, arrays in (stage.layouts or {}).items():
-        laid_out = _laid_out(kind, arrays, level.seed, stage, spacing, xp)
+        own = _of_layout(kind, uniforms, level.seed, spacing, xp)
+        laid_out = _laid_out(kind, arrays, own, level.seed, stage, spacing, xp)
         choose = partial(xp.where, arrays.chosen)
         level = Level(*(choose(mine, other) for mine, other in zip(laid_out, level, strict=True)))
     return park(level, xp)
@@ -279,13 +298,28 @@ def _mapped(drawn: _Uniforms, stage: Stage, arena: MapArrays, spacing: Spacing, 
     )
 
 
+def _of_layout(kind: Kind, uniforms: Array, seed: Array, spacing: Spacing, xp: Any) -> Array:
+    """Returns the layout's own numbers: those written out, or else those that the seed gives."""
+    before = uniform_count(spacing)
+    if uniforms.shape[0] > before:
+        return uniforms[before:]
+    count = drawing.uniform_count(kind, spacing.robots)
+    return noise.uniform(seed, 0, Stream.LAYOUT, (count,), xp)
+
+
 def _laid_out(
-    kind: Kind, of: LayoutArrays, seed: Array, stage: Stage, spacing: Spacing, xp: Any
+    kind: Kind,
+    of: LayoutArrays,
+    uniforms: Array,
+    seed: Array,
+    stage: Stage,
+    spacing: Spacing,
+    xp: Any,
 ) -> Level:
     """Lays an arena out; robots and walls beyond those of the layout are absent."""
     present = xp.arange(spacing.robots) < stage.robots
     sizes = RobotSizes(spacing.hull_radius, spacing.target_radius)
-    arena = drawing.draw(kind, of, seed, present, sizes, xp)
+    arena = drawing.draw(kind, of, uniforms, present, sizes, xp)
     walls, count = len(arena.obstacle), spacing.obstacles
     absent = xp.stack([xp.zeros_like(stage.obstacle_size)] * 3 + [0.5 * stage.obstacle_size] * 2)
     mine = np.arange(count)[:, None] < walls

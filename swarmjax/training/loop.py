@@ -14,13 +14,15 @@ from flax import struct
 from jax import Array
 
 from swarmjax.curriculum import engine as curricula
+from swarmjax.curriculum import levels
 from swarmjax.curriculum.engine import Curriculum, Decision, Schedule
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.shards import Shards
 from swarmjax.sim import gaps
 from swarmjax.task.episode import Ended
-from swarmjax.training import episodes, promotion, rollout
+from swarmjax.training import episodes, practice, promotion, rollout
+from swarmjax.training.practice import Source
 from swarmjax.training.program import Program
 from swarmjax.training.rollout import Arena
 
@@ -67,6 +69,7 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
     start_key = jax.random.key(config.seed if seed is None else seed)
     run_key, learner_key, level_key = jax.random.split(start_key, 3)
     curriculum = curricula.init(schedule, config.curriculum, program.mode)
+    curriculum = replace(curriculum, levels=practice.init(config))
     starts = _draw_first(program, schedule, curriculum, level_key)
     size, actions = program.world.observation_size, program.world.action_size
     learners = jax.vmap(
@@ -138,12 +141,9 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     """
     config, shards = program.config, program.shards
     key, level_key, rollout_key, learn_key = jax.random.split(state.key, 4)
+    waiting = _draw_waiting(program, schedule, state.curriculum, level_key)
     arenas, trajectory, ended = rollout.collect(
-        program,
-        state.learners,
-        state.arenas,
-        _draw_waiting(program, schedule, state.curriculum, level_key),
-        rollout_key,
+        program, state.learners, state.arenas, waiting, rollout_key
     )
     batch = rollout.batch(trajectory, config.algo, shards, state.arenas.recall)
     explored = rollout.explore(program, state.learners, config.algo.rollout_length)
@@ -176,6 +176,10 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     if program.by_robot:
         every = jax.tree.map(partial(shards.gather, axis=1), ended)
         metrics[episodes.KEY] = episodes.pack(every, episodes.room(config))
+    every = _every_source(state.arenas, waiting)
+    if every is not None:
+        arenas, curriculum, told = _practise(program, every, arenas, batch, ended, curriculum)
+        metrics |= told
     new = TrainState(
         learners=learners,
         arenas=arenas,
@@ -186,6 +190,38 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     return new, metrics
 
 
+def _every_source(arenas: Arena, waiting: Arena) -> Source | None:
+    """Lists what the episodes of a rollout begin on, [J, A]; None without a buffer of levels."""
+    if arenas.source is None or waiting.source is None:
+        return None
+    return practice.line_up(arenas.source, waiting.source)
+
+
+def _practise(
+    program: Program,
+    every: Source,
+    arenas: Arena,
+    batch: Batch,
+    ended: Ended,
+    curriculum: Curriculum,
+) -> tuple[Arena, Curriculum, Metrics]:
+    """Takes the episodes of a rollout into the buffer of levels."""
+    config, source, loss = program.config.curriculum, arenas.source, None
+    assert curriculum.levels is not None
+    assert source is not None
+    if every.gained is not None:
+        before = jax.tree.map(lambda x: x[0], every.gained)
+        loss, gained = practice.gain(before, batch, ended.episodes > 0)
+        source = source._replace(gained=gained)
+    played = practice.together(practice.plays(every, ended, loss, config), program.shards)
+    fast = curriculum.record.fast
+    usual = jnp.where(jnp.isnan(fast), 0.5, fast)
+    buffer, taken = levels.update(curriculum.levels, played, config.levels, usual)
+    source = source._replace(slot=levels.mark_lost(source.slot, taken))
+    arenas = replace(arenas, source=source)
+    return arenas, replace(curriculum, levels=buffer), levels.describe(buffer, played)
+
+
 def _assigned(program: Program, curriculum: Curriculum) -> Array:
     """Says on which stage the next episode of each arena of this device begins."""
     return program.shards.local(curricula.assign(curriculum, program.config.arenas))
@@ -193,20 +229,30 @@ def _assigned(program: Program, curriculum: Curriculum) -> Array:
 
 def _draw_first(program: Program, schedule: Schedule, curriculum: Curriculum, key: Array) -> Arena:
     """Draws the first episode of each arena of this device."""
-    index, cohort = _assigned(program, curriculum)[None], curriculum.cohort
-    return rollout.draw_starts(
-        program.world, schedule.stages, index, cohort, key, program.shards, program.config.algo
-    )
+    return _draw(program, schedule, curriculum, key, waiting=1)
 
 
 def _draw_waiting(
     program: Program, schedule: Schedule, curriculum: Curriculum, key: Array
 ) -> Arena:
     """Draws the episodes that wait for the arenas of this device during a rollout."""
-    index = jnp.tile(_assigned(program, curriculum), (program.config.waiting, 1))
-    cohort = curriculum.cohort
+    return _draw(program, schedule, curriculum, key, waiting=program.config.waiting)
+
+
+def _draw(
+    program: Program, schedule: Schedule, curriculum: Curriculum, key: Array, *, waiting: int
+) -> Arena:
+    """Draws so many episodes for each arena of this device."""
+    config = program.config
     return rollout.draw_starts(
-        program.world, schedule.stages, index, cohort, key, program.shards, program.config.algo
+        program.world,
+        schedule.stages,
+        jnp.tile(_assigned(program, curriculum), (waiting, 1)),
+        curriculum.cohort,
+        key,
+        program.shards,
+        config.algo,
+        practice.of(curriculum.levels, schedule.levels, config.curriculum),
     )
 
 

@@ -14,7 +14,7 @@ from swarmjax.provenance import cores
 from swarmjax.shards import Shards
 from swarmjax.task import env, surroundings
 from swarmjax.task.env import World
-from swarmjax.training import episodes
+from swarmjax.training import episodes, practice
 from swarmjax.training.config import ProgramConfig
 
 ACTION_SIZE = env.COMMAND_SIZE  # of robots that broadcast nothing
@@ -103,8 +103,12 @@ def load_world(config: ProgramConfig) -> World:
 
 
 def schedule(config: ProgramConfig) -> Schedule:
-    """Works the curriculum's numbers out."""
-    return curricula.schedule(
+    """Works the curriculum's numbers out.
+
+    Raises:
+      ConfigError: if levels are to be mutated that have nothing to move.
+    """
+    found = curricula.schedule(
         config.stage,
         config.curriculum,
         updates=config.updates,
@@ -112,6 +116,7 @@ def schedule(config: ProgramConfig) -> Schedule:
         rollout=config.algo.rollout_length,
         drawings=extension.load(config.extensions).levels,
     )
+    return found._replace(levels=practice.numbers(config))
 
 
 def groups(config: ProgramConfig, cores: int) -> int:

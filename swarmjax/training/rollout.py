@@ -26,6 +26,8 @@ from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
 from swarmjax.task.episode import Ended, Robots
 from swarmjax.task.stage import Stage
+from swarmjax.training import practice as practices
+from swarmjax.training.practice import Practice, Source
 from swarmjax.training.program import Program
 
 # Cohort of an episode that counts for none: curricula number theirs from 0, and -1 is the one
@@ -42,11 +44,13 @@ class Arena(EnvState):
       cohort: [] the curriculum's cohort in which it began, int32.
       recall: [R, H] of each robot's actor and critic before they see the observation; None if they
         remember nothing.
+      source: what the curriculum over levels had it begin on; None without one.
     """
 
     stage: Array
     cohort: Array
     recall: Recall | None = None
+    source: Source | None = None
 
 
 class Trajectory(NamedTuple):
@@ -116,6 +120,7 @@ def draw_starts(
     key: Array,
     shards: Shards = ALONE,
     config: AlgoConfig | None = None,
+    practice: Practice | None = None,
 ) -> Arena:
     """Draws fresh levels: episodes that wait until their arena is free.
 
@@ -131,6 +136,7 @@ def draw_starts(
       key: random key, consumed.
       shards: how the arenas are spread over devices; A counts those of this one.
       config: says whether robots remember; None: they do not.
+      practice: what the curriculum over levels deals out; None: every level is new.
 
     Returns:
       [W A] the episodes that wait, packed.
@@ -140,6 +146,11 @@ def draw_starts(
     size = (waiting, arenas // shards.local_streams, level.uniform_count(world.spacing))
     uniforms = shards.draw(key, lambda key: jax.random.uniform(key, size), axis=1)
     stages = jax.tree.map(jnp.asarray, stages)
+    source = None
+    if practice is not None:
+        deal_key = jax.random.fold_in(key, 1)
+        source = practices.deal(practice, uniforms, index, deal_key, shards, world.spacing)
+        uniforms = source.numbers
 
     def start(uniform: Array, i: Array) -> Arena:
         stage = task_stage.select(stages, i)
@@ -148,7 +159,11 @@ def draw_starts(
         at = i.astype(jnp.int32), jnp.asarray(cohort, jnp.int32)
         return Arena(**begun, stage=at[0], cohort=at[1], recall=memory)
 
-    return jax.vmap(start)(uniforms.reshape(-1, size[-1]), index.ravel())
+    starts = jax.vmap(start)(uniforms.reshape(-1, uniforms.shape[-1]), index.ravel())
+    if source is None:
+        return starts
+    counted = jnp.where(practices.is_fresh(source), starts.cohort, UNCOUNTED)
+    return replace(starts, cohort=counted, source=source)
 
 
 def collect(
@@ -166,8 +181,9 @@ def collect(
     Returns:
       The arenas, packed; the trajectory; the episodes that ended.
     """
-    config = program.config.algo
-    waits = _Waiting(starts, _judge(program, learners, starts))
+    config, under_way = program.config.algo, arenas.source
+    arenas, waiting = replace(arenas, source=None), replace(starts, source=None)
+    waits = _Waiting(waiting, _judge(program, learners, waiting))
     step = functools.partial(_step, program, learners, waits)
     unpack = functools.partial(physics.unpack, program.world.physics)
     arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
@@ -175,7 +191,11 @@ def collect(
     carry = (arenas, _judge(program, learners, arenas), begun)
     steps = config.rollout_length
     keys = jax.random.split(key, steps)
-    (arenas, *_), (trajectory, counts) = jax.lax.scan(step, carry, (keys, 1 + jnp.arange(steps)))
+    carry, (trajectory, counts) = jax.lax.scan(step, carry, (keys, 1 + jnp.arange(steps)))
+    arenas, _, begun = carry
+    if under_way is not None and starts.source is not None:
+        every = practices.line_up(under_way, starts.source)
+        arenas = replace(arenas, source=practices.current(every, begun))
     packed = jax.vmap(physics.pack)(arenas.sim)
     return replace(arenas, sim=packed), trajectory, _to_ended(*counts)
 

@@ -86,7 +86,12 @@ def _least(demand: Demand) -> tuple[float, float]:
 
 BAY = ArenaLayout(
     draw=draw,
-    uniforms=lambda robots, _: 2 + 4 * robots,
+    parts=lambda robots, _: (
+        ("wall", 2),
+        ("start", robots),
+        ("target", robots),
+        ("aside", 2 * robots),
+    ),
     walls=lambda _: 4,
     reads=("gap", "width", "length"),
     least=_least,

@@ -48,7 +48,7 @@ def _least(demand: Demand) -> tuple[float, float]:
 
 CIRCLE = ArenaLayout(
     draw=draw,
-    uniforms=lambda robots, _: 1,
+    parts=lambda robots, _: (("wall", 1),),
     walls=lambda _: 0,
     reads=("radius",),
     least=_least,

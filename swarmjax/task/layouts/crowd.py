@@ -51,7 +51,7 @@ def _least(demand: Demand) -> tuple[float, float]:
 
 CROWD = ArenaLayout(
     draw=draw,
-    uniforms=lambda robots, _: 4 + 2 * robots,
+    parts=lambda robots, _: (("area", 4), ("target", robots), ("start", robots)),
     walls=lambda _: 0,
     reads=("apart",),
     least=_least,

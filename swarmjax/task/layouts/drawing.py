@@ -6,14 +6,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from swarmjax.sim import noise
-from swarmjax.sim.noise import Stream
 from swarmjax.task.layouts import LAYOUTS
 from swarmjax.task.layouts.site import NUMBERS, Drawn, Numbers, Site, between, pick, rows, split
 from swarmjax.task.placement import clearance, gaps_of, metres, round_up
 
 Array = Any
 _TURNS = 8  # quarter turns, and their mirror images
+LENGTHS = 2 + len(NUMBERS)  # of a level: extents along x and y, and `NUMBERS`
 _BARS = 2  # walls that make an arena narrower than it is long
 
 
@@ -106,15 +105,25 @@ def _stack(kind: Kind, entries: Sequence[Entry | None]) -> LayoutArrays:
     return LayoutArrays(chosen=np.array([each is not None for each in mine]), **table)
 
 
+def uniform_count(kind: Kind, robots: int) -> int:
+    """How many uniform numbers an arena with room for so many robots takes."""
+    return before_own(robots) + LAYOUTS[kind.name].uniforms(robots, kind.cells)
+
+
+def before_own(robots: int) -> int:
+    """How many of them come before the layout's own: lengths, the turn and headings."""
+    return LENGTHS + 1 + robots
+
+
 def draw(
-    kind: Kind, of: LayoutArrays, seed: Array, present: Array, sizes: RobotSizes, xp: Any
+    kind: Kind, of: LayoutArrays, uniforms: Array, present: Array, sizes: RobotSizes, xp: Any
 ) -> LaidOut:
     """Lays an arena out.
 
     Args:
       kind: what is compiled in.
       of: its numbers, fields [...] of one stage.
-      seed: [] uint32 of the level; all that is random follows from it.
+      uniforms: [uniform_count(kind, R)] float32 in [0, 1), or more; all that is random follows.
       present: [R] whether the robot takes part.
       sizes: of robots and targets.
       xp: `numpy` or `jax.numpy`; both draw the same arena.
@@ -124,8 +133,7 @@ def draw(
     """
     layout, count = LAYOUTS[kind.name], present.shape[0]
     own = layout.uniforms(count, kind.cells)
-    uniforms = noise.uniform(seed, 0, Stream.LAYOUT, (2 + len(NUMBERS) + 1 + count + own,), xp)
-    lengths, turn, heading, rest = split(uniforms, [2 + len(NUMBERS), 1, count, own])
+    lengths, turn, heading, rest = split(uniforms, [LENGTHS, 1, count, own])
     side, breadth, numbers = _numbers(of, lengths, xp)
     half = xp.stack([side, breadth]) // 2
     site = Site(

@@ -97,7 +97,9 @@ class ArenaLayout(NamedTuple):
 
     Attributes:
       draw: from uniform numbers [K] in [0, 1), a site and the array module to what is drawn.
-      uniforms: how many numbers it takes for so many robots and cells.
+      parts: what the numbers place that it takes for so many robots and cells, and how many, in
+        their order: `wall`, `room`, `target` and `start` may move by themselves, the rest is `area`
+        (where the points of a lattice lie) and `aside` (from the middle of a way).
       walls: how many walls it may have, by the cells of a maze.
       reads: the `NUMBERS` of a stage that it is drawn with.
       least: the smallest side and breadth that it has room in, m, of a demand.
@@ -106,12 +108,16 @@ class ArenaLayout(NamedTuple):
     """
 
     draw: Callable[[Array, Site, Any], Drawn]
-    uniforms: Callable[[int, int], int]
+    parts: Callable[[int, int], Sequence[tuple[str, int]]]
     walls: Callable[[int], int]
     reads: tuple[str, ...]
     least: Callable[[Demand], tuple[float, float]]
     most_robots: int = 100
     square: bool = False
+
+    def uniforms(self, robots: int, cells: int) -> int:
+        """How many numbers it takes for so many robots and cells."""
+        return sum(count for _, count in self.parts(robots, cells))
 
 
 def pick(uniform: Array, low: Array, high: Array, xp: Any) -> Array:

@@ -78,7 +78,7 @@ def _least(demand: Demand) -> tuple[float, float]:
 
 TRAP = ArenaLayout(
     draw=draw,
-    uniforms=lambda robots, _: 6 + 2 * robots,
+    parts=lambda robots, _: (("wall", 2), ("area", 4), ("target", robots), ("start", robots)),
     walls=lambda _: 3,
     reads=("width", "depth"),
     least=_least,

@@ -1,0 +1,383 @@
+"""A buffer of levels: which of them are played again, and which make room for others.
+
+The curriculum's mode says on which stage an episode begins; the buffer says on which level of it.
+Each stage has an equal part of the buffer, so that no stage crowds another out and the share of the
+arenas on a stage stays its weight. A level is kept as the numbers that it is drawn from.
+
+- Prioritised level replay: Jiang et al. 2021, "Prioritized Level Replay", arXiv:2010.03934.
+- Learnability: Rutherford et al. 2024, "No Regrets: Investigating and Improving Regret
+  Approximations for Curriculum Discovery", arXiv:2408.15099.
+- Mutation: Parker-Holder et al. 2022, "Evolving Curricula with Regret-Based Environment Design"
+  (ACCEL), arXiv:2203.01302.
+
+Axes: S stages, C levels of each in the buffer, V numbers of a level, N episodes.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from swarmjax.curriculum.config import LevelsConfig
+
+# What an episode was begun on, where it is no level of the buffer: one just drawn, one just made
+# from a level of the buffer, or one that has since lost its place there.
+FRESH, MUTATED, LOST = -1, -2, -3
+
+# Of an empty place: below every score.
+_EMPTY = -1.0
+# Episodes that a level's success is remembered over. The policy changes meanwhile: this project's
+# choice.
+_MEMORY = 16.0
+# What is known of a level before its first episode: as much as of two that came out as those of
+# its stage do on the whole: this project's choice.
+_PRIOR_EPISODES = 2.0
+_LARGEST_STEP = 0.25  # of the range of a number, in a mutation: this project's choice
+_BELOW_ONE = np.float32(1.0 - 2.0**-24)  # the largest float32 below 1
+
+
+class LevelNumbers(NamedTuple):
+    """Numbers of the curriculum over levels, an argument of the compiled program.
+
+    Attributes:
+      replay: [] share of episodes that begin on a level of a full buffer.
+      mutation: [] share of those that begin on a mutated one instead.
+      temperature: [] of the ranks; the higher, the more evenly levels are played again.
+      staleness: [] share of the replay that goes to levels by how long they have not been played.
+      minimum_episodes: [] that a level has had before it is mutated, int32.
+      movable: [S, V] 1 for each number that a mutation may change, else 0; None without mutation.
+    """
+
+    replay: Array | np.float32
+    mutation: Array | np.float32
+    temperature: Array | np.float32
+    staleness: Array | np.float32
+    minimum_episodes: Array | np.int32
+    movable: Array | np.ndarray | None = None
+
+
+@struct.dataclass(kw_only=True)
+class LevelBuffer:
+    """Levels that are kept, [S, C, ...].
+
+    Attributes:
+      numbers: [.., V] that the level is drawn from, float32.
+      episodes: that have ended on it, at most `_MEMORY` remembered, float32; 0: the place is empty.
+      successes: of these, float32.
+      loss: positive value loss of the newest, float32.
+      score: the higher, the sooner the level is played again, float32.
+      begun: update in which one was last begun on it, int32.
+      generation: how many mutations it is away from one that was drawn, int32.
+      clock: [] updates so far, int32.
+    """
+
+    numbers: Array
+    episodes: Array
+    successes: Array
+    loss: Array
+    score: Array
+    begun: Array
+    generation: Array
+    clock: Array
+
+    @property
+    def held(self) -> Array:
+        """Whether there is a level in the place, [S, C]."""
+        return self.episodes > 0.0
+
+
+class Play(NamedTuple):
+    """Episodes of an update, [N].
+
+    Attributes:
+      slot: place in the buffer, counted through all stages, of the level it began on; or `FRESH`,
+        `MUTATED` or `LOST`.
+      stage: that the level is of.
+      begun: whether it began in this update.
+      ended: whether it ended in this update.
+      successes: how many trials succeeded, int32; 0 unless it ended.
+      trials: robots, or 1 where the episode counts as a whole, int32.
+      loss: positive value loss, mean over the transitions of all robots.
+      numbers: [.., V] that the level is drawn from.
+      generation: of the level.
+    """
+
+    slot: Array
+    stage: Array
+    begun: Array
+    ended: Array
+    successes: Array
+    trials: Array
+    loss: Array
+    numbers: Array
+    generation: Array
+
+
+def init(stages: int, size: int, numbers: int) -> LevelBuffer:
+    """Starts without a level.
+
+    Args:
+      stages: S.
+      size: places of all stages together, at least S; C is the whole part of size / S.
+      numbers: V.
+
+    Returns:
+      An empty buffer.
+    """
+    shape = (stages, size // stages)
+    zero, none = jnp.zeros(shape, jnp.float32), jnp.zeros(shape, jnp.int32)
+    return LevelBuffer(
+        numbers=jnp.zeros((*shape, numbers), jnp.float32),
+        episodes=zero,
+        successes=zero,
+        loss=zero,
+        score=jnp.full(shape, _EMPTY, jnp.float32),
+        begun=none,
+        generation=none,
+        clock=jnp.zeros((), jnp.int32),
+    )
+
+
+def probabilities(buffer: LevelBuffer, options: LevelNumbers) -> Array:
+    """Says how likely each level is, if one of its stage is played again.
+
+    (1 - rho) P_score + rho P_stale, with P_score proportional to rank^(-1 / temperature) and
+    P_stale to the updates since the level was last begun (Jiang et al. 2021, equations 2 to 5).
+
+    Args:
+      buffer: of levels.
+      options: `temperature` and `staleness` (rho).
+
+    Returns:
+      [S, C], 0 where there is no level; each stage that has one sums to 1.
+    """
+    order = jnp.argsort(-buffer.score, axis=1, stable=True)
+    rank = jnp.argsort(order, axis=1, stable=True) + 1
+    weight = jnp.exp(-jnp.log(rank.astype(jnp.float32)) / options.temperature)
+    by_score = _normal(jnp.where(buffer.held, weight, 0.0))
+    age = jnp.where(buffer.held, buffer.clock - buffer.begun, 0).astype(jnp.float32)
+    by_age = jnp.where(jnp.any(age > 0.0, axis=1, keepdims=True), _normal(age), by_score)
+    return (1.0 - options.staleness) * by_score + options.staleness * by_age
+
+
+def _normal(weight: Array) -> Array:
+    """Divides weights [S, C] by the sum of each stage, where there is one."""
+    total = jnp.sum(weight, axis=1, keepdims=True)
+    return weight / jnp.where(total > 0.0, total, 1.0)
+
+
+def choose(buffer: LevelBuffer, options: LevelNumbers, stage: Array, picks: Array) -> Array:
+    """Chooses which level each episode begins on.
+
+    The share that is played again grows with the part of the stage's places that are taken, so
+    that the first levels are not played over and over.
+
+    Args:
+      buffer: of levels.
+      options: the curriculum's numbers.
+      stage: [N] of the episodes.
+      picks: [N, 2] uniform numbers in [0, 1).
+
+    Returns:
+      [N] place in the buffer, counted through all stages; `FRESH` for a level yet to be drawn.
+    """
+    stages, places = buffer.score.shape
+    held = buffer.held
+    share = options.replay * jnp.mean(held.astype(jnp.float32), axis=1)
+    ends = jnp.cumsum(probabilities(buffer, options), axis=1)
+    ends = ends / jnp.maximum(ends[:, -1:], np.finfo(np.float32).tiny)
+    # All stages on one line, each from its own number on: one search for whatever stage.
+    line = (ends + jnp.arange(stages)[:, None]).ravel()
+    found = jnp.searchsorted(line, stage + picks[:, 1], side="right")
+    # Rounding may lead beyond a stage's last level, or to the end of the stage before.
+    last = jnp.max(jnp.where(held, jnp.arange(places), 0), axis=1)
+    found = jnp.clip(found, stage * places, stage * places + last[stage])
+    return jnp.where(picks[:, 0] < share[stage], found, FRESH).astype(jnp.int32)
+
+
+def update(
+    buffer: LevelBuffer, plays: Play, config: LevelsConfig, usual: Array
+) -> tuple[LevelBuffer, Array]:
+    """Takes the episodes of an update in: levels are scored anew, and the best that are new enter.
+
+    Args:
+      buffer: before.
+      plays: [N] of all arenas, those of all devices among them.
+      config: says what a score is.
+      usual: [S] success that episodes of a stage have on the whole, 0 to 1.
+
+    Returns:
+      The buffer after, and [S C] which places have another level than before.
+    """
+    buffer = _score(_record(buffer, plays), config, usual)
+    buffer, taken = _admit(buffer, plays, config, usual)
+    return replace(buffer, clock=buffer.clock + 1), taken
+
+
+def mark_lost(slot: Array, taken: Array) -> Array:
+    """Marks the places [...] that have another level by now, of those that episodes began on."""
+    gone = (slot >= 0) & taken[jnp.maximum(slot, 0)]
+    return jnp.where(gone, LOST, slot)
+
+
+def _record(buffer: LevelBuffer, plays: Play) -> LevelBuffer:
+    """Adds what episodes on levels of the buffer came to."""
+    count = buffer.score.size
+
+    def total(value: Array, mine: Array) -> Array:
+        at = jnp.where(mine & (plays.slot >= 0), plays.slot, count)
+        blank = jnp.zeros(count, value.dtype)
+        return blank.at[at].add(value, mode="drop").reshape(buffer.score.shape)
+
+    one = jnp.ones_like(plays.slot)
+    new, begun = total(one, plays.ended), total(one, plays.begun)
+    # Whole numbers first: they add up to the same in any order.
+    successes, trials = (total(x, plays.ended) for x in (plays.successes, plays.trials))
+    episodes = buffer.episodes + new
+    successes = buffer.successes + new * (successes / jnp.maximum(trials, 1))
+    kept = jnp.minimum(1.0, _MEMORY / jnp.maximum(episodes, 1.0))
+    loss = total(plays.loss, plays.ended) / jnp.maximum(new, 1)
+    return replace(
+        buffer,
+        episodes=kept * episodes,
+        successes=kept * successes,
+        loss=jnp.where(new > 0, loss, buffer.loss),
+        begun=jnp.where(begun > 0, buffer.clock, buffer.begun),
+    )
+
+
+def _score(buffer: LevelBuffer, config: LevelsConfig, usual: Array) -> LevelBuffer:
+    """Scores all levels anew."""
+    found = _SCORES[_mode(config)](
+        buffer.episodes, buffer.successes, buffer.loss, jnp.asarray(usual)[:, None]
+    )
+    return replace(buffer, score=jnp.where(buffer.held, found, _EMPTY))
+
+
+def _mode(config: LevelsConfig) -> str:
+    assert config.mode in _SCORES, config.mode  # there is no buffer in the others
+    return config.mode
+
+
+def _learnability(episodes: Array, successes: Array, loss: Array, usual: Array) -> Array:
+    """Returns p (1 - p), as expected of a level of which no more is known than its episodes.
+
+    With p of a beta distribution of parameters a and b that is a b / ((a + b) (a + b + 1)). It
+    grows with what is known: one episode says too little to displace a level of p near 1/2.
+    """
+    a = successes + _PRIOR_EPISODES * usual
+    b = episodes - successes + _PRIOR_EPISODES * (1.0 - usual)
+    return a * b / ((a + b) * (a + b + 1.0))
+
+
+def _value_loss(episodes: Array, successes: Array, loss: Array, usual: Array) -> Array:
+    """Returns the newest positive value loss (Jiang et al. 2021, "Replay-Guided ...", eq. 3)."""
+    return jnp.broadcast_to(loss, episodes.shape)
+
+
+_SCORES: dict[str, Callable[[Array, Array, Array, Array], Array]] = {
+    "learnability": _learnability,
+    "value_loss": _value_loss,
+}
+
+
+def _admit(
+    buffer: LevelBuffer, plays: Play, config: LevelsConfig, usual: Array
+) -> tuple[LevelBuffer, Array]:
+    """Puts new levels in the place of those that score less: the best in place of the worst."""
+    stages, places = buffer.score.shape
+    new = plays.ended & ((plays.slot == FRESH) | (plays.slot == MUTATED))
+    share = plays.successes / jnp.maximum(plays.trials, 1)
+    one = jnp.ones_like(share)
+    score = _SCORES[_mode(config)](one, share, plays.loss, jnp.asarray(usual)[plays.stage])
+    stage = jnp.where(new, plays.stage, stages)
+    order = jnp.lexsort((-score, stage))
+    first = jnp.searchsorted(stage[order], jnp.arange(stages + 1))
+    sorted_stage = stage[order]
+    rank = jnp.arange(len(order)) - first[sorted_stage]
+    worst = jnp.argsort(buffer.score, axis=1, stable=True)
+    at = jnp.minimum(sorted_stage, stages - 1)
+    place = worst[at, jnp.minimum(rank, places - 1)]
+    enters = (sorted_stage < stages) & (rank < places) & (score[order] > buffer.score[at, place])
+    slot = jnp.where(enters, at * places + place, stages * places)
+    taken = jnp.zeros(stages * places, bool).at[slot].set(True, mode="drop")
+    entries = {
+        "numbers": plays.numbers,
+        "episodes": one,
+        "successes": share,
+        "loss": plays.loss,
+        "score": score,
+        "begun": jnp.broadcast_to(buffer.clock, plays.slot.shape),
+        "generation": plays.generation,
+    }
+
+    def put(name: str, values: Array) -> Array:
+        old = getattr(buffer, name)
+        flat = old.reshape(stages * places, *old.shape[2:])
+        return flat.at[slot].set(values[order], mode="drop").reshape(old.shape)
+
+    return replace(buffer, **{name: put(name, each) for name, each in entries.items()}), taken
+
+
+def describe(buffer: LevelBuffer, plays: Play) -> dict[str, Any]:
+    """Says what is practised, by stage.
+
+    Args:
+      buffer: after `update`.
+      plays: [N] of the update.
+
+    Returns:
+      [S] each: `levels_fresh`, `levels_replayed` and `levels_mutated`, episodes that ended by what
+      they began on; `levels_held`, levels in the buffer; their mean `levels_success`,
+      `levels_score` and `levels_generation`, nan where there is none.
+    """
+    stages, held = buffer.score.shape[0], buffer.held
+    mine = plays.stage == jnp.arange(stages)[:, None]
+    kinds = {
+        "fresh": plays.slot == FRESH,
+        "replayed": (plays.slot >= 0) | (plays.slot == LOST),
+        "mutated": plays.slot == MUTATED,
+    }
+    ended = {
+        f"levels_{kind}": jnp.sum(mine & plays.ended & found, axis=1, dtype=jnp.int32)
+        for kind, found in kinds.items()
+    }
+
+    def mean(values: Array) -> Array:
+        return jnp.mean(values.astype(jnp.float32), axis=1, where=held)
+
+    return ended | {
+        "levels_held": jnp.sum(held, axis=1, dtype=jnp.int32),
+        "levels_success": mean(buffer.successes / jnp.maximum(buffer.episodes, 1.0)),
+        "levels_score": mean(buffer.score),
+        "levels_generation": mean(buffer.generation),
+    }
+
+
+def mutate(numbers: Array, movable: Array, picks: Array) -> Array:
+    """Moves one thing of a level: changes one of its numbers by a quarter of its range at most.
+
+    Args:
+      numbers: [V] that the level is drawn from.
+      movable: [V] 1 for each that may be changed, else 0.
+      picks: [2] uniform numbers in [0, 1).
+
+    Returns:
+      [V] numbers in [0, 1) of the mutated level, which is drawn by the same rules as any other.
+    """
+    ends = jnp.cumsum(movable)
+    chosen = jnp.searchsorted(ends, picks[0] * ends[-1], side="right")
+    moved = numbers + (picks[1] - 0.5) * np.float32(2.0 * _LARGEST_STEP)
+    inside = jnp.where(moved < 0.0, -moved, jnp.where(moved >= 1.0, 2.0 - moved, moved))
+    inside = jnp.minimum(inside, _BELOW_ONE)
+    return jnp.where(jnp.arange(numbers.shape[0]) == chosen, inside, numbers)
+
+
+def split_picks(key: Array, shape: tuple[int, ...]) -> Array:
+    """Draws the uniform numbers [*shape, 5] of `choose`, of whether to mutate, and of `mutate`."""
+    return jax.random.uniform(key, (*shape, 5))
