@@ -205,31 +205,38 @@ def _readings(arms: tuple[str, ...], test: Test, *sources: tuple[str, Values]) -
     return tuple(Reading(name=name, arms=arms, values=v, test=test) for name, v in sources)
 
 
-def _steady(stage: str | None, *axes: Axis) -> tuple[tuple[str, Values], ...]:
-    """Where success becomes steady, by either reading of success."""
-    units = {"episode": "episode number", "steps": "arena steps"}
+def steady(stage: str | None, axis: Axis) -> list[tuple[str, str, Values]]:
+    """Where success becomes steady, by either reading of success.
+
+    Args:
+      stage: whose episodes alone are looked at; None for all.
+      axis: in which it is told.
+
+    Returns:
+      Of each reading the goal, what is counted, and the places of an arm by seed.
+    """
     which = "all episodes" if stage is None else f"episodes on {stage}"
-    return tuple(
-        (
-            f"{name}, {which}, {units[axis]}",
-            partial(measures.steady_at, success=success, axis=axis, stage=stage),
-        )
-        for name, success in measures.SUCCESS.items()
-        for axis in axes
-    )
+    counted = f"{which}, {measures.UNITS[axis]}"
+    return [
+        (goal, counted, partial(measures.steady_at, success=success, axis=axis, stage=stage))
+        for goal, success in measures.SUCCESS.items()
+    ]
+
+
+def _steady(stage: str | None, axis: Axis) -> list[tuple[str, Values]]:
+    return [(f"{goal}, {counted}", values) for goal, counted, values in steady(stage, axis)]
 
 
 def _rewarded() -> tuple[tuple[str, Values], ...]:
     """Where the reward on the last stage is near its best, of robot 1 and of the swarm."""
     kinds = {"robot 1": measures.first_reward, "mean of the robots": measures.mean_reward}
-    units: dict[Axis, str] = {"episode": "episode number", "steps": "arena steps"}
     return tuple(
         (
             f"{name}, {unit}",
             partial(measures.reward_reached, of=of, axis=axis, rivals=_PAIR, stage=LAST),
         )
         for name, of in kinds.items()
-        for axis, unit in units.items()
+        for axis, unit in measures.UNITS.items()
     )
 
 

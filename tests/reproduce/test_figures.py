@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from reproductions import log, reproduction, whole
 
+from swarmjax.pages import figures as drawing
 from swarmjax.reproduce import figures, measures
 from swarmjax.reproduce import rows as reproduce_rows
 from swarmjax.reproduce.raster import columns, raster
@@ -122,7 +123,7 @@ def test_arms_keep_their_colours_in_the_file() -> None:
         share = 0.97 if "curriculum" in arm else 0.2 * i
         logs[arm] = [log(random.random(400) < share, stage=stage) for _ in range(3)]
     [plot] = [plot for plot in figures.PLOTS if plot.name == "modern_curves"]
-    png = figures.png(plot.make(reproduction(logs), arms))
+    png = drawing.png(plot.make(reproduction(logs), arms), figures.SHADES)
     image = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), float).reshape(-1, 3)
     for arm in arms:
         colour = 255 * np.array(to_rgb(figures.COLOURS[arm]))
