@@ -42,9 +42,8 @@ def write(run: Path, out: Path, made_by: str, *, send: bool = False) -> list[Pat
     """
     history = rows.read(run)
     loggers = report_send.of_run(run, history) if send else []
-    from swarmjax.report import (
-        figures as report_figures,
-    )  # Matplotlib takes a second, which no refusal should
+    # Matplotlib takes a second, which no refusal should.
+    from swarmjax.report import figures as report_figures
 
     figures = report_figures.draw(history)
     page = report_page.page(f"Report of {run}", made_by, history, figures)

@@ -6,7 +6,6 @@ colour in science communication"): cividis and viridis rise evenly in lightness.
 
 import math
 from collections.abc import Mapping
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -98,8 +97,7 @@ def _of_stages(history: History, title: str, values: np.ndarray) -> Figure:
 
 def mix(history: History, size: tuple[float, float] = (drawing.WIDTH, 4.2)) -> Figure:
     """Draws on which stages the arenas were, stacked, as the mean over seeds; `size` in inches."""
-    shares = history.mix.mean(axis=0)
-    steps, bands = _stretches(history.arena_steps, shares)
+    steps, bands = _stretched(history.arena_steps, history.mix.mean(axis=0).T)
     names = history.names
     colours = colormaps["viridis"](np.linspace(0.0, 1.0, len(names)))
     figure = Figure(figsize=size, layout="constrained")
@@ -107,7 +105,7 @@ def mix(history: History, size: tuple[float, float] = (drawing.WIDTH, 4.2)) -> F
     # What an update was trained on holds from the end of the one before.
     axes.stackplot(
         np.concatenate([[0], steps]),
-        np.concatenate([bands[:1], bands]).T,
+        np.concatenate([bands[:, :1], bands], axis=1),
         colors=colours,
         step="pre",
         linewidth=0,
@@ -228,15 +226,8 @@ def _at(updates: int, points: int) -> np.ndarray:
     return np.unique(np.linspace(updates - 1, 0, points).round().astype(int))
 
 
-def _stretches(steps: np.ndarray, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means of shares [T, S] over stretches of updates, and the steps at which each ends."""
-    ends = _at(len(steps), _STRETCHES) + 1
-    means = [shares[low:high].mean(axis=0) for low, high in pairwise([0, *ends])]
-    return steps[ends - 1], np.array(means)
-
-
 def _stretched(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means of values [N, T] over stretches of updates, and the steps at which each ends.
+    """Means of values [N or S, T] over stretches of updates, and the steps at which each ends.
 
     What was not measured counts for nothing; a stretch in which nothing was is nan.
     """

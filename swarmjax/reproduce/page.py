@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,15 +13,13 @@ from swarmjax.reproduce import claims, measures
 from swarmjax.reproduce import rows as reproduce_rows
 from swarmjax.reproduce.claims import ClaimVerdict
 from swarmjax.reproduce.measures import NUMBER, PLACE, SHARE, Unit
-from swarmjax.reproduce.rows import ARMS, EXPANDED, LAST, Reproduction
+from swarmjax.reproduce.rows import ARMS, EXPANDED, LAST, MODERN, PAIR, Reproduction
 from swarmjax.run.settings import leaves
 
-if TYPE_CHECKING:
-    from swarmjax.reproduce.figures import Plot
-
 PAGE, VERDICTS, FIGURES = "report.html", "verdicts.md", "figures"
-_PAIR = ("curriculum", "baseline")
-_STEADY_ARMS = (*_PAIR, "modern_curriculum", "modern_baseline")
+# Both readings of success, over all episodes and over those on the last stage.
+_CASES = (*claims.steady(None, "episode"), *claims.steady(LAST, "steps"))
+_OUTCOMES = ("reproduced", "not reproduced", "undecidable")
 _MET = {True: "met", False: "not met", None: "open"}
 # Of the settings, what names files here or says how the work was cut up.
 _UNSAID = ("out", "resume", "minutes")
@@ -47,36 +45,27 @@ def write(out: Path) -> Path:
       ConfigError: If what a figure shows is missing or damaged, or nothing can be written.
     """
     data = reproduce_rows.read(out)
-    from swarmjax.reproduce import (
-        figures as reproduce_figures,
-    )  # Matplotlib takes a second, which no refusal should
+    # Matplotlib takes a second, which no refusal should.
+    from swarmjax.reproduce import figures as reproduce_figures
 
     figures = reproduce_figures.draw(data)
     verdicts = claims.judge(data)
+    lacks = {name: data.lacking(plot.arms) for name, plot in reproduce_figures.PLOTS.items()}
     files = {f"{FIGURES}/{name}.png": png for name, png in figures.items()}
     files[VERDICTS] = claims.markdown(verdicts).encode()
-    files[PAGE] = page(data, verdicts, reproduce_figures.PLOTS, figures).encode()
+    files[PAGE] = _page(data, verdicts, figures, lacks).encode()
     return builder.write(out, files)[-1]
 
 
-def page(
+def _page(
     data: Reproduction,
     verdicts: Sequence[ClaimVerdict],
-    plots: "Sequence[Plot]",
     figures: Mapping[str, bytes],
+    lacks: Mapping[str, Sequence[str]],
 ) -> str:
-    """Lays the page out.
-
-    Args:
-      data: of the reproduction.
-      verdicts: on the paper's claims.
-      plots: in the order of the page.
-      figures: PNG files of those of them that could be drawn, by name.
-
-    Returns:
-      HTML in which everything that was read is escaped.
-    """
+    """Lays the page out, with PNG files by name, and the arms that each figure lacks."""
     places = _places(data)
+    outcomes = [each.outcome for each in verdicts]
     return builder.render(
         "reproduce/reproduce.html",
         styles=(builder.STYLE, "reproduce/reproduce.css"),
@@ -87,8 +76,11 @@ def page(
         lacking=data.lacking(list(ARMS)),
         arms=_arms(data),
         verdicts=verdicts,
+        counts=", ".join(f"{outcomes.count(name)} {name}" for name in _OUTCOMES),
         held=claims.HELD,
-        plots={plot.name: _shown(data, plot, figures) for plot in plots},
+        stages=(LAST, EXPANDED),
+        figures=figures,
+        lacks=lacks,
         final_heads=("arm", "on", *(label for label, _ in _COLUMNS.values())),
         final=_final(data),
         window=measures.WINDOW,
@@ -96,7 +88,7 @@ def page(
         kept_share=100 * measures.KEPT,
         steady=[(*case, *_summary(found)) for *case, found in places],
         each_seed=[(*case, *map(PLACE.value, found)) for *case, found in places],
-        compared=[] if data.lacking(_PAIR) else _compared(data),
+        compared=[] if data.lacking(PAIR) else _compared(data),
         expanded=_expanded(data),
         goals=[(goal.reading, goal.text, _MET[goal.holds]) for goal in claims.goals(data)],
     )
@@ -157,15 +149,6 @@ def _seconds(value: float | None) -> str:
     return "unknown" if value is None else f"{value:,.0f} s"
 
 
-def _shown(data: Reproduction, plot: "Plot", figures: Mapping[str, bytes]) -> dict[str, Any]:
-    """A figure with its caption; or why there is none; and which arms it lacks."""
-    missing = data.lacking(plot.arms)
-    lacks = f"Lacks {' and '.join(missing)}, not trained to the end." if missing else ""
-    png = figures.get(plot.name)
-    caption = f"Not drawn: {plot.caption.partition(':')[0]}." if png is None else plot.caption
-    return {"caption": f"{caption} {lacks}".strip(), "png": png}
-
-
 def _final(data: Reproduction) -> list[tuple[str, ...]]:
     """Tables what final policies came to, each arm on each stage."""
     return [
@@ -183,15 +166,10 @@ def _mean(values: np.ndarray, unit: Unit) -> str:
     return unit.interval(statistics.bootstrap(values[:, None], iqm))
 
 
-def _cases() -> list[tuple[str, str, claims.Values]]:
-    """Both readings of success, over all episodes and over those on the last stage."""
-    return [*claims.steady(None, "episode"), *claims.steady(LAST, "steps")]
-
-
 def _places(data: Reproduction) -> list[tuple[str, str, str, np.ndarray]]:
     """Goal, axis and arm, and where each seed [N] of it becomes steady."""
-    arms = [arm for arm in _STEADY_ARMS if arm in data.logs]
-    return [(*case, arm, values(data, arm)) for *case, values in _cases() for arm in arms]
+    arms = [arm for arm in (*PAIR, *MODERN) if arm in data.logs]
+    return [(goal, of, arm, values(data, arm)) for goal, of, values in _CASES for arm in arms]
 
 
 def _summary(places: np.ndarray) -> tuple[str, str, str]:
@@ -208,8 +186,8 @@ def _summary(places: np.ndarray) -> tuple[str, str, str]:
 def _compared(data: Reproduction) -> list[tuple[str, ...]]:
     """Tables how much earlier the curriculum is steady, seeds paired, and how likely unpaired."""
     rows = []
-    for goal, counted, values in _cases():
-        ours, theirs = (values(data, arm)[:, None] for arm in _PAIR)
+    for goal, counted, values in _CASES:
+        ours, theirs = (values(data, arm)[:, None] for arm in PAIR)
         paired = "a seed never gets there"
         if np.isfinite([ours, theirs]).all():
             paired = PLACE.difference(statistics.paired(theirs, ours, iqm))
@@ -225,6 +203,6 @@ def _expanded(data: Reproduction) -> list[tuple[str, ...]]:
     return [
         (kind, arm, *(_mean(data.judged[f"{arm}{suffix}", EXPANDED][key], SHARE) for key in shares))
         for kind, suffix in kinds
-        for arm in _PAIR
+        for arm in PAIR
         if f"{arm}{suffix}" in data.logs
     ]
