@@ -12,9 +12,7 @@ from sentences import refusal
 import swarmjax
 from swarmjax.pages import builder
 
-HOSTILE = (
-    "</style></script><script>alert(1)</script><img src=x onerror=alert(1)>&amp;{{ 7 * 7 }}"
-)
+HOSTILE = "</style></script><script>alert(1)</script><img src=x onerror=alert(1)>&amp;{{ 7 * 7 }}"
 TEMPLATES = sorted(Path(swarmjax.__file__).parent.glob("*/templates/*.html"))
 RUNS = {"title": "a title", "heads": ["a"], "rows": [], "note": "a note", "command": "make it"}
 
