@@ -95,8 +95,8 @@ def _read_rows(run: Path, stages: int) -> list[Row]:
     """Reads the metrics of a run, with all that its lines take of them."""
     found = []
     for where, row in report_rows.read_lines(run, METRICS):
-        report_rows.check_whole(row, ("seed", "arena_steps", "broken_arenas"), where)
-        report_rows.check_numbers(row, ("train_s",), where)
+        report_rows.check(row, ("seed", "arena_steps", "broken_arenas"), report_rows.WHOLE, where)
+        report_rows.check(row, ("train_s",), report_rows.NUMBER_OR_NULL, where)
         success = row.get("success_by_stage")
         report_rows.per_stage(success, stages, f"{where} has success_by_stage")
         found.append(row)

@@ -21,12 +21,13 @@ ROOMS = {
     "run": SHARED | {"sim", "task", "ppo", "curriculum", "training"},
     "evaluate": SHARED | {"sim", "task"},
     "export": SHARED | {"sim", "run"},
-    "replay": SHARED | {"sim", "task", "evaluate", "export"},
-    "report": SHARED | {"task", "run", "evaluate"},
+    "pages": {"config"},
+    "replay": SHARED | {"sim", "task", "evaluate", "export", "pages"},
+    "report": SHARED | {"task", "run", "evaluate", "pages"},
     "adapters": {"environment"},
-    "reproduce": SHARED | {"sim", "task", "run", "evaluate", "report"},
+    "reproduce": SHARED | {"sim", "task", "run", "evaluate", "pages", "report"},
     "shell": SHARED,
-    "watch": SHARED | {"task", "run", "evaluate", "report", "replay"},
+    "watch": SHARED | {"task", "run", "evaluate", "pages", "report", "replay"},
 }
 # The engine on the device judges by what trains; the cache of its programs is a run's.
 ALSO = {

@@ -1,21 +1,17 @@
 """The page of a replay: one HTML file that needs nothing else and asks for nothing else."""
 
-import base64
-import hashlib
 from collections.abc import Sequence
-from html import escape
-from importlib import resources
-from string import Template
 
 from swarmjax import epuck, provenance
 from swarmjax.config import files
+from swarmjax.pages import builder
 from swarmjax.policy import Policy
 from swarmjax.replay import pack
 from swarmjax.replay.config import ReplayConfig
 from swarmjax.replay.record import ReplayEpisode
 from swarmjax.sim import gaps
 
-_SCRIPTS = ("replay_data.js", "replay_draw.js", "replay.js")
+_SCRIPTS = ("replay/replay_data.js", "replay/replay_draw.js", "replay/replay.js")
 
 
 def page(
@@ -55,9 +51,6 @@ def page(
 def fill(title: str, packed: bytes) -> str:
     """Puts title and data into the template.
 
-    A policy of what the page may load or run stands in it: nothing but its own style and script,
-    by their digests.
-
     Args:
         title: Of the page.
         packed: What `pack.pack` returned.
@@ -65,31 +58,14 @@ def fill(title: str, packed: bytes) -> str:
     Returns:
         HTML.
     """
-    files = resources.files("swarmjax.replay") / "templates"
-    style = (files / "replay.css").read_text(encoding="utf-8")
-    script = "\n".join((files / name).read_text(encoding="utf-8") for name in _SCRIPTS)
-    script = f'(() => {{\n"use strict";\n{script}}})();\n'
-    allowed = f"default-src 'none'; img-src data:; style-src {source_hash(style)}; "
-    return Template((files / "replay.html").read_text(encoding="utf-8")).substitute(
-        title=escape(title),
-        policy=f"{allowed}script-src {source_hash(script)}; base-uri 'none'; form-action 'none'",
-        style=style,
-        script=script,
-        data=base64.b64encode(packed).decode("ascii"),
+    script = "\n".join(map(builder.read, _SCRIPTS))
+    return builder.render(
+        "replay/replay.html",
+        styles=("replay/replay.css",),
+        script=f'(() => {{\n"use strict";\n{script}}})();\n',
+        title=title,
+        packed=packed,
     )
-
-
-def source_hash(text: str) -> str:
-    """Names a style or a script in a page's policy of what it may load or run.
-
-    Args:
-        text: all of it.
-
-    Returns:
-        A hash source (W3C, Content Security Policy Level 3, 2.3.1).
-    """
-    digest = hashlib.sha256(text.encode()).digest()
-    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 
 
 def _levels(settings: ReplayConfig) -> str:

@@ -11,11 +11,12 @@ Of several it prints a table: see `table`. With `out` it writes it there too, as
 import json
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from swarmjax import command, words
-from swarmjax.config import ConfigError, files
+from swarmjax.config import files
+from swarmjax.pages import builder
 from swarmjax.report import page as report_page
 from swarmjax.report import rows, table
 from swarmjax.report import send as report_send
@@ -41,13 +42,12 @@ def write(run: Path, out: Path, made_by: str, *, send: bool = False) -> list[Pat
     """
     history = rows.read(run)
     loggers = report_send.of_run(run, history) if send else []
-    from swarmjax.report import (
-        figures as report_figures,
-    )  # Matplotlib takes a second, which no refusal should
+    # Matplotlib takes a second, which no refusal should.
+    from swarmjax.report import figures as report_figures
 
     figures = report_figures.draw(history)
     page = report_page.page(f"Report of {run}", made_by, history, figures)
-    written = _write(
+    written = builder.write(
         out, {f"{name}.png": png for name, png in figures.items()} | {PAGE: page.encode()}
     )
     report_send.send(history, [*written, *sorted(run.glob("*.html"))], loggers)
@@ -70,17 +70,7 @@ def write_table(lines: Sequence[table.TableLine], out: Path, made_by: str) -> li
     """
     page = report_page.table_page("Runs", made_by, lines)
     found = json.dumps(table.plain(lines), indent=2) + "\n"
-    return _write(out, {TABLE: found.encode(), PAGE: page.encode()})
-
-
-def _write(out: Path, contents: Mapping[str, bytes]) -> list[Path]:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for name, content in contents.items():
-            (out / name).write_bytes(content)
-    except OSError as error:
-        raise ConfigError(f"out is {out}, which cannot be written: {error.strerror}.") from None
-    return [out / name for name in contents]
+    return builder.write(out, {TABLE: found.encode(), PAGE: page.encode()})
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -4,10 +4,8 @@ Shares are drawn on a scale that is read without colours too (Crameri et al. 202
 colour in science communication"): cividis and viridis rise evenly in lightness.
 """
 
-import io
 import math
 from collections.abc import Mapping
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,13 +15,13 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
+from matplotlib.ticker import MaxNLocator
 
+from swarmjax.pages import figures as drawing
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History
 from swarmjax.task.stage_config import StageConfig
 
-_DOTS = 110  # an inch
 _POINTS, _STRETCHES = 600, 200  # of a curve and of a band: about what the dots can show
 _NAMED = 24  # stages named along a strip of colours; more would touch
 SMALL = (5.4, 3.2)  # inches
@@ -52,15 +50,8 @@ def draw(history: History) -> dict[str, bytes]:
     for name, make in makers.items():
         figure = make(history)
         if figure is not None:
-            files[name] = png(figure)
+            files[name] = drawing.png(figure)
     return files
-
-
-def png(figure: Figure) -> bytes:
-    """Makes a PNG file of a figure, without Matplotlib's version."""
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=_DOTS, metadata={"Software": None})
-    return content.getvalue()
 
 
 def by_stage(history: History) -> dict[str, Figure]:
@@ -93,10 +84,10 @@ def _of_stages(history: History, title: str, values: np.ndarray) -> Figure:
     axes.set(xlim=(0, steps[-1]), xlabel=_STEPS)
     axes.set_title(title, loc="left", fontsize=10, pad=3)
     axes.grid(visible=True, alpha=0.25)
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.xaxis.set_major_formatter(drawing.thousands())
     if values is history.success:
         axes.set_ylim(0, 1.02)
-        axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+        axes.yaxis.set_major_formatter(drawing.percent())
     if np.isnan(mean).all():
         axes.text(0.5, 0.5, "not measured yet", transform=axes.transAxes, ha="center")
     if len(history.names) > 1:
@@ -104,10 +95,9 @@ def _of_stages(history: History, title: str, values: np.ndarray) -> Figure:
     return figure
 
 
-def mix(history: History, size: tuple[float, float] = (8.6, 4.2)) -> Figure:
+def mix(history: History, size: tuple[float, float] = (drawing.WIDTH, 4.2)) -> Figure:
     """Draws on which stages the arenas were, stacked, as the mean over seeds; `size` in inches."""
-    shares = history.mix.mean(axis=0)
-    steps, bands = _stretches(history.arena_steps, shares)
+    steps, bands = _stretched(history.arena_steps, history.mix.mean(axis=0).T)
     names = history.names
     colours = colormaps["viridis"](np.linspace(0.0, 1.0, len(names)))
     figure = Figure(figsize=size, layout="constrained")
@@ -115,7 +105,7 @@ def mix(history: History, size: tuple[float, float] = (8.6, 4.2)) -> Figure:
     # What an update was trained on holds from the end of the one before.
     axes.stackplot(
         np.concatenate([[0], steps]),
-        np.concatenate([bands[:1], bands]).T,
+        np.concatenate([bands[:, :1], bands], axis=1),
         colors=colours,
         step="pre",
         linewidth=0,
@@ -124,8 +114,8 @@ def mix(history: History, size: tuple[float, float] = (8.6, 4.2)) -> Figure:
     axes.set(xlim=(0, steps[-1]), ylim=(0, 1), xlabel=_STEPS)
     seeds = len(history.seeds)
     axes.set_ylabel("share of the arenas" + (f", mean of {seeds} seeds" if seeds > 1 else ""))
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+    axes.xaxis.set_major_formatter(drawing.thousands())
+    axes.yaxis.set_major_formatter(drawing.percent())
     _name_colours(figure, axes, names)
     return figure
 
@@ -135,7 +125,7 @@ def success(history: History) -> Figure:
     stages = len(history.names)
     columns = min(stages, 3 if stages <= report_rows.MANY else 6 if stages <= 30 else 8)
     rows = math.ceil(stages / columns)
-    figure = Figure(figsize=(max(8.6, 1.4 * columns), max(1.2 + 1.6 * rows, 4.2)))
+    figure = Figure(figsize=(max(drawing.WIDTH, 1.4 * columns), max(1.2 + 1.6 * rows, 4.2)))
     figure.set_layout_engine("constrained")
     panels = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
     at = _at(len(history.updates), _POINTS)
@@ -162,7 +152,7 @@ def curves(history: History) -> Figure | None:
     """
     if all(np.isnan(values).all() for values in history.curves.values()):
         return None
-    figure = Figure(figsize=(8.6, 5.2), layout="constrained")
+    figure = Figure(figsize=(drawing.WIDTH, 5.2), layout="constrained")
     panels = list(figure.subplots(2, 3, sharex=True).flat)
     for panel, (key, title) in zip(panels, _CURVES.items(), strict=False):
         steps, seeds = _stretched(history.arena_steps, history.curves[key])
@@ -177,11 +167,9 @@ def curves(history: History) -> Figure | None:
     panels[2].tick_params(labelbottom=True)  # below it there is none
     panels[0].set_xlim(0, history.arena_steps[-1])
     panels[0].xaxis.set_major_locator(MaxNLocator(4))
-    panels[0].xaxis.set_major_formatter(EngFormatter(sep=""))
+    panels[0].xaxis.set_major_formatter(drawing.thousands())
     figure.supxlabel(_STEPS, fontsize=10)
-    figure.legend(
-        handles=_seed_lines(history), loc="outside upper right", ncols=2, fontsize=8, frameon=False
-    )
+    drawing.explain(figure, _seed_lines(history), 2)
     return figure
 
 
@@ -215,7 +203,7 @@ def grid(history: History) -> Figure | None:
     figure.supxlabel("side of the arena (m)", fontsize=10)
     figure.supylabel("robots", fontsize=10)
     scale = ScalarMappable(Normalize(0.0, 1.0), "cividis")
-    bar = figure.colorbar(scale, ax=panels, format=PercentFormatter(1.0, symbol=" %"))
+    bar = figure.colorbar(scale, ax=panels, format=drawing.percent())
     bar.set_label(f"{report_rows.measure(history)}, at last")
     return figure
 
@@ -238,15 +226,8 @@ def _at(updates: int, points: int) -> np.ndarray:
     return np.unique(np.linspace(updates - 1, 0, points).round().astype(int))
 
 
-def _stretches(steps: np.ndarray, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means of shares [T, S] over stretches of updates, and the steps at which each ends."""
-    ends = _at(len(steps), _STRETCHES) + 1
-    means = [shares[low:high].mean(axis=0) for low, high in pairwise([0, *ends])]
-    return steps[ends - 1], np.array(means)
-
-
 def _stretched(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means of values [N, T] over stretches of updates, and the steps at which each ends.
+    """Means of values [N or S, T] over stretches of updates, and the steps at which each ends.
 
     What was not measured counts for nothing; a stretch in which nothing was is nan.
     """
@@ -300,7 +281,7 @@ def _explain_lines(figure: Figure, history: History) -> None:
         kinds.append(Line2D([], [], color=_ALL, ls=":", label="no longer trained on"))
     if _promoting(history) is not None:
         kinds.append(Line2D([], [], color=_LIMIT, lw=0.8, ls="--", label="promotes"))
-    figure.legend(handles=kinds, loc="outside upper right", ncols=4, fontsize=8, frameon=False)
+    drawing.explain(figure, kinds, 4)
 
 
 def _seed_lines(history: History) -> list[Line2D]:
@@ -324,8 +305,8 @@ def _label_outer(figure: Figure, history: History) -> None:
     panel = figure.axes[0]
     panel.set(xlim=(0, history.arena_steps[-1]), ylim=(0, 1.02))
     panel.xaxis.set_major_locator(MaxNLocator(2 if len(history.names) > report_rows.MANY else 4))
-    panel.xaxis.set_major_formatter(EngFormatter(sep=""))
-    panel.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+    panel.xaxis.set_major_formatter(drawing.thousands())
+    panel.yaxis.set_major_formatter(drawing.percent())
     figure.supxlabel(_STEPS, fontsize=10)
     figure.supylabel(report_rows.measure(history), fontsize=10)
 

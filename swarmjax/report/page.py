@@ -1,39 +1,21 @@
 """The page of a report: one HTML file that needs nothing else, with its figures inside."""
 
-import base64
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from html import escape
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from swarmjax import words
 from swarmjax.config import to_dict
+from swarmjax.pages import builder
 from swarmjax.report import rows as report_rows
 from swarmjax.report import table as report_table
 from swarmjax.report.rows import History, Row
 from swarmjax.report.table import TableLine
 
 GOOD = 0.9  # success from which on a stage is counted as learned
+STYLES = (builder.STYLE, "report/report.css")
 _TOP = 5  # stages named of a reweighing
-
-STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; color: #1a1a1a; margin: 1.2rem auto;
-       max-width: 1500px; padding: 0 1.2rem; }
-h1 { font-size: 1.35rem; margin: 0 0 .6rem; overflow-wrap: anywhere; }
-h2 { font-size: 1.05rem; margin: 1.4rem 0 .4rem; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: .1rem 1rem; margin: 0; }
-dt { color: #555; } dd { margin: 0; overflow-wrap: anywhere; }
-.figures { display: grid; gap: 1rem;
-           grid-template-columns: repeat(auto-fit, minmax(min(480px, 100%), 1fr)); }
-.wide { grid-template-columns: 1fr; }
-figure { margin: 1rem 0 0; } img { max-width: 100%; } figcaption { color: #444; }
-.scroll { max-height: 26rem; overflow: auto; border: 1px solid #ddd; }
-table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
-th { position: sticky; top: 0; background: #f2f2f2; text-align: left; }
-th, td { padding: .2rem .6rem; border-bottom: 1px solid #eee; vertical-align: top; }
-code { background: #f2f2f2; padding: 0 .2rem; }
-"""
 
 _CAPTIONS = {
     "mix": "On which stages the arenas were.",
@@ -59,18 +41,18 @@ def page(title: str, command: str, history: History, figures: Mapping[str, bytes
     Returns:
       HTML in which every name of a run is escaped.
     """
-    name = escape(title)
-    layout = "figures" if len(history.names) <= report_rows.MANY else "figures wide"
-    told = "".join(
-        f"<dt>{escape(what)}</dt><dd>{escape(text)}</dd>\n" for what, text in facts(history)
-    )
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f"<title>{name}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<h1>{name}</h1>\n"
-        f"<dl>\n{told}<dt>made by</dt><dd><code>{escape(command)}</code></dd>\n</dl>\n"
-        f'<div class="{layout}">\n{"".join(_figure(*each) for each in figures.items())}</div>\n'
-        f"<h2>Decisions of the curriculum</h2>\n{_decisions(history)}"
-        f"<h2>Stages</h2>\n{_stages(history)}</body>\n</html>\n"
+    return builder.render(
+        "report/report.html",
+        styles=STYLES,
+        title=title,
+        command=command,
+        about=facts(history),
+        is_wide=len(history.names) > report_rows.MANY,
+        figures=figures,
+        captions=_CAPTIONS,
+        decisions=_decisions(history),
+        reweighings=_reweighings(history),
+        stages=_stages(history),
     )
 
 
@@ -85,12 +67,14 @@ def table_page(title: str, command: str, lines: Sequence[TableLine]) -> str:
     Returns:
       HTML in which every name of a run is escaped.
     """
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
-        f"<h1>{escape(title)}</h1>\n{_table(report_table.HEADS, report_table.cells(lines))}"
-        f"<p>{escape(report_table.note(lines))} Made by <code>{escape(command)}</code>.</p>\n"
-        "</body>\n</html>\n"
+    return builder.render(
+        "report/runs.html",
+        styles=STYLES,
+        title=title,
+        command=command,
+        heads=report_table.HEADS,
+        rows=report_table.cells(lines),
+        note=report_table.note(lines),
     )
 
 
@@ -184,49 +168,25 @@ def _origin(summary: Row) -> str:
     return f"{summary.get('device')}, commit {summary.get('commit') or 'unknown'}"
 
 
-def _figure(name: str, png: bytes) -> str:
-    """Embeds a figure."""
-    data = base64.b64encode(png).decode("ascii")
-    caption = _CAPTIONS[name]
-    return (
-        f'<figure><img src="data:image/png;base64,{data}" alt="{escape(caption)}">'
-        f"<figcaption>{escape(caption)}</figcaption></figure>\n"
-    )
-
-
-def _decisions(history: History) -> str:
-    """Tables promotions and demotions, and of the reweighings of a seed their number and last."""
+def _decisions(history: History) -> list[tuple]:
+    """Tables promotions and demotions."""
     step = history.config.arenas * history.config.algo.rollout_length
-    rows = [
+    shares = ("targets_reached", "all_reached")
+    return [
         (
             row["seed"],
             f"{row['update'] + 1:,}",
             f"{(row['update'] + 1) * step:,}",
-            row.get("from"),
-            row.get("to"),
-            row.get("why"),
-            _percent(row.get("targets_reached")),
-            _percent(row.get("all_reached")),
+            *(row.get(key) for key in ("from", "to", "why")),
+            *(_percent(row.get(key)) for key in shares),
         )
         for row in history.decisions
         if "weights" not in row
     ]
-    heads = (
-        "seed",
-        "updates done",
-        "arena control steps",
-        "from",
-        "to",
-        "why",
-        "targets reached",
-        "all reached",
-    )
-    tables = (_table(heads, rows) if rows else "") + _reweighings(history)
-    return tables or "<p>None.</p>\n"
 
 
-def _reweighings(history: History) -> str:
-    """Says how often the arenas of each seed were spread anew, and how they were at last."""
+def _reweighings(history: History) -> list[tuple]:
+    """Tables how often the arenas of each seed were spread anew, and how they were at last."""
     by_seed: dict[int, list[Row]] = {}
     for row in history.decisions:
         if "weights" in row:
@@ -237,54 +197,26 @@ def _reweighings(history: History) -> str:
         top = sorted(weights, key=lambda name: -weights[name])[:_TOP]
         most = ", ".join(f"{name} {_percent(weights[name])}" for name in top)
         rows.append((seed, len(found), f"{found[-1]['update'] + 1:,}", most))
-    heads = ("seed", "times reweighed", "updates done at the last", "most arenas then on")
-    return _table(heads, rows) if rows else ""
+    return rows
 
 
-def _stages(history: History) -> str:
+def _stages(history: History) -> list[tuple]:
     """Tables the stages: what they are, how long they were trained on, and how they stand."""
     last = {key: report_rows.among(values[:, -1]) for key, values in history.by_stage.items()}
     share = history.mix.mean(axis=(0, 1))
-    rows = [
+    return [
         (
             stage.name,
             stage.robots,
             stage.obstacles,
             report_rows.side_text(stage.sides),
             _percent(share[i]),
-            _percent(last["success_by_stage"][0][i]),
-            _percent(last["complete_by_stage"][0][i]),
-            _number(last["contacts_by_stage"][0][i]),
-            _number(last["return_by_stage"][0][i]),
+            *(_percent(last[f"{key}_by_stage"][0][i]) for key in ("success", "complete")),
+            *(_number(last[f"{key}_by_stage"][0][i]) for key in ("contacts", "return")),
             f"{last['success_by_stage'][1][i]} of {len(history.seeds)}",
         )
         for i, stage in enumerate(history.config.stage)
     ]
-    heads = (
-        "stage",
-        "robots",
-        "obstacles",
-        "side (m)",
-        "share of training",
-        "targets reached",
-        "all reached",
-        "contacts per robot",
-        "return per robot",
-        "seeds measured",
-    )
-    note = "Newest verdicts, as interquartile means of the seeds that have one."
-    return f"<p>{note}</p>\n{_table(heads, rows)}"
-
-
-def _table(heads: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
-    """Makes a table that scrolls by itself; None is a dash."""
-    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
-    body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>\n" for row in rows)
-    return f'<div class="scroll"><table>\n<tr>{head}</tr>\n{body}</table></div>\n'
-
-
-def _cell(value: object) -> str:
-    return f"<td>{'-' if value is None else escape(str(value))}</td>"
 
 
 def _percent(share: float | None) -> str | None:

@@ -7,10 +7,11 @@ that a run can be read at any time. Any other damage is refused, by its file, li
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,10 +36,32 @@ _LISTS = ("mix", "weights", *BY_STAGE)
 CURVES = ("return", "contacts_per_robot", "policy_loss", "value_loss", "entropy")
 MANY = 9  # stages from which on each is drawn small
 SUMMARY = "summary.json"
-_LARGEST = float(np.finfo(np.float32).max)
 _NUMBERS = ("seed", "update", "arena_steps")
+_LARGEST = float(np.finfo(np.float32).max)
 # A verdict takes one cohort in which its episodes begin, and one in which the last of them end.
 _COHORTS_OF_A_VERDICT = 2
+
+
+class ValueKind(NamedTuple):
+    """A kind of value in a row: its name in a sentence, and whether a value is of it."""
+
+    name: str
+    fits: Callable[[Any], bool]
+
+
+def _is_number(value: Any, types: type | UnionType, largest: float) -> bool:
+    """Tells whether a value is a number, no larger; truth values and nan are none."""
+    return isinstance(value, types) and not isinstance(value, bool) and abs(value) <= largest
+
+
+WHOLE = ValueKind("whole number", lambda value: _is_number(value, int, 2**63 - 1))  # as NumPy holds
+COUNT = ValueKind("whole number", lambda value: WHOLE.fits(value) and value >= 0)
+NUMBER = ValueKind("number", lambda value: _is_number(value, int | float, _LARGEST))
+NUMBER_OR_NULL = ValueKind("number", lambda value: value is None or NUMBER.fits(value))
+NAME = ValueKind("name", lambda value: isinstance(value, str))
+FLAG = ValueKind("truth value", lambda value: isinstance(value, bool))
+MAP = ValueKind("keys and values", lambda value: isinstance(value, dict))
+SHARES = ValueKind("shares by stage", MAP.fits)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -197,8 +220,8 @@ def _checked(raw: Row, stages: int, where: str) -> Row:
             raise ConfigError(
                 f"{where} has no {key}: the run is of a version that did not write it."
             )
-    check_whole(raw, _NUMBERS, where)
-    check_numbers(raw, ("train_s", *CURVES), where)
+    check(raw, _NUMBERS, WHOLE, where)
+    check(raw, ("train_s", *CURVES), NUMBER_OR_NULL, where)
     lists = [per_stage(raw[key], stages, f"{where} has {key}") for key in _LISTS]
     return {key: raw[key] for key in (*_NUMBERS, "train_s") if key in raw} | {
         "lists": np.array(lists),
@@ -206,36 +229,21 @@ def _checked(raw: Row, stages: int, where: str) -> Row:
     }
 
 
-def check_whole(row: Row, keys: Sequence[str], where: str) -> None:
-    """Refuses a row that lacks whole numbers.
+def check(row: Mapping[str, Any], keys: Iterable[str], kind: ValueKind, where: str) -> None:
+    """Refuses a row that has something else than a kind of value.
 
     Args:
       row: as it was written down.
-      keys: of the numbers.
+      keys: of the values; null stands for one that is missing.
+      kind: of them all.
       where: names the row, for the sentence.
 
     Raises:
-      ConfigError: if one is missing or of another type.
+      ConfigError: if one is of another kind.
     """
     for key in keys:
-        if not _is_whole(row.get(key)):
-            raise ConfigError(f"{where} has no whole number as {key}: it is damaged.")
-
-
-def check_numbers(row: Row, keys: Iterable[str], where: str) -> None:
-    """Refuses a row in which something else stands for a finite number; null or none may.
-
-    Args:
-      row: as it was written down.
-      keys: of the numbers.
-      where: names the row, for the sentence.
-
-    Raises:
-      ConfigError: if one is of another type, infinite or nan.
-    """
-    for key in keys:
-        if not _is_number_or_null(row.get(key)):
-            raise ConfigError(f"{where} has no number as {key}: it is damaged.")
+        if not kind.fits(row.get(key)):
+            raise ConfigError(f"{where} has no {kind.name} as {key}: it is damaged.")
 
 
 def per_stage(found: object, stages: int, what: str) -> np.ndarray:
@@ -252,22 +260,10 @@ def per_stage(found: object, stages: int, what: str) -> np.ndarray:
     Raises:
       ConfigError: if it is anything else.
     """
-    fits = isinstance(found, list) and len(found) == stages and all(map(_is_number_or_null, found))
+    fits = isinstance(found, list) and len(found) == stages and all(map(NUMBER_OR_NULL.fits, found))
     if not fits:
         raise ConfigError(f"{what} that is no list of {stages} numbers, one a stage.")
     return np.array(found, np.float32)
-
-
-def _is_number_or_null(value: object) -> bool:
-    """Tells whether a value is None or fits a float32; text and truth values are no numbers."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return value is None
-    return abs(value) <= _LARGEST  # no nan is
-
-
-def _is_whole(value: object) -> bool:
-    """Tells whether a value is a whole number that NumPy holds; truth values are none."""
-    return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
 
 
 def read_config(run: Path) -> TrainConfig:
@@ -293,7 +289,7 @@ def read_object(path: Path) -> Row:
       ConfigError: if it cannot be read, or holds something else.
     """
     found = reading.read_json(path)
-    if not isinstance(found, dict):
+    if not MAP.fits(found):
         raise ConfigError(f"{path} holds no keys and values: it is damaged.")
     return found
 
@@ -302,12 +298,11 @@ def _read_decisions(run: Path) -> list[Row]:
     """Reads the decisions of the curriculum, by seed and update."""
     found = []
     for where, row in read_lines(run, recorder.DECISIONS):
-        check_whole(row, ("seed", "update"), where)
-        check_numbers(row, ("targets_reached", "all_reached"), where)
+        check(row, ("seed", "update"), WHOLE, where)
+        check(row, ("targets_reached", "all_reached"), NUMBER_OR_NULL, where)
         weights = row.get("weights", {})
-        if not isinstance(weights, dict):
-            raise ConfigError(f"{where} has no shares by stage as weights: it is damaged.")
-        check_numbers(weights, weights, f"{where}, weights,")
+        check({"weights": weights}, ("weights",), SHARES, where)
+        check(weights, weights, NUMBER_OR_NULL, f"{where}, weights,")
         found.append(row)
     return sorted(found, key=lambda row: (row["seed"], row["update"]))
 

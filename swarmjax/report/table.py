@@ -218,7 +218,7 @@ def cells(lines: Sequence[TableLine]) -> list[tuple[str, ...]]:
             f"{line.updates[0]:,} of {line.updates[1]:,}",
             _seeds(line),
             "-" if math.isnan(line.mean) else f"{100.0 * line.mean:.1f} %",
-            "-" if line.interval is None else "{:.1f} to {:.1f} %".format(*_percent(line.interval)),
+            _interval(line.interval),
             "-" if line.train_s is None else f"{line.train_s:,.1f}",
         )
         for line in lines
@@ -278,5 +278,5 @@ def _seeds(line: TableLine) -> str:
     return str(of) if measured == of else f"{of}, {measured} measured"
 
 
-def _percent(interval: tuple[float, float]) -> tuple[float, float]:
-    return 100.0 * interval[0], 100.0 * interval[1]
+def _interval(ends: tuple[float, float] | None) -> str:
+    return "-" if ends is None else f"{100.0 * ends[0]:.1f} to {100.0 * ends[1]:.1f} %"

@@ -7,10 +7,10 @@ all of its readings, and not reproduced if the data contradict it by all of them
 straddles, readings disagree or an arm is missing it is undecidable.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from swarmjax.reproduce.criteria import (
     lower,
 )
 from swarmjax.reproduce.measures import NUMBER, SHARE, Axis, Measure
-from swarmjax.reproduce.rows import EXPANDED, LAST, Reproduction
+from swarmjax.reproduce.rows import EXPANDED, LAST, MODERN, PAIR, TUNED, Reproduction
 
 GENERATED = 0.8  # share of targets that is the desired behaviour: what promotes from a stage, too
 FAILED = 0.5  # share of targets below which a swarm fails
@@ -34,21 +34,12 @@ _NOTE = (
     "Numbers are interquartile means over seeds, with 95 % bootstrap intervals in brackets. Of "
     "two, the first is the curriculum's and the second the baseline's."
 )
-_PAIR = ("curriculum", "baseline")
-_TUNED = ("curriculum_expanded", "baseline_expanded")
-_MODERN = ("modern_curriculum", "modern_baseline")
 
 type Outcome = Literal["reproduced", "not reproduced", "undecidable"]
 # What the arms of a reading came to, [N] each, to whether the claim holds, and the numbers.
 type Test = Callable[..., tuple[bool | None, str]]
-
-
-class Values(Protocol):
-    """What an arm came to by seed: a function of `measures` with its options set."""
-
-    def __call__(self, data: Reproduction, arm: str, /) -> np.ndarray:
-        """Returns [N]."""
-        ...
+# What an arm came to by seed, [N]: a function of `measures` with its options set.
+type Values = Callable[[Reproduction, str], np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,14 +142,13 @@ def verdict(data: Reproduction, claim: Claim) -> ClaimVerdict:
 def finding(data: Reproduction, reading: Reading) -> Finding:
     """Says what a reading comes to; it is open where an arm or an episode is missing."""
     lacking = data.lacking(reading.arms)
+    values = [] if lacking else [reading.values(data, arm) for arm in reading.arms]
     if lacking:
-        text = f"lacks {' and '.join(lacking)}"
-        return Finding(reading=reading.name, holds=None, text=text)
-    values = [reading.values(data, arm) for arm in reading.arms]
-    if any(np.isnan(each).any() for each in values):
-        text = "a seed has too few episodes for it"
-        return Finding(reading=reading.name, holds=None, text=text)
-    holds, text = reading.test(*values)
+        holds, text = None, f"lacks {' and '.join(lacking)}"
+    elif any(np.isnan(each).any() for each in values):
+        holds, text = None, "a seed has too few episodes for it"
+    else:
+        holds, text = reading.test(*values)
     return Finding(reading=reading.name, holds=holds, text=text)
 
 
@@ -172,18 +162,13 @@ def markdown(verdicts: Sequence[ClaimVerdict]) -> str:
     rows = []
     for each in verdicts:
         reason = f", {each.reason}" if each.reason else ""
-        because = "<br>".join(map(finding_text, each.findings))
+        because = "<br>".join(f"{f.reading}: {f.text} ({HELD[f.holds]})" for f in each.findings)
         rows.append(
             f'| "{each.claim.quote}" | {each.claim.where} | **{each.outcome}**{reason} | '
             f"{because} | {each.claim.figures} |"
         )
     heads = ("the paper says", "where", "verdict", "because", "shown in")
     return "\n".join([f"| {' | '.join(heads)} |", "|---" * len(heads) + "|", *rows, "", _NOTE, ""])
-
-
-def finding_text(found: Finding) -> str:
-    """Writes a finding in a line."""
-    return f"{found.reading}: {found.text} ({HELD[found.holds]})"
 
 
 HELD = {True: "holds", False: "contradicted", None: "open"}
@@ -200,36 +185,48 @@ def _by_sampling(of: Measure, stage: str) -> tuple[str, Values]:
     return name, partial(measures.late, of=of, stage=stage)
 
 
+def _called(what: str, sources: Iterable[tuple[str, Values]]) -> list[tuple[str, Values]]:
+    """Puts what is read out before the names of its sources."""
+    return [(f"{what}, {name}", values) for name, values in sources]
+
+
 def _readings(arms: tuple[str, ...], test: Test, *sources: tuple[str, Values]) -> tuple:
     """A reading for each source of values, of the same arms and by the same test."""
     return tuple(Reading(name=name, arms=arms, values=v, test=test) for name, v in sources)
 
 
-def _steady(stage: str | None, *axes: Axis) -> tuple[tuple[str, Values], ...]:
-    """Where success becomes steady, by either reading of success."""
-    units = {"episode": "episode number", "steps": "arena steps"}
+def steady(stage: str | None, axis: Axis) -> list[tuple[str, str, Values]]:
+    """Where success becomes steady, by either reading of success.
+
+    Args:
+      stage: whose episodes alone are looked at; None for all.
+      axis: in which it is told.
+
+    Returns:
+      Of each reading the goal, what is counted, and the places of an arm by seed.
+    """
     which = "all episodes" if stage is None else f"episodes on {stage}"
-    return tuple(
-        (
-            f"{name}, {which}, {units[axis]}",
-            partial(measures.steady_at, success=success, axis=axis, stage=stage),
-        )
-        for name, success in measures.SUCCESS.items()
-        for axis in axes
-    )
+    counted = f"{which}, {measures.UNITS[axis]}"
+    return [
+        (goal, counted, partial(measures.steady_at, success=success, axis=axis, stage=stage))
+        for goal, success in measures.SUCCESS.items()
+    ]
+
+
+def _steady(stage: str | None, axis: Axis) -> list[tuple[str, Values]]:
+    return [(f"{goal}, {counted}", values) for goal, counted, values in steady(stage, axis)]
 
 
 def _rewarded() -> tuple[tuple[str, Values], ...]:
     """Where the reward on the last stage is near its best, of robot 1 and of the swarm."""
     kinds = {"robot 1": measures.first_reward, "mean of the robots": measures.mean_reward}
-    units: dict[Axis, str] = {"episode": "episode number", "steps": "arena steps"}
     return tuple(
         (
             f"{name}, {unit}",
-            partial(measures.reward_reached, of=of, axis=axis, rivals=_PAIR, stage=LAST),
+            partial(measures.reward_reached, of=of, axis=axis, rivals=PAIR, stage=LAST),
         )
         for name, of in kinds.items()
-        for axis, unit in units.items()
+        for axis, unit in measures.UNITS.items()
     )
 
 
@@ -237,15 +234,15 @@ def _expanded(test: Test, which: slice, key: str = "targets_reached") -> tuple[R
     """The 1.5 m arena, zero-shot and trained on, of some of the pair."""
     source = partial(measures.judged, key=key, stage=EXPANDED)
     return (
-        Reading(name="zero-shot at 1.5 m", arms=_PAIR[which], values=source, test=test),
-        Reading(name="trained on at 1.5 m", arms=_TUNED[which], values=source, test=test),
+        Reading(name="zero-shot at 1.5 m", arms=PAIR[which], values=source, test=test),
+        Reading(name="trained on at 1.5 m", arms=TUNED[which], values=source, test=test),
     )
 
 
-_TARGETS = (
-    _by_mean("targets_reached", LAST),
-    _by_sampling(measures.targets, LAST),
-)
+_TARGETS = (_by_mean("targets_reached", LAST), _by_sampling(measures.targets, LAST))
+_SENSED = (_by_mean("sensed_share", LAST), _by_sampling(measures.sensed_share, LAST))
+_CONTACTS = (_by_mean("contacts_per_robot", LAST), _by_sampling(measures.contacts, LAST))
+_CROWDING = ("last to arrive minus first", partial(measures.crowding, stage=LAST))
 _MORE_SHARE = partial(higher, unit=SHARE)
 _STEADY_IS = (
     f"Steady is the first episode from which on {measures.WINDOW} episodes, and all to the end of "
@@ -262,7 +259,7 @@ CLAIMS = (
         criterion=f"Share of targets reached on {LAST}: the intervals of curriculum and baseline "
         f"lie at or above {GENERATED:g}. Contradicted if one lies below.",
         figures="table of final policies, curves of the default trainer",
-        readings=_readings(_PAIR, partial(at_least, least=GENERATED), *_TARGETS),
+        readings=_readings(PAIR, partial(at_least, least=GENERATED), *_TARGETS),
     ),
     Claim(
         name="six_hundred",
@@ -292,7 +289,7 @@ CLAIMS = (
         criterion=f"{_STEADY_IS} The probability that a seed of the curriculum is steady before "
         "one of the baseline: the interval lies above 0.5. Contradicted if below.",
         figures="figure 6",
-        readings=_readings(_PAIR, earlier, *_steady(None, "episode"), *_steady(LAST, "steps")),
+        readings=_readings(PAIR, earlier, *_steady(None, "episode"), *_steady(LAST, "steps")),
     ),
     Claim(
         name="faster_reward",
@@ -302,7 +299,7 @@ CLAIMS = (
         f"on {LAST} is 0.9 of the best one of any seed of either arm. The probability that a seed "
         "of the curriculum is there first: the interval lies above 0.5. Contradicted if below.",
         figures="figure 7",
-        readings=_readings(_PAIR, earlier, *_rewarded()),
+        readings=_readings(PAIR, earlier, *_rewarded()),
     ),
     Claim(
         name="higher_success",
@@ -310,7 +307,7 @@ CLAIMS = (
         where="section 5",
         criterion=f"Share of targets reached on {LAST}, curriculum minus baseline. {_DIFFERENCE}",
         figures="table of final policies, curves of the default trainer",
-        readings=_readings(_PAIR, _MORE_SHARE, *_TARGETS),
+        readings=_readings(PAIR, _MORE_SHARE, *_TARGETS),
     ),
     Claim(
         name="fewer_collisions",
@@ -320,28 +317,8 @@ CLAIMS = (
         f"within infrared range, and contacts per robot. {_DIFFERENCE}",
         figures="figure 8, table of final policies",
         readings=(
-            *_readings(
-                _PAIR,
-                partial(lower, unit=SHARE),
-                *(
-                    (f"infrared rule, {name}", values)
-                    for name, values in (
-                        _by_mean("sensed_share", LAST),
-                        _by_sampling(measures.sensed_share, LAST),
-                    )
-                ),
-            ),
-            *_readings(
-                _PAIR,
-                partial(lower, unit=NUMBER),
-                *(
-                    (f"contacts, {name}", values)
-                    for name, values in (
-                        _by_mean("contacts_per_robot", LAST),
-                        _by_sampling(measures.contacts, LAST),
-                    )
-                ),
-            ),
+            *_readings(PAIR, partial(lower, unit=SHARE), *_called("infrared rule", _SENSED)),
+            *_readings(PAIR, partial(lower, unit=NUMBER), *_called("contacts", _CONTACTS)),
         ),
     ),
     Claim(
@@ -351,12 +328,7 @@ CLAIMS = (
         criterion=f"Share of robot steps with something within infrared range on {LAST}, "
         "curriculum: the interval lies above 0. Contradicted if it is 0.",
         figures="figure 8, table of final policies",
-        readings=_readings(
-            ("curriculum",),
-            above_zero,
-            _by_mean("sensed_share", LAST),
-            _by_sampling(measures.sensed_share, LAST),
-        ),
+        readings=_readings(("curriculum",), above_zero, *_SENSED),
     ),
     Claim(
         name="aggregation",
@@ -367,11 +339,7 @@ CLAIMS = (
         "Contradicted if the interval does not exceed 0. More of them is what crowding would bring "
         "about, but the data do not say what a ray met, so the claim cannot be reproduced by them.",
         figures="figure 8",
-        readings=_readings(
-            ("curriculum",),
-            crowded,
-            ("last to arrive minus first", partial(measures.crowding, stage=LAST)),
-        ),
+        readings=_readings(("curriculum",), crowded, _CROWDING),
     ),
     Claim(
         name="expanded_better",
@@ -419,6 +387,6 @@ GOALS = tuple(
         values=partial(measures.judged, key="targets_reached", stage=stage),
         test=partial(at_least, least=least),
     )
-    for arm in _MODERN
+    for arm in MODERN
     for stage, least in ((LAST, 0.95), (EXPANDED, 0.90))
 )

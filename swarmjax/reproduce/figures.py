@@ -4,29 +4,26 @@ A figure is drawn of those of its arms that have finished. Colours are of Okabe 
 universal design", and arms differ in their dashes too.
 """
 
-import io
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator, PercentFormatter
-from PIL import Image
+from matplotlib.ticker import MaxNLocator
 
 from swarmjax.evaluate import statistics
 from swarmjax.evaluate.curves import curve
 from swarmjax.evaluate.statistics import iqm
+from swarmjax.pages import figures as drawing
 from swarmjax.reproduce import measures
-from swarmjax.reproduce.measures import WINDOW, Axis, Measure
+from swarmjax.reproduce.measures import AXES, WINDOW, Axis, Measure
 from swarmjax.reproduce.raster import raster
-from swarmjax.reproduce.rows import EXPANDED, LAST, Reproduction
-from swarmjax.reproduce.style import AXES, WIDTH, thousands
+from swarmjax.reproduce.rows import EXPANDED, LAST, MODERN, PAIR, TUNED, Reproduction
 
-_DOTS = 110  # an inch
-_SHADES = 128  # colours of a file: a quarter of its size, each off by 23 of 255 at most
+SHADES = 128  # colours of a file: a quarter of its size, each off by 23 of 255 at most
 _POINTS, _RESAMPLES = 100, 1000  # of an interval along a curve
 COLOURS = {
     "curriculum": "#0072b2",
@@ -37,40 +34,17 @@ COLOURS = {
     "modern_baseline": "#aa4499",
 }
 _DASHES = {"baseline": "--", "baseline_expanded": "--", "modern_baseline": "--"}
-_PAIR = ("curriculum", "baseline")
-_TUNED = ("curriculum_expanded", "baseline_expanded")
-_MODERN = ("modern_curriculum", "modern_baseline")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Plot:
-    """A figure of the report.
+class Plot(NamedTuple):
+    """A figure of the report: the arms that it shows, and what draws those that have finished."""
 
-    Attributes:
-      name: of its file.
-      section: of the report, which it stands in.
-      arms: that it shows.
-      caption: says what is seen.
-      make: draws it, of those of its arms that have finished.
-    """
-
-    name: str
-    section: str
     arms: tuple[str, ...]
-    caption: str
     make: Callable[[Reproduction, tuple[str, ...]], Figure]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Panel:
-    """What a row of curves shows.
-
-    Attributes:
-      label: of the measure, with its unit.
-      of: the measure.
-      stage: whose episodes alone are shown; None for all.
-      share: whether it is a share, written in percent.
-    """
+class Panel(NamedTuple):
+    """A row of curves: a measure over the episodes of a stage, or of all; shares in percent."""
 
     label: str
     of: Measure
@@ -85,22 +59,11 @@ def draw(data: Reproduction) -> dict[str, bytes]:
       PNG files by name. The same reproduction gives the same files.
     """
     files = {}
-    for plot in PLOTS:
+    for name, plot in PLOTS.items():
         arms = tuple(arm for arm in plot.arms if arm in data.logs)
         if arms:
-            files[plot.name] = png(plot.make(data, arms))
+            files[name] = drawing.png(plot.make(data, arms), SHADES)
     return files
-
-
-def png(figure: Figure) -> bytes:
-    """Writes a figure as a PNG file with a palette of its own."""
-    content, small = io.BytesIO(), io.BytesIO()
-    figure.savefig(content, format="png", dpi=_DOTS)
-    image = Image.open(content).convert("RGB")
-    # By coverage: by the median, a line that is short would take the colour of others.
-    few = image.quantize(_SHADES, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    few.save(small, format="png", optimize=True)
-    return small.getvalue()
 
 
 def curves(
@@ -115,7 +78,7 @@ def curves(
       axes: columns, from the left.
     """
     height = 1.0 + 2.0 * len(panels)
-    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    figure = Figure(figsize=(drawing.WIDTH, height), layout="constrained")
     grid = figure.subplots(len(panels), len(axes), sharex="col", sharey="row", squeeze=False)
     for row, panel in zip(grid, panels, strict=True):
         for place, axis in zip(row, axes, strict=True):
@@ -125,11 +88,11 @@ def curves(
             place.tick_params(labelsize=8)
         row[0].set_ylabel(panel.label, fontsize=8)
         if panel.share:
-            row[0].yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+            row[0].yaxis.set_major_formatter(drawing.percent())
     for place, axis in zip(grid[-1], axes, strict=True):
         place.set_xlabel(AXES[axis], fontsize=9)
         place.set_xlim(left=0)
-        place.xaxis.set_major_formatter(thousands())
+        place.xaxis.set_major_formatter(drawing.thousands(least=10_000))
         place.xaxis.set_major_locator(MaxNLocator(5))
     _explain_curves(figure, data, arms)
     return figure
@@ -165,7 +128,7 @@ def _explain_curves(figure: Figure, data: Reproduction, arms: tuple[str, ...]) -
         for arm in arms
     ]
     kinds.append(Line2D([], [], color="0.5", lw=0.5, label=f"each of {len(data.seeds)} seeds"))
-    figure.legend(handles=kinds, loc="outside upper right", ncols=5, fontsize=8, frameon=False)
+    drawing.explain(figure, kinds)
 
 
 def final(data: Reproduction, arms: tuple[str, ...]) -> Figure:
@@ -176,7 +139,7 @@ def final(data: Reproduction, arms: tuple[str, ...]) -> Figure:
         "sensed_share": "robot steps within infrared range",
         "contacts_per_robot": "contacts per robot and episode",
     }
-    figure = Figure(figsize=(WIDTH, 1.6 + 0.8 * len(arms)), layout="constrained")
+    figure = Figure(figsize=(drawing.WIDTH, 1.6 + 0.8 * len(arms)), layout="constrained")
     places = figure.subplots(2, 2, sharey=True)
     for place, (key, label) in zip(places.flat, kinds.items(), strict=True):
         for shift, stage, mark in ((-0.16, LAST, "o"), (0.16, EXPANDED, "s")):
@@ -186,7 +149,7 @@ def final(data: Reproduction, arms: tuple[str, ...]) -> Figure:
         place.grid(axis="x", alpha=0.3)
         place.tick_params(labelsize=8)
         if key != "contacts_per_robot":
-            place.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+            place.xaxis.set_major_formatter(drawing.percent())
         place.set_xlim(left=max(0.0, place.get_xlim()[0]))
     places[0, 0].set_yticks(range(len(arms)), arms)
     places[0, 0].set_ylim(len(arms) - 0.5, -0.5)
@@ -195,7 +158,7 @@ def final(data: Reproduction, arms: tuple[str, ...]) -> Figure:
         for mark, stage in (("o", LAST), ("s", EXPANDED))
     ]
     marks.append(Line2D([], [], color="0.3", marker=".", ls="", ms=4, alpha=0.5, label="a seed"))
-    figure.legend(handles=marks, loc="outside upper right", ncols=3, fontsize=8, frameon=False)
+    drawing.explain(figure, marks, 3)
     return figure
 
 
@@ -211,144 +174,45 @@ def _dots(place: Axes, values: np.ndarray, row: float, style: tuple[str, str]) -
 _TWO: tuple[Axis, ...] = ("episode", "steps")
 _ALL_OF_THEM = "all episodes"
 _ON_LAST = f"episodes on {LAST}"
-_ROLLING = (
-    f"Rolling means of {WINDOW} episodes. Thin: each seed. Thick, with its band: interquartile "
-    "mean over seeds and 95 % bootstrap interval, where all seeds have a value."
-)
-_RASTER = (
-    "A row a seed, a line an episode: blue where the goal was reached, white where not, a shade "
-    "where a line is several episodes."
-)
 
 
 def _rewards(of: Measure, who: str) -> tuple[Panel, ...]:
-    return (
-        Panel(label=f"reward of {who} (m),\n{_ALL_OF_THEM}", of=of, stage=None),
-        Panel(label=f"reward of {who} (m),\n{_ON_LAST}", of=of, stage=LAST),
-    )
+    kinds = {_ALL_OF_THEM: None, _ON_LAST: LAST}
+    return tuple(Panel(f"reward of {who} (m),\n{which}", of, kinds[which]) for which in kinds)
 
 
 def _collisions(stage: str | None, which: str) -> tuple[Panel, ...]:
     return (
-        Panel(
-            label=f"steps within infrared range,\n{which}",
-            of=measures.sensed_share,
-            stage=stage,
-            share=True,
-        ),
-        Panel(label=f"contacts per robot,\n{which}", of=measures.contacts, stage=stage),
+        Panel(f"steps within infrared range,\n{which}", measures.sensed_share, stage, share=True),
+        Panel(f"contacts per robot,\n{which}", measures.contacts, stage),
     )
 
 
-PLOTS = (
-    Plot(
-        name="figure6_episodes",
-        section="6",
-        arms=_PAIR,
-        caption=f"Figure 6 over episodes, all of a run, on whatever stage. {_RASTER} The triangle "
-        "is the episode from which on success is steady, and is missing where it never is; the "
-        "dotted line is the number that the paper gives. A run ends after its steps, so that those "
-        "with short episodes have more.",
-        make=partial(raster, axis="episode", stage=None),
-    ),
-    Plot(
-        name="figure6_steps",
-        section="6",
-        arms=_PAIR,
-        caption=f"Figure 6 over arena control steps from the beginning of the run, episodes on "
-        f"{LAST} alone. {_RASTER} Grey is time on the curriculum's earlier stages, and after the "
-        "last episode.",
-        make=partial(raster, axis="steps", stage=LAST),
-    ),
-    Plot(
-        name="figure7_robot1",
-        section="7",
-        arms=_PAIR,
-        caption="Figure 7: cumulative reward of an episode, of robot 1, as the paper's is of one "
-        f"robot. {_ROLLING} "
-        "Earlier stages are smaller, and so is what can be collected on them: the lower row "
-        f"compares like with like, from the beginning of the run, on {LAST}.",
-        make=partial(curves, panels=_rewards(measures.first_reward, "robot 1"), axes=_TWO),
-    ),
-    Plot(
-        name="figure7_swarm",
-        section="7",
-        arms=_PAIR,
-        caption=f"The same as the mean over the robots of the swarm. {_ROLLING}",
-        make=partial(curves, panels=_rewards(measures.mean_reward, "a robot"), axes=_TWO),
-    ),
-    Plot(
-        name="figure8",
-        section="8",
-        arms=_PAIR,
-        caption="Figure 8: collisions by the paper's rule, the share of robot steps with something "
-        "within infrared range, and by true contacts per robot and episode, over training with "
-        f"sampled actions. {_ROLLING}",
-        make=partial(
-            curves,
-            panels=(*_collisions(None, _ALL_OF_THEM), *_collisions(LAST, _ON_LAST)),
-            axes=_TWO,
-        ),
-    ),
-    Plot(
-        name="figure9_raster",
-        section="9",
-        arms=_TUNED,
-        caption=f"Figure 9: episodes of training on at 1.5 m, from the final policies of the two "
-        f"arms. {_RASTER} The triangle is the episode from which on success is steady.",
-        make=partial(raster, axis="episode", stage=EXPANDED),
-    ),
-    Plot(
-        name="figure9_curves",
-        section="9",
-        arms=_TUNED,
-        caption=f"Figure 9 as curves: training on at 1.5 m. {_ROLLING}",
-        make=partial(
-            curves,
-            panels=(
-                Panel(label="targets reached", of=measures.targets, stage=EXPANDED, share=True),
-                Panel(label="reward of a robot (m)", of=measures.mean_reward, stage=EXPANDED),
-            ),
-            axes=_TWO,
-        ),
-    ),
-    Plot(
-        name="final",
-        section="final",
-        arms=(*_PAIR, *_TUNED, *_MODERN),
-        caption=f"Final policies by their mean actions, in MuJoCo C, on {LAST} (1.2 m, circles) "
-        f"and {EXPANDED} (1.5 m, squares): each seed as a dot, interquartile mean over seeds with "
-        "its 95 % bootstrap interval. Arms that end on _expanded were trained on at 1.5 m; for all "
-        "others 1.5 m is zero-shot.",
-        make=final,
-    ),
-    Plot(
-        name="modern_curves",
-        section="modern",
-        arms=(*_PAIR, *_MODERN),
-        caption="The default trainer beside the paper's algorithm, at the same arena control steps "
-        f"in all: training on {LAST} with sampled actions. {_ROLLING}",
-        make=partial(
-            curves,
-            panels=(
-                Panel(
-                    label=f"targets reached,\n{_ON_LAST}",
-                    of=measures.targets,
-                    stage=LAST,
-                    share=True,
-                ),
-                _rewards(measures.mean_reward, "a robot")[1],
-                *_collisions(LAST, _ON_LAST),
-            ),
-            axes=("steps",),
-        ),
-    ),
-    Plot(
-        name="modern_raster",
-        section="modern",
-        arms=_MODERN,
-        caption=f"Figure 6 of the default trainer over arena control steps, episodes on {LAST} "
-        f"alone. {_RASTER} It runs several arenas at once, whose episodes end together.",
-        make=partial(raster, axis="steps", stage=LAST),
-    ),
+_OF_ROBOT_1 = _rewards(measures.first_reward, "robot 1")
+_OF_SWARM = _rewards(measures.mean_reward, "a robot")
+_TO_THE_END = (
+    Panel("targets reached", measures.targets, EXPANDED, share=True),
+    Panel("reward of a robot (m)", measures.mean_reward, EXPANDED),
 )
+_DEFAULT_TRAINER = (
+    Panel(f"targets reached,\n{_ON_LAST}", measures.targets, LAST, share=True),
+    _OF_SWARM[1],
+    *_collisions(LAST, _ON_LAST),
+)
+_ALL_COLLISIONS = (*_collisions(None, _ALL_OF_THEM), *_collisions(LAST, _ON_LAST))
+
+# Their captions, in reproduce.html, say what is seen.
+PLOTS = {
+    "figure6_episodes": Plot(PAIR, partial(raster, axis="episode", stage=None)),
+    "figure6_steps": Plot(PAIR, partial(raster, axis="steps", stage=LAST)),
+    "figure7_robot1": Plot(PAIR, partial(curves, panels=_OF_ROBOT_1, axes=_TWO)),
+    "figure7_swarm": Plot(PAIR, partial(curves, panels=_OF_SWARM, axes=_TWO)),
+    "figure8": Plot(PAIR, partial(curves, panels=_ALL_COLLISIONS, axes=_TWO)),
+    "figure9_raster": Plot(TUNED, partial(raster, axis="episode", stage=EXPANDED)),
+    "figure9_curves": Plot(TUNED, partial(curves, panels=_TO_THE_END, axes=_TWO)),
+    "final": Plot((*PAIR, *TUNED, *MODERN), final),
+    "modern_curves": Plot(
+        (*PAIR, *MODERN), partial(curves, panels=_DEFAULT_TRAINER, axes=("steps",))
+    ),
+    "modern_raster": Plot(MODERN, partial(raster, axis="steps", stage=LAST)),
+}

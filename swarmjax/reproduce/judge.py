@@ -7,7 +7,7 @@ differ by the noise of their sensors alone.
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from swarmjax.evaluate.engine_c import Arenas
 from swarmjax.evaluate.judge import Judge
 from swarmjax.evaluate.measures import Outcome
 from swarmjax.provenance import cores
+from swarmjax.report.rows import Row
 from swarmjax.reproduce.config import ReproduceConfig
 from swarmjax.reproduce.rows import EVALUATION, EXPANDED, LAST
 from swarmjax.run.settings import from_stored
@@ -28,8 +29,6 @@ from swarmjax.task.level import Level
 from swarmjax.task.stage_config import StageConfig
 
 STAGES = (LAST, EXPANDED)
-
-Row = dict[str, Any]
 
 
 class Task(NamedTuple):

@@ -21,6 +21,9 @@ KEPT = 0.5  # share below which a later window loses it; why it is not 0.8, `ste
 type Axis = Literal["episode", "steps"]
 type Measure = Callable[[RunLog], np.ndarray]  # [E] of a log
 
+UNITS: dict[Axis, str] = {"episode": "episode number", "steps": "arena steps"}
+AXES: dict[Axis, str] = {"episode": "episode of the run", "steps": "arena control steps"}
+
 
 def first_reached(log: RunLog) -> np.ndarray:
     """Whether [E] robot 1 reached its target: the paper's "the robot"."""

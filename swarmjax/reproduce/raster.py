@@ -6,11 +6,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from swarmjax.pages import figures as drawing
 from swarmjax.reproduce import measures
-from swarmjax.reproduce.measures import Axis, Measure
+from swarmjax.reproduce.measures import AXES, Axis, Measure
 from swarmjax.reproduce.rows import Reproduction, RunLog
-from swarmjax.reproduce.style import AXES, PAPER, WIDTH, thousands
 
+PAPER = {"curriculum": 300, "baseline": 600}  # episodes: section 4, on Figure 6
 _COLUMNS = 700  # of a raster: about as many as the dots along it
 _REACHED = LinearSegmentedColormap.from_list("reached", ["white", "#0b4f9e"])
 _NOTHING, _STEADY = "0.86", "#e69f00"
@@ -28,7 +29,7 @@ def raster(data: Reproduction, arms: tuple[str, ...], *, axis: Axis, stage: str 
     kinds = [(name, success, arm) for name, success in measures.SUCCESS.items() for arm in arms]
     seeds = len(data.seeds)
     height = 1.1 + len(kinds) * (0.55 + 0.11 * seeds)
-    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    figure = Figure(figsize=(drawing.WIDTH, height), layout="constrained")
     panels = figure.subplots(len(kinds), sharex=True, squeeze=False)[:, 0]
     edges = _edges([log for arm in arms for log in data.logs[arm]], axis)
     for panel, (name, success, arm) in zip(panels, kinds, strict=True):
@@ -51,7 +52,7 @@ def raster(data: Reproduction, arms: tuple[str, ...], *, axis: Axis, stage: str 
         panel.set_title(f"{arm}: {name}", loc="left", fontsize=9, pad=3)
         panel.set_yticks(range(seeds), [str(seed) for seed in data.seeds], fontsize=6)
     panels[-1].set_xlabel(AXES[axis])
-    panels[-1].xaxis.set_major_formatter(thousands())
+    panels[-1].xaxis.set_major_formatter(drawing.thousands(least=10_000))
     figure.supylabel("seed", fontsize=10)
     _explain_raster(figure, axis == "episode" and any(arm in PAPER for arm in arms))
     return figure
@@ -107,4 +108,4 @@ def _explain_raster(figure: Figure, paper: bool) -> None:
     ]
     if paper:
         kinds.append(Line2D([], [], color="black", lw=1.0, ls=":", label="the paper's number"))
-    figure.legend(handles=kinds, loc="outside upper right", ncols=5, fontsize=8, frameon=False)
+    drawing.explain(figure, kinds)

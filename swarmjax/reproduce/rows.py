@@ -15,7 +15,7 @@ import numpy as np
 from swarmjax.config import ConfigError
 from swarmjax.evaluate.statistics import LEAST_DRAWN
 from swarmjax.report import rows as report_rows
-from swarmjax.report.rows import Row
+from swarmjax.report.rows import Row, ValueKind
 from swarmjax.run.recorder import EPISODES
 
 FACTS, EVALUATION = "reproduce.json", "evaluation.json"
@@ -29,10 +29,21 @@ ARMS = {
     "modern_curriculum": "the default trainer with the paper's curriculum",
     "modern_baseline": "the default trainer on the last stage from scratch",
 }
+PAIR = ("curriculum", "baseline")
+TUNED = ("curriculum_expanded", "baseline_expanded")
+MODERN = ("modern_curriculum", "modern_baseline")
 # Of a row of the evaluation, over its episodes.
 JUDGED = ("targets_reached", "all_reached", "sensed_share", "contacts_per_robot", "return")
 _COUNTS = ("seed", "update", "arena_steps", "steps", "robots")
-_BY_ROBOT = ("reached", "reward", "robot_steps", "sensed", "contacts")
+_BY_ROBOT = {
+    "reached": report_rows.FLAG,
+    "reward": report_rows.NUMBER,
+    **dict.fromkeys(("robot_steps", "sensed", "contacts"), report_rows.COUNT),
+}
+_SEEDS = ValueKind(
+    "list of whole numbers",
+    lambda value: isinstance(value, list) and all(map(report_rows.COUNT.fits, value)),
+)
 _MAPS = ("settings", "versions", "device", "commit", "seconds", "compile_s")
 
 
@@ -121,19 +132,17 @@ def _read_facts(out: Path) -> Row:
         raise ConfigError(f"{out} is no reproduction: it has no {FACTS}.")
     facts = report_rows.read_object(path)
     _check_format(facts, path)
-    report_rows.check_whole(facts, ("budget", "fine_tune"), str(path))
-    seeds: Any = facts.get("seeds")
-    if not isinstance(seeds, list) or not all(map(_is_count, seeds)):
-        raise ConfigError(f"{path} has no list of whole numbers as seeds: it is damaged.")
+    report_rows.check(facts, ("budget", "fine_tune"), report_rows.WHOLE, str(path))
+    report_rows.check(facts, ("seeds",), _SEEDS, str(path))
+    seeds = facts["seeds"]
     if len(set(seeds)) < LEAST_DRAWN:
         raise ConfigError(
             f"{path} has {len(set(seeds))} seeds: an interval takes {LEAST_DRAWN} or more."
         )
-    for key in _MAPS:
-        if not isinstance(facts.get(key), dict):
-            raise ConfigError(f"{path} has no keys and values as {key}: it is damaged.")
+    report_rows.check(facts, _MAPS, report_rows.MAP, str(path))
     for key in ("seconds", "compile_s"):
-        report_rows.check_numbers(facts[key], facts[key], f"{path}, {key},")
+        number = report_rows.NUMBER_OR_NULL
+        report_rows.check(facts[key], facts[key], number, f"{path}, {key},")
     return facts
 
 
@@ -163,34 +172,13 @@ def _read_logs(run: Path, seeds: Sequence[int]) -> tuple[RunLog, ...]:
 
 def _check_episode(row: Row, where: str) -> None:
     """Refuses an episode that lacks something, or whose lists have another length."""
-    report_rows.check_whole(row, _COUNTS, where)
-    if not isinstance(row.get("stage"), str):
-        raise ConfigError(f"{where} has no name as stage: it is damaged.")
-    for key in _BY_ROBOT:
+    report_rows.check(row, _COUNTS, report_rows.WHOLE, where)
+    report_rows.check(row, ("stage",), report_rows.NAME, where)
+    for key, kind in _BY_ROBOT.items():
         found: Any = row.get(key)
         fits = isinstance(found, list) and len(found) == row["robots"] > 0
-        if not fits or not all(map(_FITS[key], found)):
+        if not fits or not all(map(kind.fits, found)):
             raise ConfigError(f"{where} has {key} that is no list of {row['robots']} values.")
-
-
-def _is_count(value: Any) -> bool:
-    """Tells whether a value is a whole number of 0 or more; truth values are none."""
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
-
-
-def _is_finite(value: Any) -> bool:
-    """Tells whether a value is a finite number; truth values are none."""
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return is_number and bool(np.isfinite(value))
-
-
-_FITS = {
-    "reached": lambda value: isinstance(value, bool),
-    "reward": _is_finite,
-    "robot_steps": _is_count,
-    "sensed": _is_count,
-    "contacts": _is_count,
-}
 
 
 def _log(rows: list[Row]) -> RunLog:
@@ -239,12 +227,8 @@ def _read_judged(
 
 def _check_judged(row: Any, where: str) -> None:
     """Refuses a row of the evaluation that lacks something."""
-    if not isinstance(row, dict):
+    if not report_rows.MAP.fits(row):
         raise ConfigError(f"{where} holds no keys and values: it is damaged.")
-    report_rows.check_whole(row, ("seed", "episodes"), where)
-    for key in ("arm", "stage"):
-        if not isinstance(row.get(key), str):
-            raise ConfigError(f"{where} has no name as {key}: it is damaged.")
-    for key in JUDGED:
-        if not _is_finite(row.get(key)):
-            raise ConfigError(f"{where} has no number as {key}: it is damaged.")
+    report_rows.check(row, ("seed", "episodes"), report_rows.WHOLE, where)
+    report_rows.check(row, ("arm", "stage"), report_rows.NAME, where)
+    report_rows.check(row, JUDGED, report_rows.NUMBER, where)

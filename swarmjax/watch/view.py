@@ -161,9 +161,10 @@ def figures(history: History) -> dict[str, bytes]:
     Returns:
         PNG files by the names in `NAMES`; those alone that say something.
     """
-    from swarmjax.report import figures as report_figures  # Matplotlib takes a second
+    from swarmjax.pages import figures as drawing  # Matplotlib takes a second
+    from swarmjax.report import figures as report_figures
 
     made = report_figures.by_stage(history)
     if len(history.names) > 1:
         made["mix"] = report_figures.mix(history, report_figures.SMALL)
-    return {name: report_figures.png(figure) for name, figure in made.items()}
+    return {name: drawing.png(figure) for name, figure in made.items()}

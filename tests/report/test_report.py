@@ -29,8 +29,8 @@ def test_a_report_is_written_beside_its_run(
     out = run / "report"
     assert {path.name for path in out.iterdir()} == {"mix.png", "success.png", "report.html"}
     page = (out / "report.html").read_text()
-    assert f"<h1>Report of {tmp_path}/a &#x27;run&#x27;</h1>" in page
-    assert "<code>python -m swarmjax.report &#x27;run=" in page
+    assert f"<h1>Report of {tmp_path}/a &#39;run&#39;</h1>" in page
+    assert "<code>python -m swarmjax.report &#39;run=" in page
     assert str(out / "report.html") in capsys.readouterr().out
 
 

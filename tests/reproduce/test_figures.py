@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from reproductions import log, reproduction, whole
 
+from swarmjax.pages import figures as drawing
 from swarmjax.reproduce import figures, measures
 from swarmjax.reproduce import rows as reproduce_rows
 from swarmjax.reproduce.raster import columns, raster
@@ -108,7 +109,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 def test_figures_of_arms_that_have_not_finished_are_left_out(drawn: dict[str, bytes]) -> None:
     lacking = {"figure9_raster", "figure9_curves", "modern_raster"}
-    assert set(drawn) == {plot.name for plot in figures.PLOTS} - lacking
+    assert set(drawn) == figures.PLOTS.keys() - lacking
     assert all(png.startswith(b"\x89PNG") for png in drawn.values())
 
 
@@ -121,8 +122,7 @@ def test_arms_keep_their_colours_in_the_file() -> None:
         stage = np.array(["paper1"] * (0 if "baseline" in arm else 350) + [LAST] * 400)[:400]
         share = 0.97 if "curriculum" in arm else 0.2 * i
         logs[arm] = [log(random.random(400) < share, stage=stage) for _ in range(3)]
-    [plot] = [plot for plot in figures.PLOTS if plot.name == "modern_curves"]
-    png = figures.png(plot.make(reproduction(logs), arms))
+    png = drawing.png(figures.PLOTS["modern_curves"].make(reproduction(logs), arms), figures.SHADES)
     image = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), float).reshape(-1, 3)
     for arm in arms:
         colour = 255 * np.array(to_rgb(figures.COLOURS[arm]))
