@@ -11,19 +11,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import matplotlib as mpl
-import numpy as np
 
 from benchmarks import key_value
-from swarmjax import command, epuck
+from swarmjax import command
 from swarmjax.config import Section, about
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate import cells
 from swarmjax.evaluate.suite_config import CellConfig, read_suite
+from swarmjax.report import levels as report_levels
 from swarmjax.task.config import TaskConfig
 from swarmjax.task.level import Level
 
 mpl.use("Agg")
-from matplotlib import patches, transforms
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
@@ -60,20 +59,8 @@ def draw(chosen: Sequence[CellConfig], number: int, out: Path) -> None:
 
 
 def _draw_level(axis: Axes, drawn: Level, name: str) -> None:
-    half = 0.5 * float(drawn.side)
-    axis.set(xlim=(-half, half), ylim=(-half, half), aspect="equal", title=name)
-    axis.add_patch(patches.Rectangle((-half, -half), 2 * half, 2 * half, fill=False, linewidth=1.5))
-    for x, y, yaw, half_x, half_y in drawn.obstacle[drawn.obstacle_present]:
-        turn = transforms.Affine2D().rotate(float(yaw)).translate(float(x), float(y))
-        corner = (-float(half_x), -float(half_y))
-        box = patches.Rectangle(corner, 2 * float(half_x), 2 * float(half_y), color="black")
-        box.set_transform(turn + axis.transData)
-        axis.add_patch(box)
-    for i in np.flatnonzero(drawn.present):
-        colour, start, target = f"C{i % 10}", drawn.start[i, :2], drawn.target[i]
-        axis.add_patch(patches.Circle(tuple(start), epuck.HULL_RADIUS, color=colour))
-        reach = TaskConfig().target_radius
-        axis.add_patch(patches.Circle(tuple(target), reach, color=colour, fill=False))
+    axis.set_title(name)
+    report_levels.draw_level(axis, drawn, TaskConfig().target_radius)
 
 
 def main(arguments: Sequence[str]) -> int:

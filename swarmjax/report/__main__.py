@@ -1,7 +1,8 @@
 """`python -m swarmjax.report run=DIR|runs=DIR,... [out=DIR]`: what runs came to.
 
-Of one run it writes `mix.png`, `success.png`, `curves.png`, `grid.png` if the stages make a grid,
-and `report.html`, which holds them all. The run may be under way or have been killed: what it has
+Of one run it writes `mix.png`, `success.png`, `curves.png`, `levels.png` and `practised.png` if
+there is a curriculum over levels, `grid.png` if the stages make a grid, and `report.html`, which
+holds them all. The run may be under way or have been killed: what it has
 not finished writing is left out. No JAX.
 
 Of several it prints a table: see `table`. With `out` it writes it there too, as `report.html` and
@@ -43,9 +44,15 @@ def write(run: Path, out: Path, made_by: str, *, send: bool = False) -> list[Pat
     history = rows.read(run)
     loggers = report_send.of_run(run, history) if send else []
     # Matplotlib takes a second, which no refusal should.
+    from swarmjax.pages import figures as drawing
     from swarmjax.report import figures as report_figures
+    from swarmjax.report import levels as report_levels
 
     figures = report_figures.draw(history)
+    best = report_levels.read(run, history.config)
+    pictures = None if best is None else report_levels.draw(best, history.config)
+    if pictures is not None:
+        figures["practised"] = drawing.png(pictures)
     page = report_page.page(f"Report of {run}", made_by, history, figures)
     written = builder.write(
         out, {f"{name}.png": png for name, png in figures.items()} | {PAGE: page.encode()}

@@ -15,7 +15,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
 
 from swarmjax.pages import figures as drawing
 from swarmjax.report import rows as report_rows
@@ -42,11 +42,12 @@ def draw(history: History) -> dict[str, bytes]:
     """Draws the figures of a run.
 
     Returns:
-      PNG files by name: `mix`, `success`, `curves` if the run wrote them down, and `grid` if the
-      stages make one. The same run gives the same files: they do not hold Matplotlib's version.
+      PNG files by name: `mix`, `success`, `curves` if the run wrote them down, `levels` if it has a
+      curriculum over levels, and `grid` if the stages make one. The same run gives the same files:
+      they do not hold Matplotlib's version.
     """
     files = {}
-    makers = {"mix": mix, "success": success, "curves": curves, "grid": grid}
+    makers = {"mix": mix, "success": success, "curves": curves, "levels": levels, "grid": grid}
     for name, make in makers.items():
         figure = make(history)
         if figure is not None:
@@ -173,6 +174,46 @@ def curves(history: History) -> Figure | None:
     return figure
 
 
+def levels(history: History) -> Figure | None:
+    """Draws what the curriculum over levels did, a colour a stage, as the mean over seeds.
+
+    None without one.
+    """
+    if history.levels is None:
+        return None
+    found = history.levels
+    ended = sum(found[f"levels_{kind}"] for kind in ("fresh", "replayed", "mutated"))
+    again = found["levels_replayed"] + found["levels_mutated"]
+    measures = {
+        "levels kept": found["levels_held"],
+        "episodes that began on them or a mutated one": _shares(again, np.asarray(ended)),
+        "success on the levels kept": found["levels_success"],
+        "mean score of the levels kept": found["levels_score"],
+    }
+    figure = Figure(figsize=(8.6, 5.2), layout="constrained")
+    panels = figure.subplots(2, 2, sharex=True).ravel()
+    colours = colormaps["viridis"](np.linspace(0.0, 1.0, len(history.names)))
+    for panel, (title, values) in zip(panels, measures.items(), strict=True):
+        for i, colour in enumerate(colours):
+            steps, seeds = _stretched(history.arena_steps, values[..., i])
+            panel.plot(steps, report_rows.together(seeds), color=colour, lw=1.6)
+        panel.set_title(title, loc="left", fontsize=10, pad=3)
+        panel.grid(visible=True, alpha=0.25)
+        panel.set_ylim(bottom=0.0)
+    panels[0].set_xlim(0, history.arena_steps[-1])
+    panels[0].xaxis.set_major_formatter(EngFormatter(sep=""))
+    for panel in panels[1:3]:
+        panel.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+    figure.supxlabel(_STEPS, fontsize=10)
+    _name_colours(figure, list(panels), history.names)
+    return figure
+
+
+def _shares(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Divides counts; nan where nothing was counted."""
+    return np.where(whole > 0, part / np.maximum(whole, 1), np.nan)
+
+
 def grid(history: History) -> Figure | None:
     """Draws the last success of each cell, robots by side, a panel for each number of obstacles.
 
@@ -238,7 +279,7 @@ def _stretched(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
     return steps[ends - 1], np.where(there, sums / np.maximum(there, 1), np.nan)
 
 
-def _name_colours(figure: Figure, axes: Axes, names: list[str]) -> None:
+def _name_colours(figure: Figure, axes: Axes | list[Axes], names: list[str]) -> None:
     """Names the bands along a strip of their colours, in their order."""
     count = len(names)
     norm = BoundaryNorm(np.arange(count + 1) - 0.5, count)

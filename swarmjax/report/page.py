@@ -25,6 +25,11 @@ _CAPTIONS = {
     "curves": "How learning went, at each update. Return and contacts are sums over an episode and "
     "means over the robots of the episodes that ended in the update; short episodes end first, so "
     "the first ones say little. Entropy is that of the policy's actions, in nats.",
+    "levels": "What the curriculum over levels did: how many levels of each stage are kept, how "
+    "many episodes began on one of them, and how those went.",
+    "practised": "The levels of each stage with the highest scores, as the newest checkpoint of "
+    "the first seed has them: success over the episodes that are remembered, and the score. Robots "
+    "are discs, their targets circles of the same colour.",
     "grid": "Success of each cell at last, in percent; grey: not a stage of this run.",
 }
 
@@ -88,7 +93,9 @@ def facts(history: History) -> list[tuple[str, str]]:
       What a line is about, and its text.
     """
     trained, names = history.config, history.names
-    options = to_dict(trained.curriculum).items()
+    stages_by = to_dict(trained.curriculum)
+    levels_by = stages_by.pop("levels")
+    options = [*stages_by.items(), *((f"levels.{key}", value) for key, value in levels_by.items())]
     seeds = f"{history.seeds[0]}" + (f" to {history.seeds[-1]}" if len(history.seeds) > 1 else "")
     spent = f"{history.updates[-1] + 1:,} of {words.count(trained.updates, 'update')}"
     time = "" if history.seconds is None else f", {words.duration(history.seconds)}"

@@ -32,6 +32,15 @@ BY_STAGE = (
     "episodes_by_stage",
 )
 _LISTS = ("mix", "weights", *BY_STAGE)
+# Of each stage what its curriculum over levels did, if there is one.
+LEVELS = (
+    "levels_fresh",
+    "levels_replayed",
+    "levels_mutated",
+    "levels_held",
+    "levels_success",
+    "levels_score",
+)
 # Of an update as a whole; the first two over the episodes that ended in it.
 CURVES = ("return", "contacts_per_robot", "policy_loss", "value_loss", "entropy")
 MANY = 9  # stages from which on each is drawn small
@@ -80,6 +89,7 @@ class History:
       seconds: of training by the last update; None if they were not written down.
       decisions: of the curriculum, as they were written down, by seed and update.
       summary: of the run, as it was written down; empty before its end.
+      levels: [N, T, S] for each name of `LEVELS`; None without a curriculum over levels.
     """
 
     config: TrainConfig
@@ -93,6 +103,7 @@ class History:
     seconds: float | None
     decisions: list[Row]
     summary: Row
+    levels: dict[str, np.ndarray] | None = None
 
     @property
     def names(self) -> list[str]:
@@ -116,7 +127,7 @@ def read(run: Path) -> History:
     stages = len(trained.stage)
     by_seed: dict[int, dict[int, Row]] = {}
     for where, raw in read_lines(run, recorder.METRICS):
-        row = _checked(raw, stages, where)
+        row = _checked(raw, stages, where, levels=trained.curriculum.levels.is_on)
         by_seed.setdefault(row["seed"], {})[row["update"]] = row
     updates = sorted(set.intersection(*map(set, by_seed.values()))) if by_seed else []
     if not updates:
@@ -192,7 +203,9 @@ def _history(
     rows = [[by_seed[seed][update] for update in updates] for seed in seeds]
     lists = np.array([[row["lists"] for row in of_seed] for of_seed in rows])
     curves = np.array([[row["curves"] for row in of_seed] for of_seed in rows])
-    columns = dict(zip(_LISTS, np.moveaxis(lists, 2, 0), strict=True))
+    every = np.moveaxis(lists, 2, 0)
+    columns = dict(zip(_LISTS, every, strict=False))
+    kept: dict[str, np.ndarray] = dict(zip(LEVELS, every[len(_LISTS) :], strict=False))
     mix = np.nan_to_num(columns["mix"])
     return History(
         config=trained,
@@ -206,23 +219,25 @@ def _history(
         seconds=rows[0][-1].get("train_s"),
         decisions=rest[0],
         summary=rest[1],
+        levels=kept or None,
     )
 
 
-def _checked(raw: Row, stages: int, where: str) -> Row:
-    """Takes out of a row what a report needs.
+def _checked(raw: Row, stages: int, where: str, *, levels: bool) -> Row:
+    """Takes out of a row what a report needs, of a curriculum over levels too if there is one.
 
     Lists become one array [.., S] of float32; the curves, which may be missing, one of nan or
     numbers.
     """
-    for key in (*_NUMBERS, *_LISTS):
+    keys = (*_LISTS, *(LEVELS if levels else ()))
+    for key in (*_NUMBERS, *keys):
         if key not in raw:
             raise ConfigError(
                 f"{where} has no {key}: the run is of a version that did not write it."
             )
     check(raw, _NUMBERS, WHOLE, where)
     check(raw, ("train_s", *CURVES), NUMBER_OR_NULL, where)
-    lists = [per_stage(raw[key], stages, f"{where} has {key}") for key in _LISTS]
+    lists = [per_stage(raw[key], stages, f"{where} has {key}") for key in keys]
     return {key: raw[key] for key in (*_NUMBERS, "train_s") if key in raw} | {
         "lists": np.array(lists),
         "curves": np.array([raw.get(key) for key in CURVES], np.float32),

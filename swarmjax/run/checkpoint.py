@@ -28,7 +28,7 @@ import numpy as np
 from absl import logging as absl_logging
 
 from swarmjax.policy import digest
-from swarmjax.run import directory, heap, hosts
+from swarmjax.run import directory, heap, hosts, practised
 from swarmjax.run.errors import CheckpointError, TrainingError
 
 # Orbax takes half a second to import, which a run spends while it compiles (`trainer`).
@@ -214,6 +214,9 @@ class Checkpoints:
             raise FileExistsError("a newer one is there")
         step = self._folder / str(update)
         directory.write_json(step / _MANIFEST, _file_digests(step))
+        best = practised.best(leaves)
+        if best is not None:
+            directory.write_json(self._run / practised.FILE, best)
         with directory.Log(self._run / directory.SAVED) as log:
             log.write([{"update": update, "digest": meta["digest"], **told}])
         self._prune()

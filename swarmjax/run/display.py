@@ -18,6 +18,7 @@ Row = Mapping[str, Any]
 LINE_SECONDS = 2.0  # least time between two plain lines
 MOST_STAGES = 8  # that the table shows one by one
 GOOD = 0.9  # share of targets above which a stage is counted
+_OF_LEVELS = ("levels kept", "success on them", "episodes on them")
 _SPEEDS = (
     ("arena steps/s", "arena_steps_per_s"),
     ("robot steps/s", "robot_steps_per_s"),
@@ -34,6 +35,21 @@ class Spread(NamedTuple):
     high: float
 
 
+class LevelsState(NamedTuple):
+    """How the levels of a stage stand that are kept, mean over seeds.
+
+    Attributes:
+      held: how many.
+      success: on them, 0 to 1; None where there are none.
+      again: share of the episodes that ended in the newest update and had begun on one of them, or
+        on a mutated one; None where none ended.
+    """
+
+    held: float
+    success: float | None
+    again: float | None
+
+
 class StageState(NamedTuple):
     """How a stage stands.
 
@@ -41,11 +57,13 @@ class StageState(NamedTuple):
       name: of the stage.
       arenas: share of the arenas that are on it, mean over seeds.
       success: share of targets by its newest verdict, over the seeds that have one; None without.
+      levels: that are kept; None without a curriculum over levels.
     """
 
     name: str
     arenas: float
     success: Spread | None
+    levels: LevelsState | None = None
 
 
 def summarize(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
@@ -112,7 +130,28 @@ def spread(values: Sequence[float | None]) -> Spread | None:
 def _stage(last: Sequence[Row], index: int, name: str) -> StageState:
     """How a stage stands by the last row of each seed."""
     arenas = sum(row["mix"][index] / sum(row["mix"]) for row in last) / len(last)
-    return StageState(name, arenas, spread([row["success_by_stage"][index] for row in last]))
+    success = spread([row["success_by_stage"][index] for row in last])
+    return StageState(name, arenas, success, _levels(last, index))
+
+
+def _levels(last: Sequence[Row], index: int) -> LevelsState | None:
+    """How the levels of a stage stand by the last row of each seed."""
+    if "levels_held" not in last[0]:
+        return None
+
+    def each(key: str) -> list[float | None]:
+        return [row[f"levels_{key}"][index] for row in last]
+
+    def total(key: str) -> float:
+        return sum(value or 0.0 for value in each(key))
+
+    success, again = spread(each("success")), total("replayed") + total("mutated")
+    ended = again + total("fresh")
+    return LevelsState(
+        held=total("held") / len(last),
+        success=None if success is None else success.mean,
+        again=again / ended if ended else None,
+    )
 
 
 @contextlib.contextmanager
@@ -215,7 +254,8 @@ def _table(summary: Row, speeds: Row, updates: int, seconds_left: float) -> Grou
     for a, b in zip(left, right, strict=True):
         table.add_row(*a, *b)
     stages = summary["stages"]
-    return Group(table, _stage_table(stages)) if len(stages) > 1 else Group(table)
+    several = len(stages) > 1 or any(stage.levels for stage in stages)
+    return Group(table, _stage_table(stages)) if several else Group(table)
 
 
 def _stage_table(stages: Sequence[StageState]) -> Table:
@@ -223,7 +263,8 @@ def _stage_table(stages: Sequence[StageState]) -> Table:
     table = Table(
         caption=_counted(stages), caption_justify="left", box=box.SIMPLE_HEAD, show_edge=False
     )
-    for heading in ("stage", "arenas", "targets reached"):
+    kept = any(stage.levels for stage in stages)
+    for heading in ("stage", "arenas", "targets reached", *(_OF_LEVELS if kept else ())):
         table.add_column(heading, justify="left" if heading == "stage" else "right")
     shown = [("", stage) for stage in stages]
     if len(stages) > MOST_STAGES:
@@ -232,8 +273,17 @@ def _stage_table(stages: Sequence[StageState]) -> Table:
         if measured:
             shown += [("best: ", measured[-1]), ("worst: ", measured[0])]
     for what, stage in shown:
-        table.add_row(f"{what}{stage.name}", f"{100 * stage.arenas:.0f} %", _percent(stage.success))
+        arenas, name = f"{100 * stage.arenas:.0f} %", f"{what}{stage.name}"
+        table.add_row(name, arenas, _percent(stage.success), *_levels_cells(stage.levels))
     return table
+
+
+def _levels_cells(levels: LevelsState | None) -> tuple[str, ...]:
+    """Writes how levels stand, for the columns `_OF_LEVELS`; nothing without a buffer."""
+    if levels is None:
+        return ()
+    shares = ("-" if x is None else f"{100 * x:.0f} %" for x in (levels.success, levels.again))
+    return (f"{levels.held:,.0f}", *shares)
 
 
 def _measured(stages: Sequence[StageState]) -> list[StageState]:

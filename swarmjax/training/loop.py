@@ -22,7 +22,7 @@ from swarmjax.shards import Shards
 from swarmjax.sim import gaps
 from swarmjax.task.episode import Ended
 from swarmjax.training import episodes, practice, promotion, rollout
-from swarmjax.training.practice import Source
+from swarmjax.training.practice import LevelSource
 from swarmjax.training.program import Program
 from swarmjax.training.rollout import Arena
 
@@ -190,7 +190,7 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     return new, metrics
 
 
-def _every_source(arenas: Arena, waiting: Arena) -> Source | None:
+def _every_source(arenas: Arena, waiting: Arena) -> LevelSource | None:
     """Lists what the episodes of a rollout begin on, [J, A]; None without a buffer of levels."""
     if arenas.source is None or waiting.source is None:
         return None
@@ -199,7 +199,7 @@ def _every_source(arenas: Arena, waiting: Arena) -> Source | None:
 
 def _practise(
     program: Program,
-    every: Source,
+    every: LevelSource,
     arenas: Arena,
     batch: Batch,
     ended: Ended,

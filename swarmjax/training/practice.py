@@ -38,7 +38,7 @@ class Gained(NamedTuple):
     steps: Array
 
 
-class Source(NamedTuple):
+class LevelSource(NamedTuple):
     """What the episode of each arena began on, [A].
 
     Attributes:
@@ -120,7 +120,7 @@ def of(
 
 def deal(
     practice: Practice, uniforms: Array, stage: Array, key: Array, shards: Shards, spacing: Spacing
-) -> Source:
+) -> LevelSource:
     """Says what each episode begins on.
 
     Args:
@@ -145,7 +145,7 @@ def deal(
         fresh = jax.vmap(lambda each: level.write_out(each, spacing, added, jnp))(fresh)
     slot = levels.choose(buffer, practice.options, stage, picks[:, :2])
     again, at = slot >= 0, jnp.maximum(slot, 0)
-    source = Source(
+    source = LevelSource(
         slot=slot,
         stage=stage.astype(jnp.int32),
         numbers=jnp.where(again[:, None], buffer.numbers.reshape(-1, count)[at], fresh),
@@ -159,7 +159,7 @@ def _nothing(slot: Array) -> Gained:
     return Gained(jnp.zeros(slot.shape), jnp.zeros(slot.shape))
 
 
-def _mutate(practice: Practice, source: Source, picks: Array) -> Source:
+def _mutate(practice: Practice, source: LevelSource, picks: Array) -> LevelSource:
     """Moves something in some of the levels [N] that are played again; picks are [N, 3]."""
     buffer, options = practice.buffer, practice.options
     if options.movable is None:
@@ -175,12 +175,12 @@ def _mutate(practice: Practice, source: Source, picks: Array) -> Source:
     )
 
 
-def is_fresh(source: Source) -> Array:
+def is_fresh(source: LevelSource) -> Array:
     """Tells which episodes speak for their stage: those on levels that are drawn for them."""
     return source.slot == FRESH
 
 
-def line_up(under_way: Source, waiting: Source) -> Source:
+def line_up(under_way: LevelSource, waiting: LevelSource) -> LevelSource:
     """Lists what every arena's episodes of a rollout begin on, in their order.
 
     Args:
@@ -197,7 +197,7 @@ def line_up(under_way: Source, waiting: Source) -> Source:
     return jax.tree.map(join, under_way, waiting)
 
 
-def current(every: Source, ended: Array) -> Source:
+def current(every: LevelSource, ended: Array) -> LevelSource:
     """Picks what each arena is on after a rollout.
 
     Args:
@@ -242,7 +242,7 @@ def gain(before: Gained, batch: Batch, over: Array) -> tuple[Array, Gained]:
     return mean, after
 
 
-def plays(every: Source, ended: Ended, loss: Array | None, config: CurriculumConfig) -> Play:
+def plays(every: LevelSource, ended: Ended, loss: Array | None, config: CurriculumConfig) -> Play:
     """Reads off what the episodes of a rollout came to.
 
     An arena that ends more episodes than waited for it begins the last one again; those count for

@@ -21,7 +21,7 @@ from swarmjax.task import stage as task_stage
 from swarmjax.training import loop, practice, rollout
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
-from swarmjax.training.practice import Source
+from swarmjax.training.practice import LevelSource
 from swarmjax.training.program import Program
 
 UPDATES = 20
@@ -37,7 +37,7 @@ class Trained(NamedTuple):
     rows: list[dict]
 
 
-def _source(state: TrainState) -> Source:
+def _source(state: TrainState) -> LevelSource:
     found = state.arenas.source
     assert found is not None
     return found

@@ -17,6 +17,8 @@ Found = dict[str, np.ndarray]
 PLAIN = ""
 # All that a run may have besides: a memory, and a critic that sees the state.
 REMEMBERS = "algo.memory=gru algo.memory_size=8 algo.critic=state"
+# A buffer of levels, which every device holds whole.
+LEVELS = "curriculum.levels.mode=value_loss curriculum.levels.buffer=60"
 
 
 def _start(
@@ -40,8 +42,8 @@ def _end(*processes: subprocess.Popen[str]) -> None:
 
 @pytest.fixture(
     scope="module",
-    params=[PLAIN, pytest.param(REMEMBERS, marks=pytest.mark.slow)],
-    ids=["plain", "remembers"],
+    params=[PLAIN, *(pytest.param(each, marks=pytest.mark.slow) for each in (REMEMBERS, LEVELS))],
+    ids=["plain", "remembers", "levels"],
 )
 def words(request: pytest.FixtureRequest) -> str:
     """What the run is told."""
@@ -91,6 +93,14 @@ def test_the_curriculum_decides_the_same(alone: Found, spread: Found, name: str)
 def test_an_update_sums_once_a_minibatch_and_five_times_more(alone: Found, spread: Found) -> None:
     assert int(alone["sums"]) == 0
     assert int(spread["sums"]) == 1 + 5  # the first is in the loop over minibatches
+
+
+def test_every_device_has_the_same_levels(words: str, alone: Found, spread: Found) -> None:
+    names = [name for name in alone if name.startswith("metrics/levels_")]
+    assert bool(names) == (words == LEVELS)
+    for name in names:
+        # Rounding: scores and successes are means of float32; counts are exact.
+        np.testing.assert_allclose(spread[name], alone[name], rtol=1e-4, err_msg=name)
 
 
 def test_the_curriculum_moves_on(alone: Found) -> None:

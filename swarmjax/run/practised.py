@@ -1,0 +1,39 @@
+"""The levels that a run practises now, of its newest checkpoint, for its report."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+FILE = "levels.json"
+BEST = 3  # levels of each stage that are written down
+_BUFFER = "curriculum/levels/"
+_TOLD = ("numbers", "score", "episodes", "successes", "generation")
+
+
+def best(leaves: Mapping[str, np.ndarray]) -> dict[str, Any] | None:
+    """Lists the levels of the buffer with the highest scores.
+
+    Args:
+      leaves: of a checkpoint, [N, ...] each.
+
+    Returns:
+      `update`, and `levels`: of each seed and stage at most `BEST`, the best first, each with the
+      `numbers` that it is drawn from, `score`, `episodes`, `successes` and `generation`; None
+      where there is no buffer.
+    """
+    if f"{_BUFFER}numbers" not in leaves:
+        return None
+    buffer = {name: leaves[f"{_BUFFER}{name}"] for name in _TOLD}
+    seeds, stages, _ = buffer["score"].shape
+    found = [
+        [_of_stage({name: x[seed, stage] for name, x in buffer.items()}) for stage in range(stages)]
+        for seed in range(seeds)
+    ]
+    return {"update": int(leaves["update"][0]), "levels": found}
+
+
+def _of_stage(buffer: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+    order = np.argsort(-buffer["score"], kind="stable")
+    chosen = order[buffer["episodes"][order] > 0][:BEST]
+    return [{name: buffer[name][at].tolist() for name in _TOLD} for at in chosen]
