@@ -1,0 +1,46 @@
+"""Cells of notebooks: a shell cell reads as shell, and one that fails names its file and line."""
+
+from typing import Any
+
+from docutils import nodes
+from sphinx.application import Sphinx
+from sphinx.util import logging
+
+_LOG = logging.getLogger(__name__)
+_SHELL = "%%bash\n"
+
+
+def _is_cell(node: nodes.Node) -> bool:
+    return isinstance(node, nodes.container) and node.get("nb_element") == "cell_code"
+
+
+def _tidy(app: Sphinx, document: nodes.document) -> None:
+    """Reports failed cells, and takes the magic word off those of a shell."""
+    for cell in document.findall(_is_cell):
+        for block in cell.findall(nodes.literal_block):
+            if "traceback" in block["classes"]:
+                _report(app, cell, block)
+            elif block.rawsource.startswith(_SHELL):
+                _as_shell(block)
+
+
+def _report(app: Sphinx, cell: Any, block: nodes.literal_block) -> None:
+    """Warns of a failed cell, with its line and the last line of its error."""
+    last = block.astext().strip().splitlines()[-1]
+    where = (app.env.docname, cell.line)
+    _LOG.warning("a cell failed: %s", last, location=where, type="site", subtype="cell")
+
+
+def _as_shell(block: nodes.literal_block) -> None:
+    """Shows the commands of a shell without the word that marks them for the notebook."""
+    text = block.rawsource.removeprefix(_SHELL)
+    block.rawsource = text
+    block["language"] = "bash"
+    block.children = []
+    block += nodes.Text(text)
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Registers the extension."""
+    app.connect("doctree-read", _tidy)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
