@@ -56,8 +56,8 @@ class GalleryConfig(Section):
     steps: int = field(
         default=1500, metadata=about("control steps at most", 1, 100_000, reason="raise steps")
     )
-    every: int = field(default=8, metadata=about("control steps from picture to picture", 1, 1000))
-    pace: int = field(default=64, metadata=about("time that a picture is shown for, ms", 10, 10000))
+    every: int = field(default=10, metadata=about("control steps from picture to picture", 1, 1000))
+    pace: int = field(default=80, metadata=about("time that a picture is shown for, ms", 10, 10000))
 
     def _check(self) -> None:
         for word in self.who:
@@ -139,9 +139,11 @@ def picture(level: Level, frame: Frame) -> Image.Image:
     image = Image.new("RGB", (edge, edge), "white")
     pen = ImageDraw.Draw(image)
     half = 0.5 * float(level.side)
-    pen.rectangle([*_pixel(-half, half, scale), *_pixel(half, -half, scale)], None, "black", 4)
+    pen.rectangle(
+        [*_pixel(-half, half, scale), *_pixel(half, -half, scale)], outline="black", width=4
+    )
     for box in level.obstacle[level.obstacle_present]:
-        pen.polygon([_pixel(x, y, scale) for x, y in _corners(box)], "black")
+        pen.polygon([_pixel(x, y, scale) for x, y in _corners(box)], fill="black")
     for robot in np.flatnonzero(level.present):
         _draw_robot(pen, level, frame, int(robot), scale)
     return image.resize((SIZE, SIZE), Image.Resampling.LANCZOS)
@@ -152,13 +154,14 @@ def _draw_robot(
 ) -> None:
     colour = _COLOURS[robot % len(_COLOURS)]
     x, y, yaw = map(float, frame.pose[robot])
-    target = _pixel(*map(float, level.target[robot]), scale)
-    pen.circle(target, TaskConfig().target_radius * scale, None, colour, 4)
-    pen.circle(_pixel(x, y, scale), epuck.HULL_RADIUS * scale, colour, colour)
+    goal_x, goal_y = map(float, level.target[robot])
+    target = _pixel(goal_x, goal_y, scale)
+    pen.circle(target, TaskConfig().target_radius * scale, outline=colour, width=4)
+    pen.circle(_pixel(x, y, scale), epuck.HULL_RADIUS * scale, fill=colour)
     nose = (x + epuck.HULL_RADIUS * math.cos(yaw), y + epuck.HULL_RADIUS * math.sin(yaw))
-    pen.line([_pixel(x, y, scale), _pixel(*nose, scale)], "white", 5)
+    pen.line([_pixel(x, y, scale), _pixel(*nose, scale)], fill="white", width=5)
     if frame.arrived[robot]:
-        pen.circle(_pixel(x, y, scale), 0.4 * epuck.HULL_RADIUS * scale, "white")
+        pen.circle(_pixel(x, y, scale), 0.4 * epuck.HULL_RADIUS * scale, fill="white")
 
 
 def _pixel(x: float, y: float, scale: float) -> tuple[float, float]:
@@ -191,8 +194,9 @@ def main(arguments: Sequence[str]) -> int:
         images = [picture(level, frame) for frame in frames]
         shown = [settings.pace] * (len(images) - 1) + [_PAUSE]
         file = out / f"{cell.name}.webp"
+        packed = {"quality": 40, "method": 6, "minimize_size": True}
         images[0].save(
-            file, save_all=True, append_images=images[1:], duration=shown, loop=0, quality=50
+            file, save_all=True, append_images=images[1:], duration=shown, loop=0, **packed
         )
         told = f"{frames[-1].arrived.sum()} of {level.present.sum()} robots arrived"
         sys.stdout.write(f"{file}: {len(images)} pictures, {told}, {file.stat().st_size:,} bytes\n")

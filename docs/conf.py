@@ -1,5 +1,6 @@
 """Builds the site: `bash .ci/docs`. The network is not needed."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -39,6 +40,7 @@ nb_execution_timeout = 900
 nb_execution_show_tb = False
 nb_merge_streams = True
 nb_output_stderr = "show"
+os.environ["TTY_COMPATIBLE"] = "0"  # a notebook asks for colours, and progress would be drawn
 
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 4

@@ -4,6 +4,7 @@ from typing import Any
 
 from docutils import nodes
 from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
 from sphinx.util import logging
 
 _LOG = logging.getLogger(__name__)
@@ -40,7 +41,16 @@ def _as_shell(block: nodes.literal_block) -> None:
     block += nodes.Text(text)
 
 
+def _spread(app: Sphinx, env: BuildEnvironment, names: list[str]) -> None:
+    """Spreads notebooks evenly over the pages: processes take several pages at a time."""
+    slow = [name for name in names if name.startswith("tutorials/")]
+    rest = [name for name in names if name not in slow]
+    places = {index * len(names) // len(slow) for index in range(len(slow))}
+    names[:] = [(slow if place in places else rest).pop(0) for place in range(len(names))]
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Registers the extension."""
     app.connect("doctree-read", _tidy)
+    app.connect("env-before-read-docs", _spread)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
