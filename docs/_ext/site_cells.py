@@ -3,6 +3,7 @@
 from typing import Any
 
 from docutils import nodes
+from nbclient import NotebookClient
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
 from sphinx.util import logging
@@ -49,8 +50,20 @@ def _spread(app: Sphinx, env: BuildEnvironment, names: list[str]) -> None:
     names[:] = [(slow if place in places else rest).pop(0) for place in range(len(names))]
 
 
+def _join_streams(app: Sphinx) -> None:
+    """Joins what a cell prints: a shell cell hands it over in pieces of a hundred bytes."""
+    execute = NotebookClient.async_execute_cell
+
+    async def joined(client: NotebookClient, cell: Any, *args: Any, **kwargs: Any) -> Any:
+        client.coalesce_streams = True
+        return await execute(client, cell, *args, **kwargs)
+
+    NotebookClient.async_execute_cell = joined
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Registers the extension."""
+    app.connect("builder-inited", _join_streams)
     app.connect("doctree-read", _tidy)
     app.connect("env-before-read-docs", _spread)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
