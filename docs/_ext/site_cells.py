@@ -58,7 +58,7 @@ def _join_streams(app: Sphinx) -> None:
         client.coalesce_streams = True
         return await execute(client, cell, *args, **kwargs)
 
-    NotebookClient.async_execute_cell = joined
+    NotebookClient.async_execute_cell = joined  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
