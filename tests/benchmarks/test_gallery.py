@@ -21,12 +21,22 @@ _LEVEL = Level(
 )
 
 
-def _at(image: Image.Image, x: float, y: float) -> tuple[int, ...]:
-    """Reads the colour at a place in metres, y up."""
+def _at(image: Image.Image, x: float, y: float) -> tuple[int, int, int]:
+    """Reads the colour at a place in metres, y up: one of the above, if it is near one.
+
+    Scaling down rings by some of 255 shades beside an edge; the colours are 100 and more apart.
+    """
+    found = _shade(image, x, y)
+    near = [c for c in (BLUE, BLACK, WHITE) if max(np.abs(np.subtract(c, found))) < 30]
+    return near[0] if near else found
+
+
+def _shade(image: Image.Image, x: float, y: float) -> tuple[int, int, int]:
     pixel = SIZE / (SIDE + 0.06)
     found = image.getpixel((round(0.5 * SIZE + x * pixel), round(0.5 * SIZE - y * pixel)))
     assert isinstance(found, tuple)
-    return found
+    red, green, blue = found
+    return int(red), int(green), int(blue)
 
 
 def _picture(arrived: bool) -> Image.Image:
