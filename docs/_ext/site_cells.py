@@ -1,5 +1,6 @@
-"""Cells of notebooks: a shell cell reads as shell, and one that fails names its file and line."""
+"""Cells of notebooks: shell reads as shell, a file as a file; a failure names file and line."""
 
+from pathlib import Path
 from typing import Any
 
 from docutils import nodes
@@ -10,6 +11,8 @@ from sphinx.util import logging
 
 _LOG = logging.getLogger(__name__)
 _SHELL = "%%bash\n"
+_FILE = "%%writefile "
+_LANGUAGES = {".yaml": "yaml", ".py": "python", ".c": "c"}
 
 
 def _is_cell(node: nodes.Node) -> bool:
@@ -17,13 +20,15 @@ def _is_cell(node: nodes.Node) -> bool:
 
 
 def _tidy(app: Sphinx, document: nodes.document) -> None:
-    """Reports failed cells, and takes the magic word off those of a shell."""
-    for cell in document.findall(_is_cell):
-        for block in cell.findall(nodes.literal_block):
+    """Reports failed cells, and takes the magic words off the others."""
+    for cell in list(document.findall(_is_cell)):
+        for block in list(cell.findall(nodes.literal_block)):
             if "traceback" in block["classes"]:
                 _report(app, cell, block)
             elif block.rawsource.startswith(_SHELL):
-                _as_shell(block)
+                _rewrite(block, block.rawsource.removeprefix(_SHELL), "bash")
+            elif block.rawsource.startswith(_FILE):
+                _as_file(cell, block)
 
 
 def _report(app: Sphinx, cell: Any, block: nodes.literal_block) -> None:
@@ -33,11 +38,25 @@ def _report(app: Sphinx, cell: Any, block: nodes.literal_block) -> None:
     _LOG.warning("a cell failed: %s", last, location=where, type="site", subtype="cell")
 
 
-def _as_shell(block: nodes.literal_block) -> None:
-    """Shows the commands of a shell without the word that marks them for the notebook."""
-    text = block.rawsource.removeprefix(_SHELL)
+def _as_file(cell: Any, block: nodes.literal_block) -> None:
+    """Shows a file under its name, and not that it was written."""
+    first, _, text = block.rawsource.partition("\n")
+    name = first.removeprefix(_FILE)
+    _rewrite(block, text, _LANGUAGES[Path(name).suffix])
+    title = nodes.paragraph("", "", nodes.literal(name, name), classes=["file-name"])
+    cell.insert(0, title)
+    for output in list(cell.findall(_is_output)):
+        output.parent.remove(output)
+
+
+def _is_output(node: nodes.Node) -> bool:
+    return isinstance(node, nodes.container) and node.get("nb_element") == "cell_code_output"
+
+
+def _rewrite(block: nodes.literal_block, text: str, language: str) -> None:
+    """Shows a cell without the word that marks it for the notebook."""
     block.rawsource = text
-    block["language"] = "bash"
+    block["language"] = language
     block.children = []
     block += nodes.Text(text)
 
