@@ -13,7 +13,7 @@ import types
 import typing
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 MAX_COUNT = 2**31 - 1  # counts and seeds are int32 on the device
 # All else is computed in float32: nothing lies beyond, and nearer to 0 a device computes with 0.
@@ -303,6 +303,47 @@ def sections(cls: type[Section]) -> dict[str, type[Section]]:
     return {name: inner for name, inner in found.items() if inner is not None}
 
 
+class KeyLine(NamedTuple):
+    """What is said about a key, as text.
+
+    Attributes:
+        key: dotted.
+        default: as it would be typed, or in angle brackets where it comes from.
+        meaning: what it is, with its unit; empty where nothing was written.
+        allowed: the type and the bounds of its values.
+    """
+
+    key: str
+    default: str
+    meaning: str
+    allowed: str
+
+
+def list_keys(cls: type[Section], chosen: Collection[str] | None = None) -> list[KeyLine]:
+    """Return what there is to say about each key.
+
+    Args:
+        cls: the section that they are of.
+        chosen: the keys to list; None for all.
+    """
+    known = keys(cls).items()
+    return [_key_line(cls, key, item) for key, item in known if chosen is None or key in chosen]
+
+
+def _key_line(cls: type[Section], key: str, item: dataclasses.Field[Any]) -> KeyLine:
+    section = key.partition(".")[0]
+    default = f"<{'required' if section == key else f'the {section}'}>"
+    if section in cls.inherited and section != key:
+        default = f"<{cls.inherited[section]}>"
+    elif item.default_factory is not dataclasses.MISSING:
+        default = show(item.default_factory(), quote="")
+    elif item.default is not dataclasses.MISSING:
+        default = show(item.default, quote="")
+    bounds = item.metadata.get("bounds", Bounds())
+    allowed = _describe(item.type, "" if bounds == Bounds() else f" {bounds}")
+    return KeyLine(key, default, item.metadata.get("meaning", ""), allowed)
+
+
 def describe_keys(cls: type[Section], chosen: Collection[str] | None = None) -> list[str]:
     """Return a line for each key: its default, its meaning and what it takes.
 
@@ -310,22 +351,10 @@ def describe_keys(cls: type[Section], chosen: Collection[str] | None = None) -> 
         cls: the section that they are of.
         chosen: the keys to describe; None for all.
     """
-    lines = []
-    for key, item in keys(cls).items():
-        if chosen is not None and key not in chosen:
-            continue
-        section = key.partition(".")[0]
-        default = f"<{'required' if section == key else f'the {section}'}>"
-        if section in cls.inherited and section != key:
-            default = f"<{cls.inherited[section]}>"
-        elif item.default_factory is not dataclasses.MISSING:
-            default = show(item.default_factory(), quote="")
-        elif item.default is not dataclasses.MISSING:
-            default = show(item.default, quote="")
-        bounds = item.metadata["bounds"]
-        allowed = _describe(item.type, "" if bounds == Bounds() else f" {bounds}")
-        lines.append(f"  {f'{key}={default}':<38}  {item.metadata['meaning']} ({allowed})")
-    return lines
+    return [
+        f"  {f'{line.key}={line.default}':<38}  {line.meaning} ({line.allowed})"
+        for line in list_keys(cls, chosen)
+    ]
 
 
 def unknown_key(key: str, cls: type[Section], where: str = "") -> ConfigError:

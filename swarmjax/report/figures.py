@@ -15,7 +15,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
+from matplotlib.ticker import MaxNLocator
 
 from swarmjax.pages import figures as drawing
 from swarmjax.report import rows as report_rows
@@ -190,7 +190,7 @@ def levels(history: History) -> Figure | None:
         "success on the levels kept": found["levels_success"],
         "mean score of the levels kept": found["levels_score"],
     }
-    figure = Figure(figsize=(8.6, 5.2), layout="constrained")
+    figure = Figure(figsize=(drawing.WIDTH, 5.2), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True).ravel()
     colours = colormaps["viridis"](np.linspace(0.0, 1.0, len(history.names)))
     for panel, (title, values) in zip(panels, measures.items(), strict=True):
@@ -201,9 +201,9 @@ def levels(history: History) -> Figure | None:
         panel.grid(visible=True, alpha=0.25)
         panel.set_ylim(bottom=0.0)
     panels[0].set_xlim(0, history.arena_steps[-1])
-    panels[0].xaxis.set_major_formatter(EngFormatter(sep=""))
+    panels[0].xaxis.set_major_formatter(drawing.thousands())
     for panel in panels[1:3]:
-        panel.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+        panel.yaxis.set_major_formatter(drawing.percent())
     figure.supxlabel(_STEPS, fontsize=10)
     _name_colours(figure, list(panels), history.names)
     return figure

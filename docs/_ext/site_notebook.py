@@ -1,0 +1,67 @@
+"""Writes the first tutorial as a notebook: `python docs/_ext/site_notebook.py`."""
+
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+_ROOT = Path(__file__).resolve().parents[2]
+TUTORIAL = _ROOT / "docs" / "tutorials" / "first-swarm.md"
+NOTEBOOK = _ROOT / "examples" / "first_swarm.ipynb"
+_CELL = re.compile(r"```\{code-cell\} ipython3\n(.*?)```\n", re.DOTALL)
+# Jupyter asks commands for colours, and progress would be drawn again and again.
+_FIRST = "%env TTY_COMPATIBLE=0"
+
+
+def cells(page: str) -> list[tuple[str, str]]:
+    """Takes a tutorial apart.
+
+    Args:
+        page: its text.
+
+    Returns:
+        Kind, `markdown` or `code`, and source of each cell.
+    """
+    body = page.split("---\n", 2)[2]
+    parts = _CELL.split(body)
+    kinds = ("markdown", "code")
+    found = [(kinds[i % 2], _source(kinds[i % 2], part)) for i, part in enumerate(parts)]
+    found = [(kind, source) for kind, source in found if source]
+    return [found[0], ("code", _FIRST), *found[1:]]
+
+
+def _source(kind: str, part: str) -> str:
+    if kind == "code":
+        return re.sub(r"^:\w+:.*\n", "", part, flags=re.MULTILINE).strip()
+    linked = re.sub(r"\]\(\.\./", "](../docs/", part)
+    return re.sub(r"\]\(([\w-]+\.md)", r"](../docs/tutorials/\1", linked).strip()
+
+
+def notebook(page: str) -> dict[str, Any]:
+    """Makes a notebook of a tutorial, without outputs.
+
+    Args:
+        page: its text.
+
+    Returns:
+        The notebook, format 4.5.
+    """
+    every = []
+    for number, (kind, source) in enumerate(cells(page)):
+        cell = {"cell_type": kind, "id": f"cell-{number}", "metadata": {}}
+        cell["source"] = source.splitlines(keepends=True)
+        every.append(cell | ({"execution_count": None, "outputs": []} if kind == "code" else {}))
+    kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
+    metadata = {"kernelspec": kernel, "language_info": {"name": "python"}}
+    return {"cells": every, "metadata": metadata, "nbformat": 4, "nbformat_minor": 5}
+
+
+def text(page: str) -> str:
+    """Writes the notebook of a tutorial as it is stored."""
+    return json.dumps(notebook(page), indent=1, ensure_ascii=False) + "\n"
+
+
+if __name__ == "__main__":
+    NOTEBOOK.write_text(text(TUTORIAL.read_text()))
+    sys.stdout.write(f"{NOTEBOOK.relative_to(_ROOT)}\n")
