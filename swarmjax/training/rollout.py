@@ -27,7 +27,7 @@ from swarmjax.task.env import EnvState, World
 from swarmjax.task.episode import Ended, Robots
 from swarmjax.task.stage import Stage
 from swarmjax.training import practice as practices
-from swarmjax.training.practice import Practice, LevelSource
+from swarmjax.training.practice import LevelSource, Practice
 from swarmjax.training.program import ACTION_SIZE, Program
 
 # Cohort of an episode that counts for none: curricula number theirs from 0, and -1 is the one
