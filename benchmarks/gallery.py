@@ -66,7 +66,7 @@ class GalleryConfig(Section):
                 raise ConfigError(f"who is {show(word)}: give CELL:NAME, NAME one of {names}.")
 
 
-class Frame(NamedTuple):
+class Moment(NamedTuple):
     """Where robots are at one moment.
 
     Attributes:
@@ -78,7 +78,7 @@ class Frame(NamedTuple):
     arrived: np.ndarray
 
 
-def drive(settings: GalleryConfig, cell: Cell, who: str | None) -> tuple[Level, list[Frame]]:
+def drive(settings: GalleryConfig, cell: Cell, who: str | None) -> tuple[Level, list[Moment]]:
     """Runs one level.
 
     Args:
@@ -107,8 +107,8 @@ def drive(settings: GalleryConfig, cell: Cell, who: str | None) -> tuple[Level, 
     return level, frames
 
 
-def _frame(arenas: engine_c.Arenas) -> Frame:
-    return Frame(np.array(arenas.pose[0]), np.array(arenas.outcome.arrived[0]))
+def _frame(arenas: engine_c.Arenas) -> Moment:
+    return Moment(np.array(arenas.pose[0]), np.array(arenas.outcome.arrived[0]))
 
 
 def _evaluation(settings: GalleryConfig, who: str | None) -> tuple[EvaluateConfig, Policy]:
@@ -124,7 +124,7 @@ def _evaluation(settings: GalleryConfig, who: str | None) -> tuple[EvaluateConfi
         return config, policy_file.read(str(path))
 
 
-def picture(level: Level, frame: Frame) -> Image.Image:
+def picture(level: Level, frame: Moment) -> Image.Image:
     """Draws one moment, SIZE pixels wide and high.
 
     Args:
@@ -150,7 +150,7 @@ def picture(level: Level, frame: Frame) -> Image.Image:
 
 
 def _draw_robot(
-    pen: ImageDraw.ImageDraw, level: Level, frame: Frame, robot: int, scale: float
+    pen: ImageDraw.ImageDraw, level: Level, frame: Moment, robot: int, scale: float
 ) -> None:
     colour = _COLOURS[robot % len(_COLOURS)]
     x, y, yaw = map(float, frame.pose[robot])

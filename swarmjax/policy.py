@@ -77,10 +77,11 @@ def load(path: str | Path | IO[bytes]) -> Policy:
         if sum(map(text.count, "[{,:")) > MAX_ENTRIES:
             raise ValueError(f"meta has more than {MAX_ENTRIES} entries")
         meta = json.loads(text)
-        history = meta.get("observation", {}).get("history", 1)
+        seen = meta.get("observation", {})
+        history = seen.get("history", 1)
         if type(history) is not int or history < 1:
             raise ValueError(f"meta.observation.history is {json.dumps(history)[:80]}")
-        hears = "neighbours" in meta["observation"]
+        hears = "neighbours" in seen
         wanted = MEMORY_FORMAT if "memory" in meta or history > 1 else FORMAT
         wanted = HEARING_FORMAT if hears else wanted
         if meta["format"] in (MEMORY_FORMAT, HEARING_FORMAT) and "network" in meta:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.gallery import SIZE, Frame, GalleryConfig, picture
+from benchmarks.gallery import SIZE, GalleryConfig, Moment, picture
 from swarmjax.config import ConfigError
 from swarmjax.task.level import Level
 
@@ -41,7 +41,7 @@ def _shade(image: Image.Image, x: float, y: float) -> tuple[int, int, int]:
 
 def _picture(arrived: bool) -> Image.Image:
     pose = np.array([[0.2, 0.1, 0.0], [5.0, 5.0, 0.0]])
-    return picture(_LEVEL, Frame(pose, np.array([arrived, False])))
+    return picture(_LEVEL, Moment(pose, np.array([arrived, False])))
 
 
 def test_a_robot_is_a_disc_around_its_place() -> None:
