@@ -152,8 +152,8 @@ def _rollouts(settings: TrainConfig) -> int:
 
 
 def _actions(program: Program, key: Array) -> Array:
-    """Uniform random actions [A, R, 2]."""
-    shape = (program.config.arenas, program.config.sim.max_robots, programs.ACTION_SIZE)
+    """Uniform random actions [A, R, U]."""
+    shape = (program.config.arenas, program.config.sim.max_robots, program.world.action_size)
     return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
 
 

@@ -320,7 +320,7 @@ class KeyLine(NamedTuple):
 
 
 def list_keys(cls: type[Section], chosen: Collection[str] | None = None) -> list[KeyLine]:
-    """Return what there is to say about each key.
+    """Return the documentation of each key.
 
     Args:
         cls: the section that they are of.

@@ -191,7 +191,7 @@ def choose(buffer: LevelBuffer, options: LevelNumbers, stage: Array, picks: Arra
     share = options.replay * jnp.mean(held.astype(jnp.float32), axis=1)
     ends = jnp.cumsum(probabilities(buffer, options), axis=1)
     ends = ends / jnp.maximum(ends[:, -1:], np.finfo(np.float32).tiny)
-    # All stages on one line, each from its own number on: one search for whatever stage.
+    # The ends of all stages on one line, each shifted by its stage: one search finds any.
     line = (ends + jnp.arange(stages)[:, None]).ravel()
     found = jnp.searchsorted(line, stage + picks[:, 1], side="right")
     # Rounding may lead beyond a stage's last level, or to the end of the stage before.
@@ -203,7 +203,7 @@ def choose(buffer: LevelBuffer, options: LevelNumbers, stage: Array, picks: Arra
 def update(
     buffer: LevelBuffer, plays: Play, config: LevelsConfig, usual: Array
 ) -> tuple[LevelBuffer, Array]:
-    """Takes the episodes of an update in: levels are scored anew, and the best that are new enter.
+    """Takes in an update's episodes: scores all levels again, and lets the best new ones enter.
 
     Args:
       buffer: before.
@@ -226,7 +226,7 @@ def mark_lost(slot: Array, taken: Array) -> Array:
 
 
 def _record(buffer: LevelBuffer, plays: Play) -> LevelBuffer:
-    """Adds what episodes on levels of the buffer came to."""
+    """Adds the outcomes of episodes on levels of the buffer."""
     count = buffer.score.size
 
     def total(value: Array, mine: Array) -> Array:
@@ -252,7 +252,7 @@ def _record(buffer: LevelBuffer, plays: Play) -> LevelBuffer:
 
 
 def _score(buffer: LevelBuffer, config: LevelsConfig, usual: Array) -> LevelBuffer:
-    """Scores all levels anew."""
+    """Scores all levels again."""
     found = _SCORES[_mode(config)](
         buffer.episodes, buffer.successes, buffer.loss, jnp.asarray(usual)[:, None]
     )

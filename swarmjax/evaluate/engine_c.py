@@ -291,7 +291,7 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
             raise PolicyError("the policy remembers: give the action, as `by_policy` chooses it.")
         _, action = by_policy(judge).act(None, arenas)
     active = arrival.drives(task.arrival, before)
-    memory, pose, impulse = _drive(judge, arenas, action[..., :2], active)
+    memory, pose, impulse = _drive(judge, arenas, action[..., : sim_drive.COMMAND_SIZE], active)
     sight = look(judge, arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)
     arrived = arrival.arrived(task.arrival, before, sight.distance <= task.target_radius)
     touches = touching(judge, arenas.data)
@@ -335,11 +335,9 @@ def _hear(
     settings = judge.electronics.neighbours
     if not settings.count:
         return sight
-    if said is None:
-        said = np.zeros((*pose.shape[:2], settings.message_size), np.float32)
     hidden = rays.hidden(judge.scene, data, pose, obstacle, settings.range)
     present = np.ones(pose.shape[:2], bool)  # the judge has no other robots
-    return sight._replace(heard=hearing.reachable(pose, present, hidden, said, settings.range, np))
+    return sight._replace(heard=hearing.reachable(pose, present, hidden, said, settings, np))
 
 
 class _Step(NamedTuple):

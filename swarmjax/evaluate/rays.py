@@ -92,7 +92,7 @@ def hidden(
         data: [A] of `MjData`, positions up to date, each of a model whose boxes have its sizes.
         pose: [A, R, 3] x (m), y (m), yaw (rad).
         obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
-        reach: Beyond which nobody asks, m.
+        reach: Farthest that two robots hear each other, m.
 
     Returns:
         [A, R, R] bool; False of pairs beyond reach.

@@ -66,9 +66,9 @@ def bind_memory(config: AlgoConfig) -> AlgoConfig:
     asked = config.memory != "none" and config.update_backend == "auto" and _has_fast()
     if not asked or not _has_tensor_cores() or _is_full_precision():
         return config
-    from swarmjax.ppo.fast import recurrence
+    from swarmjax.ppo.fast import kernel, recurrence
 
-    fitting = recurrence.fits(config.memory_size or 0)
+    fitting = recurrence.fits(config.memory_size or 0, kernel.shared_memory())
     return replace(config, memory_kernels=recurrence) if fitting else config
 
 

@@ -6,6 +6,8 @@ from swarmjax.sim.config import RobotConfig
 
 Array = Any
 
+COMMAND_SIZE = 2  # numbers of an action that drive: forward speed and turn rate
+
 
 class Drive(NamedTuple):
     """The numbers of a differential drive.

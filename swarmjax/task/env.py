@@ -41,8 +41,6 @@ from swarmjax.task.factors import Factors
 from swarmjax.task.level import Level, Spacing
 from swarmjax.task.stage_config import StageConfig, make_room
 
-COMMAND_SIZE = 2  # forward speed and turn rate
-
 
 @dataclass(frozen=True, eq=False)
 class World:
@@ -78,7 +76,7 @@ class World:
     @property
     def action_size(self) -> int:
         """Numbers of an action, U: the command, then what is broadcast."""
-        return COMMAND_SIZE + self.electronics.neighbours.message_size
+        return sim_drive.COMMAND_SIZE + self.electronics.neighbours.message_size
 
 
 @struct.dataclass
@@ -401,7 +399,7 @@ def _move(
 
 
 def _look(world: World, pose: Array, level: Level, factors: Factors, said: Array | None) -> Sight:
-    """Works out what there is to be sensed at poses [R, 3], where this was said [R, M]."""
+    """Works out what can be sensed at poses [R, 3], after robots said this [R, M]."""
     distance, bearing = observation.to_target(pose, level.target, jnp)
     radius, reach = world.robot.hull_radius, world.electronics.reach
     mount, shades = task_electronics.mount(factors), task_electronics.reflectance(factors)
@@ -436,10 +434,8 @@ def _hear(world: World, sight: Sight, pose: Array, level: Level, said: Array | N
     settings = world.electronics.neighbours
     if not settings.count:
         return sight
-    if said is None:
-        said = jnp.zeros((len(pose), settings.message_size))
     hidden = hearing.hidden(pose, level.obstacle, jnp)
-    found = hearing.reachable(pose, level.present, hidden, said, settings.range, jnp)
+    found = hearing.reachable(pose, level.present, hidden, said, settings, jnp)
     return sight._replace(heard=found)
 
 
@@ -449,8 +445,8 @@ def _fill(
     """Adds what only the terms of an extension look at, if there are any."""
     if not world.terms:
         return step
-    if world.action_size > COMMAND_SIZE:  # terms see what moves the robot
-        action = action[:, :COMMAND_SIZE]
+    if world.action_size > sim_drive.COMMAND_SIZE:  # terms see what moves the robot
+        action = action[:, : sim_drive.COMMAND_SIZE]
     return step._replace(
         outside=~state.arrived,
         pose_before=physics.poses(world.physics, state.sim),

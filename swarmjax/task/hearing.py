@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from swarmjax.sim import infrared, noise
+from swarmjax.sim.drive import COMMAND_SIZE
 from swarmjax.sim.noise import Stream
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import NeighboursConfig
@@ -19,7 +20,7 @@ Array = Any
 
 
 class Heard(NamedTuple):
-    """What there is to be heard.
+    """What can be heard.
 
     Attributes:
       distance: [..., R, R] from the one that hears (first) to the one that sends, m; inf where
@@ -34,7 +35,12 @@ class Heard(NamedTuple):
 
 
 def reachable(
-    pose: Array, present: Array, hidden: Array, message: Array, reach: float, xp: Any
+    pose: Array,
+    present: Array,
+    hidden: Array,
+    message: Array | None,
+    settings: NeighboursConfig,
+    xp: Any,
 ) -> Heard:
     """Works out who could hear whom.
 
@@ -42,17 +48,25 @@ def reachable(
       pose: [..., R, 3] x (m), y (m), yaw (rad).
       present: [..., R] whether the robot takes part.
       hidden: [..., R, R] whether a wall or a box is between two robots.
-      message: [..., R, M] what each broadcast.
-      reach: between centres, m.
+      message: [..., R, M] what each broadcast; None before anything was.
+      settings: range and numbers of a message.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      What there is to be heard.
+      What can be heard.
     """
+    if message is None:
+        message = xp.zeros((*pose.shape[:-1], settings.message_size), xp.float32)
     x, y, distance = _apart(pose, xp)
     bearing = xp.arctan2(y, x) - pose[..., :, None, 2]
     other = ~np.eye(pose.shape[-2], dtype=bool)
-    hears = present[..., :, None] & present[..., None, :] & other & ~hidden & (distance <= reach)
+    hears = (
+        present[..., :, None]
+        & present[..., None, :]
+        & other
+        & ~hidden
+        & (distance <= settings.range)
+    )
     return Heard(xp.where(hears, distance, xp.inf), bearing, message)
 
 
@@ -93,7 +107,7 @@ def listen(
     """Lists the nearest neighbours of each robot whose packets arrive.
 
     Args:
-      heard: what there is to be heard.
+      heard: what can be heard.
       settings: how many are listed.
       realism: packets that are lost, and noise.
       seed: [...] uint32 of the episode; None where nothing is random.
@@ -102,7 +116,7 @@ def listen(
 
     Returns:
       [..., R, K W], nearest first: 1 for one that is there, distance (m), cosine and sine of the
-      bearing, message; 0 where nobody is.
+      bearing, message; 0 in place of those that are missing.
     """
     distance, bearing, message = heard
     robots = distance.shape[-1]
@@ -131,8 +145,8 @@ def listen(
     found = xp.stack([xp.where(is_there, row, 0.0) for row in rows], axis=-1)
     found = found.reshape((*found.shape[:-2], kept * settings.width))
     lacking = (settings.count - kept) * settings.width
-    nobody = xp.zeros((*found.shape[:-1], lacking), found.dtype)
-    return xp.concatenate([found, nobody], axis=-1) if lacking else found
+    missing = xp.zeros((*found.shape[:-1], lacking), found.dtype)
+    return xp.concatenate([found, missing], axis=-1) if lacking else found
 
 
 def _draw(
@@ -158,7 +172,7 @@ def broadcast(action: Array, size: int, active: Array, xp: Any) -> Array:
     """Takes what robots broadcast out of their actions.
 
     Args:
-      action: [..., R, 2 + M], or only the first two, of who says nothing.
+      action: [..., R, 2 + M], or only the first two, of a robot that says nothing.
       size: M.
       active: [..., R] who may act; others are silent, and 0 is heard of them.
       xp: `numpy` or `jax.numpy`.
@@ -166,7 +180,7 @@ def broadcast(action: Array, size: int, active: Array, xp: Any) -> Array:
     Returns:
       [..., R, M] within -1..1.
     """
-    said = xp.clip(action[..., 2:], -1.0, 1.0)
+    said = xp.clip(action[..., COMMAND_SIZE:], -1.0, 1.0)
     if said.shape[-1] < size:
         said = xp.zeros((*said.shape[:-1], size), action.dtype)
     return xp.where(active[..., None], said, 0.0)

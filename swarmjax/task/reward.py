@@ -93,7 +93,7 @@ def robot_contact(step: Step) -> Array:
 
 
 def touching(step: Step) -> Array:
-    """1 where the robot touches something after the step, of whatever kind.
+    """1 where the robot touches something of any kind after the step.
 
     `contact` alone is paid once however long a robot then leans against a wall.
     """

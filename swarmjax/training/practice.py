@@ -243,7 +243,7 @@ def gain(before: Gained, batch: Batch, over: Array) -> tuple[Array, Gained]:
 
 
 def plays(every: LevelSource, ended: Ended, loss: Array | None, config: CurriculumConfig) -> Play:
-    """Reads off what the episodes of a rollout came to.
+    """Reads off the outcomes of the episodes of a rollout.
 
     An arena that ends more episodes than waited for it begins the last one again; those count for
     no level: a short episode would count more often than a long one.

@@ -12,12 +12,13 @@ from swarmjax.ppo import dispatch, networks
 from swarmjax.ppo.dispatch import Backend
 from swarmjax.provenance import cores
 from swarmjax.shards import Shards
+from swarmjax.sim import drive
 from swarmjax.task import env, surroundings
 from swarmjax.task.env import World
 from swarmjax.training import episodes, practice
 from swarmjax.training.config import ProgramConfig
 
-ACTION_SIZE = env.COMMAND_SIZE  # of robots that broadcast nothing
+ACTION_SIZE = drive.COMMAND_SIZE  # of robots that broadcast nothing
 MAX_ROWS = 4096  # updates that a call can report, over all seeds; a longer chunk is several calls
 
 

@@ -353,15 +353,22 @@ def test_contacts_are_counted_by_kind(episode: Episode) -> None:
     assert expected[RANDOM].sum() >= 3
 
 
+def _priced(
+    world: World, start: EnvState, actions: np.ndarray, arena: int, **weights: float
+) -> env.TimeStep:
+    """Drives one arena again, with other weights of the reward."""
+    task = world.task
+    priced = dataclasses.replace(task, reward=dataclasses.replace(task.reward, **weights))
+    step = functools.partial(env.step, dataclasses.replace(world, task=priced))
+    state = jax.tree.map(lambda x: x[arena], start)
+    drive = jax.jit(lambda state, chosen: jax.lax.scan(step, state, chosen))
+    return drive(state, jnp.asarray(actions[:, arena]))[1]
+
+
 def test_a_contact_of_robots_is_charged_to_the_one_on_its_way(
     tiny_world: World, start: EnvState, actions: np.ndarray, episode: Episode
 ) -> None:
-    task = tiny_world.task
-    priced = dataclasses.replace(task, reward=dataclasses.replace(task.reward, robot_contact=-0.5))
-    step = functools.partial(env.step, dataclasses.replace(tiny_world, task=priced))
-    arena = jax.tree.map(lambda x: x[PUSHING], start)
-    drive = jax.jit(lambda state, chosen: jax.lax.scan(step, state, chosen))
-    _, came = drive(arena, jnp.asarray(actions[:, PUSHING]))
+    came = _priced(tiny_world, start, actions, PUSHING, robot_contact=-0.5)
     charged = np.asarray(came.reward) - episode.came.reward[:, PUSHING]
     # 1e-5: another program, whose roundings contacts multiply.
     np.testing.assert_allclose(charged.sum(axis=0), [0.0, -0.5, 0.0], atol=1e-5)
@@ -370,13 +377,8 @@ def test_a_contact_of_robots_is_charged_to_the_one_on_its_way(
 def test_leaning_is_charged_in_every_step(
     tiny_world: World, start: EnvState, actions: np.ndarray, episode: Episode
 ) -> None:
-    task = tiny_world.task
-    priced = dataclasses.replace(task, reward=dataclasses.replace(task.reward, touching=-0.5))
-    step = functools.partial(env.step, dataclasses.replace(tiny_world, task=priced))
-    arena = jax.tree.map(lambda x: x[BUMPING], start)
-    drive = jax.jit(lambda state, chosen: jax.lax.scan(step, state, chosen))
-    _, came = drive(arena, jnp.asarray(actions[:, BUMPING]))
-    side, obstacle = (np.asarray(x) for x in (arena.level.side, arena.level.obstacle))
+    came = _priced(tiny_world, start, actions, BUMPING, touching=-0.5)
+    side, obstacle = (np.asarray(x[BUMPING]) for x in (start.level.side, start.level.obstacle))
     gap = np.stack(
         [gaps.gaps(pose, side, obstacle, HULL, np) for pose in episode.pose[1:, BUMPING]]
     )

@@ -41,7 +41,7 @@ def _listen(
     config = NeighboursConfig(count=count, message_size=said.shape[-1])
     obstacle, pose = xp.asarray(obstacle, xp.float32), xp.asarray(pose)
     hidden = hearing.hidden(pose, obstacle, xp)
-    heard = hearing.reachable(pose, xp.asarray(present), hidden, xp.asarray(said), 0.7, xp)
+    heard = hearing.reachable(pose, xp.asarray(present), hidden, xp.asarray(said), config, xp)
     drawn = None if seed is None else xp.asarray(seed, xp.uint32)
     found = hearing.listen(heard, config, RealismConfig(**realism), drawn, xp.asarray(3), xp)
     return np.asarray(found).reshape(len(pose), count, -1)

@@ -38,9 +38,6 @@ LAUNCH = Launch(tile=64, programs=264, warps=4)
 LARGE = Launch(tile=128, programs=264, warps=8)
 # Of a minibatch: with fewer, one tile more or less would make minibatches too unlike.
 _LEAST_TILES = 8
-# By compute capability, bytes, where a program may have more than the least: CUDA C++ Programming
-# Guide, "Technical Specifications per Compute Capability".
-_MEMORY = {"8.0": 163 * 1024, "9.0": 227 * 1024, "10.0": 227 * 1024}
 
 _Run = functools.partial[tuple[jax.Array, Metrics]]
 Flat = dict[str, jax.Array]  # a vector for each network, in the order of its tree's leaves
@@ -76,14 +73,8 @@ def choose_launch(
     """
     if samples is not None and samples < _LEAST_TILES * config.num_minibatches * LARGE.tile:
         return LAUNCH
-    memory = _MEMORY.get(_capability(), kernel.SHARED_MEMORY)
     sizes = (observation_size, config.hidden_sizes, action_size)
-    return LARGE if kernel.fits(*sizes, LARGE.tile, memory) else LAUNCH
-
-
-def _capability() -> str:
-    """The compute capability of the GPU that JAX computes on, such as 9.0; no text of others."""
-    return str(getattr(jax.devices()[0], "compute_capability", ""))
+    return LARGE if kernel.fits(*sizes, LARGE.tile, kernel.shared_memory()) else LAUNCH
 
 
 def gradient(

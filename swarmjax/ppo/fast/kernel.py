@@ -26,6 +26,8 @@ MOST_WIDTH = 128
 # Programming Guide, "Technical Specifications per Compute Capability"); other products than those
 # of 9.0, which `fits` counts, take up to 4 more.
 SHARED_MEMORY = 95 * 1024
+# By compute capability, bytes, where a program may have more than the least: as above.
+_MORE_SHARED_MEMORY = {"8.0": 163 * 1024, "9.0": 227 * 1024, "10.0": 227 * 1024}
 
 
 class Layer(NamedTuple):
@@ -102,6 +104,12 @@ Loss = Callable[[jax.Array, Samples, dict[str, jax.Array]], tuple[jax.Array, dic
 
 
 _Activations = list[tuple[jax.Array, jax.Array]]
+
+
+def shared_memory() -> int:
+    """Returns how many bytes a program may have on the chip that JAX computes on."""
+    capability = str(getattr(jax.devices()[0], "compute_capability", ""))
+    return _MORE_SHARED_MEMORY.get(capability, SHARED_MEMORY)
 
 
 def padded_width(width: int) -> int:
@@ -324,16 +332,17 @@ def _outer(features: jax.Array, slope: jax.Array) -> jax.Array:
 
 
 def _swish(before: jax.Array) -> jax.Array:
-    return before * _logistic(before)
+    return before * logistic(before)
 
 
-def _logistic(x: jax.Array) -> jax.Array:
+def logistic(x: jax.Array) -> jax.Array:
+    """Computes 1 / (1 + exp(-x)), of what Triton knows."""
     return 1.0 / (1.0 + jnp.exp(-x))
 
 
 def _slope_of_swish(before: jax.Array, after: jax.Array) -> jax.Array:
     """The derivative of z s(z), s + z s (1 - s), since that of the logistic s is s (1 - s)."""
-    share = _logistic(before)
+    share = logistic(before)
     return share + after * (1.0 - share)
 
 

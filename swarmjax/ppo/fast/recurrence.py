@@ -16,6 +16,8 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
+from swarmjax.ppo.fast.kernel import logistic
+
 # Sequences of a tile. On an H100 a program of 8 warps takes twice as long back through 64 of them,
 # and one of 4 warps longer through 32 (docs/performance.md).
 TILE = 32
@@ -88,9 +90,20 @@ class _Gates(NamedTuple):
     recalled: jax.Array
 
 
-def fits(size: int) -> bool:
-    """Says whether the kernels take a memory of H numbers."""
-    return size in _SIZES
+def fits(size: int, shared_memory: int) -> bool:
+    """Says whether the kernels take a memory: its width, and the room on the chip.
+
+    What lies there is the kernel of what is recalled twice, the second time turned over for the way
+    back, with four tiles of memories and slopes.
+
+    Args:
+        size: H.
+        shared_memory: Of a program, bytes.
+
+    Returns:
+        Whether `remember_all` may be called.
+    """
+    return size in _SIZES and 4 * (2 * size * 3 * size + 4 * TILE * size) <= shared_memory
 
 
 def remember_all(
@@ -274,7 +287,7 @@ def _gates(seen: Any, rows: _Rows, before: jax.Array, unit: _Unit) -> _Gates:
         found = _load(seen, rows, gate * size, size) + unit.biases_seen[gate][None, :]
         return found, jnp.dot(before, unit.kernels[gate]) + unit.biases[gate][None, :]
 
-    reset, update = (_logistic(jnp.add(*of(gate))) for gate in (0, 1))
+    reset, update = (logistic(jnp.add(*of(gate))) for gate in (0, 1))
     candidate, recalled = of(2)
     return _Gates(reset, update, jnp.tanh(candidate + reset * recalled), recalled)
 
@@ -294,10 +307,6 @@ def _slopes(slope: jax.Array, gates: _Gates, before: jax.Array) -> tuple[_Three,
     by_reset = by_candidate * recalled * reset * (1.0 - reset)
     seen = (by_reset, by_update, by_candidate)
     return seen, (by_reset, by_update, by_candidate * reset), slope * update
-
-
-def _logistic(x: jax.Array) -> jax.Array:
-    return 1.0 / (1.0 + jnp.exp(-x))
 
 
 def _own(count: int) -> _Rows:
