@@ -4,12 +4,14 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.config.section import MAX_COUNT
 
 # The options of a curriculum that not all modes take: those that do, and what null stands for.
 _STEPWISE = ("sequential", "mixed")
 
 
 _MODE_OPTIONS: dict[str, tuple[tuple[str, ...], float | str | None]] = {
+    "prerequisites": (("adaptive",), 0),
     "threshold": (_STEPWISE, 0.8),
     "demotion": (_STEPWISE, None),
     "budget_share": (_STEPWISE, 0.5),
@@ -22,6 +24,8 @@ _MODE_OPTIONS: dict[str, tuple[tuple[str, ...], float | str | None]] = {
     "exploration": (_STEPWISE, "keep"),
     "newcomers": (_STEPWISE, "copy"),
 }
+# Options that say when a stage is left, which the adaptive mode does where it has prerequisites.
+_LEAVING = ("threshold", "budget_share")
 
 
 _BUFFERED = ("learnability", "value_loss")
@@ -152,7 +156,11 @@ class CurriculumConfig(Section):
     )
     threshold: float | None = field(
         default=None,
-        metadata=about("success that promotes; null: 0.8 [sequential, mixed]", 0.0, 1.0),
+        metadata=about(
+            "success that promotes; null: 0.8 [sequential, mixed, adaptive with prerequisites]",
+            0.0,
+            1.0,
+        ),
     )
     demotion: float | None = field(
         default=None,
@@ -165,8 +173,8 @@ class CurriculumConfig(Section):
     budget_share: float | None = field(
         default=None,
         metadata=about(
-            "share of the budget for all stages before the last, in equal parts; null: 0.5 "
-            "[sequential, mixed]",
+            "share of the budget for all stages before the last, in equal parts, or at most for the "
+            "prerequisites; null: 0.5 [sequential, mixed, adaptive with prerequisites]",
             above=0.0,
             below=1.0,
         ),
@@ -182,6 +190,15 @@ class CurriculumConfig(Section):
         metadata=about(
             "learnability: p (1 - p) of success p; progress: how fast it changes; failure: 1 - p; "
             "null: learnability [adaptive]"
+        ),
+    )
+    prerequisites: int | None = field(
+        default=None,
+        metadata=about(
+            "stages at the front that are practised alone until each of them succeeds; null: 0 "
+            "[adaptive]",
+            0,
+            MAX_COUNT,
         ),
     )
     floor: float | None = field(
@@ -226,6 +243,8 @@ class CurriculumConfig(Section):
         for key, (modes, default) in _MODE_OPTIONS.items():
             value = getattr(self, key)
             plain = getattr(CurriculumConfig, key)
+            if key in _LEAVING and self.prerequisites:
+                modes = (*modes, "adaptive")
             if self.mode not in modes and value != plain:
                 raise ConfigError(
                     f"{key} is {show(value, quote='')}, but mode is {self.mode}: {key} is an "

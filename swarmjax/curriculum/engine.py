@@ -212,7 +212,8 @@ def schedule(
 ) -> Schedule:
     """Works the curriculum's numbers out.
 
-    The stages before the last share `budget_share` of the updates in equal parts.
+    The stages before the last share `budget_share` of the updates in equal parts; prerequisites
+    may take all of it.
 
     Args:
       stages: S, in order.
@@ -229,6 +230,8 @@ def schedule(
     if options.budget_share is not None:
         share = options.budget_share * updates / max(len(stages) - 1, 1)
         deadline[:-1] = [math.ceil(share * (i + 1)) for i in range(len(stages) - 1)]
+    if options.prerequisites:
+        deadline[:-1] = [deadline[-2]] * (len(stages) - 1)
     return Schedule(
         stages=task_stage.stack(stages, drawings),
         deadline=np.array(deadline, np.int32),

@@ -100,6 +100,10 @@ def adaptive(
     al. 2021, arXiv:2106.14876). `failure` is 1 - p: where all stages can be solved, the one that
     never succeeds is practised most, which `learnability` leaves to the floor.
 
+    With `prerequisites` the first stages of the sequence are practised alone, until all of them
+    succeed at `threshold` or the deadline is past. What they teach is then there before the rest
+    teaches something else.
+
     Args:
       curriculum: as in `sequential`.
       schedule: likewise.
@@ -108,23 +112,45 @@ def adaptive(
       update: likewise.
 
     Returns:
-      What to do from the next update on; the newest stage is always the last.
+      What to do from the next update on; the newest stage is the last that is practised.
     """
-    stages = curriculum.weights.shape[0]
     assert options.score is not None  # an option of this mode: the config has filled it in
-    found = _SCORES[options.score](curriculum.record)
+    stage, reason = _unlock(curriculum, schedule, options, verdict, update)
+    practised = jnp.arange(curriculum.weights.shape[0]) <= stage
+    count = jnp.sum(practised, dtype=jnp.float32)
+    found = jnp.where(practised, _SCORES[options.score](curriculum.record), 0.0)
     total = jnp.sum(found)
-    share = jnp.where(total > 0.0, found / jnp.where(total > 0.0, total, 1.0), 1.0 / stages)
+    share = jnp.where(total > 0.0, found / jnp.where(total > 0.0, total, 1.0), 1.0 / count)
     floor = jnp.asarray(schedule.floor)
-    weights = floor / stages + (1.0 - floor) * share
+    weights = jnp.where(practised, floor / count + (1.0 - floor) * share, 0.0)
     if options.shares == "robots":
         weights = _per_robot(weights, jnp.asarray(schedule.stages.robots))
-    reason = jnp.where(verdict.over & jnp.any(verdict.judged), REWEIGHED, STAYED)
     return StageChoice(
-        stage=jnp.full_like(curriculum.stage, stages - 1),
+        stage=stage,
         weights=jnp.where(verdict.over, weights, curriculum.weights),
-        reason=reason.astype(jnp.int32),
+        reason=reason,
     )
+
+
+def _unlock(
+    curriculum: Curriculum,
+    schedule: Schedule,
+    options: CurriculumConfig,
+    verdict: CohortVerdict,
+    update: Array,
+) -> tuple[Array, Array]:
+    """Returns the last stage that is practised, and why the weights change."""
+    reweighed = jnp.where(verdict.over & jnp.any(verdict.judged), REWEIGHED, STAYED)
+    last = jnp.full_like(curriculum.stage, curriculum.weights.shape[0] - 1)
+    if not options.prerequisites:
+        return last, reweighed.astype(jnp.int32)
+    first = options.prerequisites
+    passed = jnp.all(curriculum.record.fast[:first] >= schedule.threshold)
+    late = update + 1 >= jnp.asarray(schedule.deadline)[first - 1]
+    unlocked = curriculum.stage == last
+    opens = verdict.over & (passed | late) & ~unlocked
+    reason = jnp.where(opens, jnp.where(passed, BY_THRESHOLD, BY_BUDGET), reweighed)
+    return jnp.where(unlocked | opens, last, first - 1), reason.astype(jnp.int32)
 
 
 def _step(

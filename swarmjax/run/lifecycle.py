@@ -409,7 +409,7 @@ def _own_pieces(settings: TrainConfig) -> str:
 def _short_budget(settings: TrainConfig, schedule: Schedule) -> list[str]:
     """Says where stages need more of the budget than they are to have, in no or one sentence."""
     share = settings.curriculum.budget_share
-    if share is None:
+    if share is None or settings.curriculum.prerequisites:
         return []
     begins, latest = curriculum.last_begins(schedule), math.ceil(share * settings.updates)
     if begins <= latest:

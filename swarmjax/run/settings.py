@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from swarmjax import extension
+from swarmjax import extension, words
 from swarmjax.config import (
     ConfigError,
     Section,
@@ -163,6 +163,7 @@ class TrainConfig(ProgramConfig):
                 f"{MAX_COUNT}: give at most {MAX_COUNT - self.seeds + 1}."
             )
         self._check_stages()
+        self._check_prerequisites()
         self._check_devices()
         self._check_budget()
         self._check_counts()
@@ -192,6 +193,14 @@ class TrainConfig(ProgramConfig):
                         f"{where}{key} is {value}, but sim.max_{key} is {most}: "
                         f"give {least} to {most}."
                     )
+
+    def _check_prerequisites(self) -> None:
+        first, stages = self.curriculum.prerequisites or 0, len(self.stage)
+        if first and first >= stages:
+            raise ConfigError(
+                f"curriculum.prerequisites is {first}, but there are {words.count(stages, 'stage')}: "
+                f"give at most {stages - 1}."
+            )
 
     def _check_devices(self) -> None:
         share = self.arena_devices

@@ -47,6 +47,7 @@ SEQUENTIAL, MIXED = (CurriculumConfig(mode=mode) for mode in ("sequential", "mix
 ADAPTIVE = CurriculumConfig(mode="adaptive")
 PROGRESS = CurriculumConfig(mode="adaptive", score="progress")
 FAILURE = CurriculumConfig(mode="adaptive", score="failure")
+AFTER_TWO = CurriculumConfig(mode="adaptive", prerequisites=2)
 
 _advance = jax.jit(curriculum.advance, static_argnums=(2, 3))
 
@@ -202,6 +203,53 @@ def test_adaptive_weighs_by_its_score(
     expected = 0.1 / 4 + 0.9 * np.array(score) / sum(score)
     np.testing.assert_allclose(found.weights, expected, rtol=1e-5)  # float32, differences of it
     assert (int(found.stage), int(found.reason)) == (3, REWEIGHED)
+
+
+@pytest.mark.parametrize(
+    ("newest", "fast", "update", "to", "reason"),
+    [
+        (1, [0.79, 0.9, NAN, NAN], 3, 1, REWEIGHED),
+        (1, [0.9, NAN, NAN, NAN], 3, 1, REWEIGHED),
+        (1, [0.8, 0.8, NAN, NAN], 3, 3, BY_THRESHOLD),
+        (1, [0.5, 0.0, NAN, NAN], 48, 1, REWEIGHED),
+        (1, [0.5, 0.0, NAN, NAN], 49, 3, BY_BUDGET),
+        (3, [0.1, 0.0, 0.5, 0.5], 50, 3, REWEIGHED),  # what is unlocked stays unlocked
+    ],
+)
+def test_prerequisites_are_practised_alone_until_each_succeeds(
+    newest: int, fast: list[float], update: int, to: int, reason: int
+) -> None:
+    numbers = _schedule(4, deadline=np.array([50, 50, 50, NEVER], np.int32))
+    state = _known(_state(newest, 4), fast, [0.0] * 4)
+    found = _choose(AFTER_TWO, state, numbers, _verdict([0.5] * 4), update)
+    assert (int(found.stage), int(found.reason)) == (to, reason)
+    locked = to == 1
+    assert (np.asarray(found.weights) > 0.0).tolist() == [True, True, not locked, not locked]
+    assert float(jnp.sum(found.weights)) == pytest.approx(1.0, abs=1e-6)  # float32
+
+
+def test_prerequisites_are_left_at_the_end_of_a_cohort() -> None:
+    state = _known(_state(1, 4), [1.0, 1.0, NAN, NAN], [1.0] * 4)
+    found = _choose(AFTER_TWO, state, _schedule(4), _verdict([1.0] * 4, over=False), 3)
+    assert (int(found.stage), int(found.reason)) == (1, STAYED)
+
+
+def test_a_run_begins_on_its_prerequisites() -> None:
+    found = curriculum.init(_schedule(4), AFTER_TWO, MODES["adaptive"])
+    assert found.weights.tolist() == [0.5, 0.5, 0.0, 0.0]
+
+
+def test_prerequisites_may_take_their_share_of_the_budget() -> None:
+    chosen = tuple(StageConfig(name=f"s{i}", robots=1, side=1.0) for i in range(4))
+    for first in (1, 3):
+        found = curriculum.schedule(
+            chosen,
+            CurriculumConfig(mode="adaptive", prerequisites=first, budget_share=0.25),
+            updates=100,
+            step_limit=10,
+            rollout=10,
+        )
+        assert found.deadline.tolist() == [25, 25, 25, NEVER]
 
 
 def test_shares_of_robots_give_stages_of_many_robots_fewer_arenas() -> None:

@@ -15,7 +15,8 @@ pytestmark = pytest.mark.skipif(
 _THREADS = """
 import ctypes, sys, threading
 from swarmjax.run import heap
-if sys.argv[1] == "share":
+heap.os.cpu_count = lambda: int(sys.argv[1])
+if sys.argv[1] != "0":
     heap.share()
 together = threading.Barrier(8)
 def allocate():
@@ -30,16 +31,18 @@ libc.fflush(None)
 """
 
 
-def _heaps(word: str) -> int:
-    words = [sys.executable, "-c", _THREADS, word]
+def _heaps(cores: int) -> int:
+    words = [sys.executable, "-c", _THREADS, str(cores)]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run(words, capture_output=True, text=True, check=True, env=environment)
     return done.stdout.count("<heap nr=")
 
 
-def test_threads_share_one_heap() -> None:
-    assert _heaps("share") == 1
-    assert _heaps("leave") > 1
+def test_two_cores_share_a_heap() -> None:
+    assert _heaps(1) == 1
+    assert _heaps(2) == 1
+    assert _heaps(6) == 3
+    assert _heaps(0) > 3  # not limited
 
 
 # Every hundredth block stays, so that none of the pages between lies at the end of the heap.
