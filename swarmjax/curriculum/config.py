@@ -173,8 +173,8 @@ class CurriculumConfig(Section):
     budget_share: float | None = field(
         default=None,
         metadata=about(
-            "share of the budget for all stages before the last, in equal parts, or at most for the "
-            "prerequisites; null: 0.5 [sequential, mixed, adaptive with prerequisites]",
+            "share of the budget for all stages before the last, in equal parts; adaptive: at most "
+            "for the prerequisites; null: 0.5 [sequential, mixed, adaptive with prerequisites]",
             above=0.0,
             below=1.0,
         ),

@@ -198,8 +198,8 @@ class TrainConfig(ProgramConfig):
         first, stages = self.curriculum.prerequisites or 0, len(self.stage)
         if first and first >= stages:
             raise ConfigError(
-                f"curriculum.prerequisites is {first}, but there are {words.count(stages, 'stage')}: "
-                f"give at most {stages - 1}."
+                f"curriculum.prerequisites is {first}, but the run has "
+                f"{words.count(stages, 'stage')}: give at most {stages - 1}."
             )
 
     def _check_devices(self) -> None:
