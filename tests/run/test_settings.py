@@ -574,7 +574,7 @@ def test_help_gives_default_meaning_and_allowed_values():
         "(a whole number 1 to 2147483647, all or auto)" in lines
     )
     assert (
-        "sim.impl=auto who steps the physics; auto: warp on an NVIDIA GPU (auto, jax or warp)"
+        "sim.impl=auto physics implementation; auto: warp on an NVIDIA GPU (auto, jax or warp)"
         in lines
     )
 
