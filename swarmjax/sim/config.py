@@ -15,7 +15,7 @@ _HULL_REASON = (
     "swarmjax/sim/config.py together"
 )
 # Limits for MuJoCo's geometry, float32 and arenas of 0.4 to 4 m. An e-puck drives at 0.13 m/s.
-LEAST = 0.001  # m, m/s, rad/s, or friction; lower limit of divisors
+LEAST = 0.001  # m, m/s, rad/s or friction; lower limit of numbers that code divides by
 _FASTEST = 5.0  # m/s
 _SPEED_REASON = "a faster robot crosses the largest arena, of 4 m, in less than a second"
 _FASTEST_TURN = 50.0  # rad/s

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Array = Any
 # Limits of iterations and line-search steps; docs/design-notes.md has the measurements. With
-# `jax`, MJX's Newton method stops once it is close enough. Everything else has room to converge.
+# `jax`, the limits stop MJX's Newton method once it is close enough. All others can converge.
 _NEWTON_STEPS = {"planar": (3, 5), "wheeled": (30, 20)}
 _MOST_STEPS = (100, 50)  # MuJoCo's own
 # Limit for discs: the tightest jam of tests/sim/test_solver.py takes 150 to 200 sweeps. Its error

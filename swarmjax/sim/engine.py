@@ -15,7 +15,7 @@ from jax import Array
 CONTACTS_PER_ROBOT = 3
 # Contacts per robot in one arena: a disc touches at most six neighbours of its size at once.
 ROWS_PER_ROBOT = 6
-FEW_ARENAS = 64  # so few may all be crowded at once, so there is memory for every pair
+FEW_ARENAS = 64  # up to this many may all be crowded at once, so every pair gets memory
 
 # Types of MJX, in either implementation, or of a faster engine with the same field names.
 Model = Any

@@ -137,8 +137,8 @@ def encoders(qpos: Array, xp: Any) -> Array:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [..., R, 2] left and right since the start, rad, in whole steps of 0.00628 (Webots E-puck,
-      1000 steps a turn), rounded down.
+      [..., R, 2] angles of the left and right wheel since the start, rad, rounded down to whole
+      steps of 0.00628 (Webots E-puck, 1000 steps per turn).
     """
     angle = qpos.reshape(*qpos.shape[:-1], -1, _QPOS)[..., 7:]
     return xp.floor(angle / epuck.ENCODER_STEP) * epuck.ENCODER_STEP

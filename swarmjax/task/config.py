@@ -100,7 +100,11 @@ class TaskConfig(Section):
     )
     target_radius: float = field(
         default=0.05,
-        metadata=about("distance to the target that counts as arrival, m", above=0.0, high=0.1),
+        metadata=about(
+            "distance between the centres of robot and target that counts as arrival, m",
+            above=0.0,
+            high=0.1,
+        ),
     )
     arrival: Arrival = field(
         default="latch",

@@ -42,7 +42,7 @@ def _parts(shape: Shape, half: float) -> list[_Part]:
     if shape == "ell":  # two sides of the square
         aside = half - thin
         return [_Part(0.0, -aside, 0.0, half, thin), _Part(-aside, 0.0, quarter, half, thin)]
-    if shape == "pillar":  # a regular octagon is the union of four boxes, an edge at either end
+    if shape == "pillar":  # four boxes form a regular octagon, whose edges are their ends
         length, width = outer * math.cos(math.pi / 8), outer * math.sin(math.pi / 8)
         return [_Part(0.0, 0.0, 0.25 * math.pi * i, length, width) for i in range(4)]
     return [_Part(0.0, 0.0, 0.0, half, half)]

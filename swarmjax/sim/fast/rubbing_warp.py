@@ -128,7 +128,7 @@ class WarpSwept:
 
 
 @wp.kernel(enable_backward=False)
-def _push_apart(  # noqa: PLR0913  # JAX hands arrays over one by one
+def _push_apart(  # noqa: PLR0913  # JAX passes arrays one by one
     place: wp.array2d[wp.vec3],
     rate: wp.array2d[wp.vec3],
     free: wp.array2d[wp.vec3],

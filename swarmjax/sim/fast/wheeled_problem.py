@@ -135,7 +135,7 @@ def gather(m: Any, d: Any, robots: int) -> Any:
 
 
 def _most_rows(m: Any, robots: int) -> int:
-    """Returns the most rows of a robot: 4 per wheel, 1 per skid, 1 per object the hull may touch."""
+    """Counts the rows of a robot, at most: 4 per wheel, 1 per skid, 1 per object near its hull."""
     others = m.ngeom - 1 - _GEOMS * robots  # without the floor
     return 2 * 4 + 2 + robots - 1 + others
 
