@@ -74,7 +74,8 @@ def bits(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: Any
       [..., *shape] uint32.
     """
     # Keep a last axis throughout, because NumPy warns about overflow only for scalars.
-    key = _mix(_mix(xp.asarray(seed, xp.uint32)[..., None]))  # mixed once, it would commute
+    # Mixed only once, the seed would commute with the clock.
+    key = _mix(_mix(xp.asarray(seed, xp.uint32)[..., None]))
     index = np.arange(math.prod(shape), dtype=np.uint32)
     for word in (xp.asarray(clock, xp.uint32)[..., None], np.full(1, stream, np.uint32), index):
         key = _mix(key ^ _mix(word))

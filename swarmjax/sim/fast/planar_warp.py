@@ -1,8 +1,8 @@
 """Contacts of planar robots in Warp: one kernel, with one thread per arena.
 
 `discs` describes the problem. A thread finds the contacts of its arena, stores them, and sweeps
-through them until no force changes. XLA would unroll one kernel over all possible contacts, and
-spend most of a sweep on contacts that do not exist.
+through them until no force changes. In a kernel that XLA unrolls over all possible contacts,
+most of a sweep would go to contacts that do not exist.
 
 JAX calls the kernel through `warp.jax_kernel`, so XLA can include it in a CUDA graph.
 """
