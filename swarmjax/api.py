@@ -1,7 +1,7 @@
-"""swarmjax from Python: environments, training, judging and policies.
+"""swarmjax from Python: environments, training, evaluation and policies.
 
-These are the functions of `swarmjax` itself: `swarmjax.make_env` and so on. Settings are those of
-the commands, by the same names, and what a command refuses raises `SwarmjaxError` here, with the
+These functions are available as `swarmjax.make_env` and so on. Settings have the same names as on
+the command line. Where a command refuses a setting, a function raises `SwarmjaxError` with the
 same sentence.
 """
 
@@ -29,16 +29,16 @@ Settings = Mapping[str, Any] | Sequence[str]
 
 
 class SwarmjaxError(ValueError):
-    """A mistake in what was given, or a run that broke, in one sentence."""
+    """A mistake in the arguments, or a run that broke, described in one sentence."""
 
 
 class TrainResult(NamedTuple):
-    """What came of a training run.
+    """Result of a training run.
 
     Attributes:
-        policy: of the first seed.
-        policies: of all seeds.
-        metrics: a row an update and seed, as `metrics.jsonl` holds them.
+        policy: policy of the first seed.
+        policies: policies of all seeds.
+        metrics: one row per update and seed, as in `metrics.jsonl`.
         run: the run directory.
     """
 
@@ -49,7 +49,7 @@ class TrainResult(NamedTuple):
 
 
 def _one_error[**P, R](function: Callable[P, R]) -> Callable[P, R]:
-    """Raises the errors of the package as one class."""
+    """Converts the package's errors to `SwarmjaxError`."""
 
     @functools.wraps(function)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -72,13 +72,13 @@ def make_env(
     arenas: int = 64,
     extensions: Any = None,
 ) -> "Swarm":
-    """Builds many arenas that are stepped together, by pure functions.
+    """Builds many arenas that are stepped together by pure functions.
 
         env = swarmjax.make_env("s6", arenas=64)
         state = jax.jit(env.reset)(jax.random.key(0))
         state, step = jax.jit(env.step)(state, action)  # action [64, 5, 2], -1..1
 
-    Act on `state.observation` [A, R, O]; arenas start another episode by themselves.
+    `state.observation` [A, R, O] is the policy's input. Arenas start new episodes by themselves.
 
     Args:
         stage: a name of `configs/stage/`, the path of a .yaml file, a `StageConfig`, or several of
@@ -88,14 +88,14 @@ def make_env(
         task: settings by name, as in `{"step_limit": 300, "reward": {"contact": -0.1}}`.
         realism: `ideal`, `webots`, `real`, or settings by name.
         sim: settings by name, as in `{"solver": "mjx"}`.
-        arenas: how many are stepped together, A.
-        extensions: pieces of your own: a file, a module, or a list of them.
+        arenas: number of arenas stepped together, A.
+        extensions: your own extension pieces: a file, a module, or a list of them.
 
     Returns:
         The environment: `reset(key)`, `step(state, action)`, `observation_space`, `action_space`.
 
     Raises:
-        SwarmjaxError: something given is unsound.
+        SwarmjaxError: an argument is invalid.
     """
     from swarmjax import environment
     from swarmjax.run.settings import load_train
@@ -111,7 +111,7 @@ def make_env(
 
 
 _ROOM = ("robots", "obstacles")
-# Settings of the learner, which an environment does not read, that hold for any number of arenas.
+# Learner settings that allow any number of arenas. An environment does not read them.
 _NOT_LEARNING = {"budget": 2**20, "algo.num_minibatches": 1, "algo.rollout_length": 1}
 
 
@@ -130,18 +130,19 @@ def train_policy(
     Args:
         settings: keys of the command and their values, as `{"algo.discount": 0.995}` or
             `["algo.discount=0.995"]`; `stage` may also be a `StageConfig` or a list of them.
-        on_update: is called with each row of `metrics.jsonl`; the run saves and stops when it
-            returns True. So it does at Ctrl-C.
-        log: is called with each row too, in a thread of its own: the run does not wait, and goes on
-            without it if it raises, which a sentence on standard error says. Or a `Logger` of
-            `swarmjax.run.loggers`, which also hears speeds and is closed at the end; or a list.
-        extensions: pieces of your own: a file, a module, or a list of them.
+        on_update: called with each row of `metrics.jsonl`. If it returns True, the run saves and
+            stops, as it does on Ctrl-C.
+        log: a function that is also called with each row, but in its own thread, so the run does
+            not wait for it. If it raises, a warning is printed to standard error and the run
+            continues without it. Or a `Logger` of `swarmjax.run.loggers`, which also receives
+            speeds and is closed at the end. Or a list of these.
+        extensions: your own extension pieces: a file, a module, or a list of them.
 
     Returns:
         The policies, the metrics and the run directory.
 
     Raises:
-        SwarmjaxError: a setting is unsound, or the run broke.
+        SwarmjaxError: a setting is invalid, or the run broke.
     """
     from swarmjax.run import quiet
     from swarmjax.run.settings import TrainConfig, load_run
@@ -169,7 +170,7 @@ def evaluate_policy(
     workers: int = 1,
     **settings: Any,
 ) -> dict[str, Any]:
-    """Judges a policy in MuJoCo's C engine, as `python -m swarmjax.evaluate` does.
+    """Evaluates a policy in MuJoCo's C engine, as `python -m swarmjax.evaluate` does.
 
         found = swarmjax.evaluate_policy(result.policy, stage="s6", episodes=100)
         found["cells"][0]["measures"]["targets_reached"]["mean"]
@@ -177,19 +178,19 @@ def evaluate_policy(
     Robot, task and realism are those that the policy was trained with, on the wheeled body.
 
     Args:
-        policy: a `Policy`, the path of a policy file, or several of one recipe.
+        policy: a `Policy`, the path of a policy file, or several from the same recipe.
         suite: a name of `configs/suites/`, or a file, instead of a stage.
         stage: a name, a path or a `StageConfig`; None: the last one it was trained on.
         extensions: pieces that the policy needs: a file, a module, or a list of them.
-        workers: processes. More than one imports the calling script again, which then needs
-            `if __name__ == "__main__":`.
+        workers: number of processes. Each additional process imports the calling script again,
+            which then needs `if __name__ == "__main__":`.
         settings: further keys of the command, as `episodes=100`, `realism="real"`.
 
     Returns:
-        What `result.json` holds (docs/interface.md).
+        The contents of `result.json` (docs/interface.md).
 
     Raises:
-        SwarmjaxError: something given is unsound, or does not fit the policy.
+        SwarmjaxError: an argument is invalid, or does not fit the policy.
     """
     from swarmjax.evaluate import evaluation, witness
     from swarmjax.evaluate.config import EvaluateConfig
@@ -212,11 +213,11 @@ def evaluate_policy(
 
 @_one_error
 def load_policy(path: str | Path, extensions: Any = None) -> Policy:
-    """Reads a policy file and checks all of it; `swarmjax.policy.act` runs it.
+    """Reads and checks a policy file; `swarmjax.policy.act` runs the policy.
 
     Args:
         path: of the file.
-        extensions: a file, module or list with the network that the policy needs, if it needs one.
+        extensions: a file, module or list with the network that the policy needs, if any.
 
     Raises:
         SwarmjaxError: the file is missing, damaged or inconsistent.
@@ -225,7 +226,7 @@ def load_policy(path: str | Path, extensions: Any = None) -> Policy:
 
 
 def _loggers(given: Any) -> "list[Logger]":
-    """Makes loggers of functions, and of one a list."""
+    """Converts functions to loggers, and a single logger to a list."""
     from swarmjax.run.loggers import Calls, Logger
 
     every = list(given) if isinstance(given, list | tuple) else [given]
@@ -239,12 +240,12 @@ def _loggers(given: Any) -> "list[Logger]":
 
 
 def _is_one(policy: Any) -> bool:
-    """Tells a policy or its path from a list of them; a policy is a tuple too."""
+    """Returns whether this is a single policy or path, not a list; a policy is a tuple too."""
     return isinstance(policy, str | Path | Policy)
 
 
 def _given(settings: Mapping[str, Any]) -> tuple[list[str], list[dict[str, Any]] | None]:
-    """Splits settings into words of a command line, and stages that no word can name."""
+    """Splits settings into command-line words, and stages that no word can name."""
     rest = dict(settings)
     stage = rest.get("stage")
     stages = None if stage is None or isinstance(stage, str | Path) else _stages(rest.pop("stage"))
@@ -254,7 +255,7 @@ def _given(settings: Mapping[str, Any]) -> tuple[list[str], list[dict[str, Any]]
 
 
 def _stages(given: Any) -> list[dict[str, Any]]:
-    """Makes plain data of stages: of settings, of mappings, or of names in a list."""
+    """Converts stages to plain data; accepts settings, mappings, or names in a list."""
     from swarmjax.task import stage_files
 
     every = [given] if isinstance(given, Section | Mapping) else list(given)
@@ -270,7 +271,7 @@ def _stages(given: Any) -> list[dict[str, Any]]:
 
 
 def _mapping(settings: Settings) -> dict[str, Any]:
-    """Makes a mapping of `key=value` words too."""
+    """Returns settings as a mapping; also converts `key=value` words."""
     if isinstance(settings, Mapping):
         return dict(settings)
     if isinstance(settings, str):
@@ -279,7 +280,7 @@ def _mapping(settings: Settings) -> dict[str, Any]:
 
 
 def _flat(given: Mapping[str, Any], where: str = "") -> dict[str, str]:
-    """Flattens settings to values by dotted keys, written as they would be typed."""
+    """Flattens settings to values by dotted keys, written as on a command line."""
     found: dict[str, str] = {}
     for key, value in given.items():
         value = to_dict(value) if isinstance(value, Section) else value
@@ -293,5 +294,5 @@ def _flat(given: Mapping[str, Any], where: str = "") -> dict[str, str]:
 
 
 def _signals(stop: Any) -> AbstractContextManager[Any]:
-    """Listens to Ctrl-C where that is possible: in the main thread."""
+    """Handles Ctrl-C where that is possible: in the main thread."""
     return stop if threading.current_thread() is threading.main_thread() else nullcontext()

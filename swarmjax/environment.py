@@ -1,6 +1,7 @@
-"""The swarm as an environment: many arenas stepped together, by pure functions.
+"""The swarm as an environment: many arenas stepped together by pure functions.
 
-`make_env` makes one. Axes: A arenas, R robots (as many as the largest stage has), O observation.
+`make_env` creates one. Axes: A arenas, R robots (the number of the largest stage), O observation
+entries.
 """
 
 from dataclasses import dataclass, replace
@@ -23,18 +24,18 @@ from swarmjax.training import program as programs
 from swarmjax.training import rollout
 from swarmjax.training.config import ProgramConfig
 
-_REDRAW = 32  # control steps in which every level that waits is replaced; episodes take longer
+_REDRAW = 32  # control steps in which every waiting level is replaced; episodes take longer
 
 
 class Space(NamedTuple):
-    """What one robot's observation or action is.
+    """Description of one robot's observation or action.
 
     Attributes:
-        shape: of it.
-        names: of its entries.
-        units: of its entries.
-        low: least value of each; None if there is none.
-        high: largest value of each; None if there is none.
+        shape: shape of the array.
+        names: names of its entries.
+        units: units of its entries.
+        low: least value of each entry; None without a limit.
+        high: largest value of each entry; None without a limit.
     """
 
     shape: tuple[int, ...]
@@ -46,13 +47,13 @@ class Space(NamedTuple):
 
 @struct.dataclass
 class SwarmState:
-    """All that changes: a JAX tree to carry through `jit`, `vmap` and `scan`.
+    """The complete state: a JAX tree to carry through `jit`, `vmap` and `scan`.
 
     Attributes:
-        arenas: [A] the arenas; `arenas.observation` [A, R, O] is what to act on, and
-            `arenas.level` where the episodes started.
+        arenas: [A] the arenas; `arenas.observation` [A, R, O] is the policy's input, and
+            `arenas.level` the levels that the episodes started from.
         waiting: [A] the episodes that begin next.
-        key: random key of the levels to come.
+        key: random key of future levels.
         clock: [] control steps since `reset`, int32.
     """
 
@@ -63,21 +64,21 @@ class SwarmState:
 
     @property
     def observation(self) -> Array:
-        """[A, R, O] what to act on: of a new episode where the last one has ended."""
+        """[A, R, O] input of the policy; from the new episode where the last one has ended."""
         return self.arenas.observation
 
     @property
     def present(self) -> Array:
-        """[A, R] whether the robot takes part."""
+        """[A, R] whether the robot is present."""
         return self.arenas.level.present
 
 
 @dataclass(frozen=True, eq=False)
 class Swarm:
-    """An environment of many arenas. Made by `make_env`.
+    """An environment of many arenas, created by `make_env`.
 
     Attributes:
-        config: its settings.
+        config: settings of the environment.
         world: the compiled arena.
         stages: [S] the stages; arena i plays stage i modulo S.
     """
@@ -88,33 +89,33 @@ class Swarm:
 
     @property
     def num_arenas(self) -> int:
-        """Arenas, A."""
+        """Number of arenas, A."""
         return self.config.arenas
 
     @property
     def num_robots(self) -> int:
-        """Robots in an arena, R; where a stage has fewer, `state.present` says which are there."""
+        """Robots per arena, R; where a stage has fewer, `state.present` marks the present ones."""
         return self.world.spacing.robots
 
     @property
     def observation_space(self) -> Space:
-        """One robot's observation, [O]: by `task.history`, what was seen before follows."""
+        """One robot's observation, [O]; with `task.history`, earlier observations follow."""
         layout, history = self.world.electronics.layout, self.world.task.history
         names = observation.stacked_names(layout.names, history)
         return Space((len(names),), names, layout.units * history, None, None)
 
     @property
     def action_space(self) -> Space:
-        """One robot's action, [U]: -1..1 spans the commands; what is beyond is clipped.
+        """One robot's action, [U]: the command, clipped to -1..1, which spans its range.
 
-        Behind the two of the command is what the robot broadcasts, if it does.
+        The numbers that a robot broadcasts, if any, follow the two of the command.
         """
         ones = np.ones(self.world.action_size, np.float32)
         names, _ = policy_file.action_layout(self.world.electronics.neighbours.message_size)
         return Space(ones.shape, names, ("1",) * len(names), -ones, ones)
 
     def pose(self, state: SwarmState) -> Array:
-        """[A, R, 3] x (m), y (m), yaw (rad) of the robots; absent ones stand outside."""
+        """Returns poses [A, R, 3], x (m), y (m), yaw (rad); absent robots are parked outside."""
         return jax.vmap(partial(physics.poses, self.world.physics))(state.arenas.sim)
 
     def reset(self, key: Array) -> SwarmState:
@@ -124,7 +125,7 @@ class Swarm:
             key: random key, consumed.
 
         Returns:
-            The state; act on its `observation`.
+            The state; pass its `observation` to the policy.
         """
         key, first, second = jax.random.split(key, 3)
         every = jnp.arange(self.num_arenas)
@@ -136,18 +137,19 @@ class Swarm:
         )
 
     def step(self, state: SwarmState, action: Array) -> tuple[SwarmState, TimeStep]:
-        """Moves all arenas on by one control step; those whose episode ends start another.
+        """Advances all arenas by one control step; arenas whose episode ends start another.
 
-        Arenas reset themselves: where `done`, the state is that of the next episode, while the
-        step's observation is the last one of the old. Levels of the next episodes are drawn ahead,
-        each again every 32 steps; an arena that ends twice within those repeats its level.
+        Arenas reset themselves. Where `done` is true, the returned state belongs to the next
+        episode, while the step's observation is the last one of the old episode. The levels of the
+        next episodes are drawn ahead, and each is redrawn every 32 steps. An arena that ends two
+        episodes within 32 steps plays the same level again.
 
         Args:
-            state: before.
-            action: [A, R, U], -1..1 spans the commands; what is beyond is clipped.
+            state: before the step.
+            action: [A, R, U], clipped to -1..1, which spans the commands.
 
         Returns:
-            The state after, and the step's outcome: observation [A, R, O], reward, terminated,
+            The new state, and the outcome of the step: observation [A, R, O], reward, terminated,
             truncated and valid [A, R], done and sound [A].
         """
         unpack = partial(physics.unpack, self.world.physics)
@@ -160,14 +162,14 @@ class Swarm:
         return SwarmState(arenas=arenas, waiting=waiting, key=key, clock=state.clock + 1), came
 
     def _redraw(self, waiting: EnvState, clock: Array, key: Array) -> EnvState:
-        """Replaces the next few of the episodes that wait, in turn."""
+        """Replaces the next few of the waiting episodes, in turn."""
         count = -(-self.num_arenas // _REDRAW)
         which = (clock * count + jnp.arange(count)) % self.num_arenas
         fresh = self._draw(key, which)
         return jax.tree.map(lambda old, new: old.at[which].set(new), waiting, fresh)
 
     def _draw(self, key: Array, arena: Array) -> EnvState:
-        """Starts episodes [N] for these arenas [N], packed."""
+        """Starts episodes [N] for the arenas [N], packed."""
         spacing, stages = self.world.spacing, jax.tree.map(jnp.asarray, self.stages)
         count = len(self.stages.robots)
 
@@ -184,13 +186,13 @@ def load(config: ProgramConfig) -> Swarm:
     """Builds the environment that a config describes.
 
     Args:
-        config: its stages, robot, task, realism, simulation, arenas and extensions are read.
+        config: provides stages, robot, task, realism, simulation, arenas and extensions.
 
     Returns:
         The environment.
 
     Raises:
-        ConfigError: a piece of an extension does not fit, or see `task.env.load`.
+        ConfigError: a piece of an extension does not fit, or `task.env.load` raises it.
     """
     world = programs.load_world(config)
     stages = task_stage.stack(config.stage, world.drawings)

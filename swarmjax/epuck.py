@@ -1,8 +1,8 @@
-"""The e-puck in numbers: unit and source beside each.
+"""Numbers of the e-puck, each with its unit and source.
 
-Frame: x forward, y left, z up, origin on the floor midway between the wheels; angles
-counter-clockwise from +x, in radians. Numbers are restated from the sources named; the
-Webots model itself is not part of this project.
+The frame has x forward, y left and z up. Its origin is on the floor midway between the wheels.
+Angles are in radians, counter-clockwise from +x. The numbers are restated from the named sources;
+the Webots model itself is not part of this project.
 """
 
 import math
@@ -11,16 +11,16 @@ HULL_RADIUS = 0.037  # m; Webots E-puck, collision cylinder
 HULL_BOTTOM = 0.0025  # m; lower end of the same cylinder (centre 0.025, height 0.045)
 HULL_TOP = 0.0475  # m; its upper end
 MASS = 0.16  # kg; Webots e-puck guide, version 1: body 0.15 and two wheels of 0.005
-# kg m^2; body 9.78585e-5 about its vertical axis, two 5 g wheels 0.026 m off the axis
-# (2 * 0.005 * 0.026**2 = 6.8e-6) and their own 5.1e-7 each: 1.06e-4 in all.
+# kg m^2; the body has 9.78585e-5 about its vertical axis. Two 5 g wheels 0.026 m off the axis add
+# 2 * 0.005 * 0.026**2 = 6.8e-6, and 5.1e-7 each about their own axes: 1.06e-4 in all.
 YAW_INERTIA = 1.06e-4
 WHEEL_MASS = 0.005  # kg, each; Webots E-puck
-# The whole body, for `robot=wheeled`: Webots E-puck, version 1, without its wheels. The order of
-# the moments is that of its older, y-up file; the newer one has them in that order unturned.
+# The whole body, for `robot=wheeled`: Webots E-puck, version 1, without its wheels. The moments are
+# in the order of its older, y-up file; the newer z-up file has them in the same order.
 BODY_INERTIA = (8.64333e-5, 8.74869e-5, 9.78585e-5)  # kg m^2 about x, y, z of the centre of mass
-COM_HEIGHT = 0.015  # m; of the centre of mass, exactly over the axle
+COM_HEIGHT = 0.015  # m; height of the centre of mass, exactly over the axle
 SKID_X = 0.025  # m; front and back end of the box that it skids on (0.05 long)
-SKID_CLEARANCE = 0.0001  # m; its lower face above the floor
+SKID_CLEARANCE = 0.0001  # m; from the floor to the lower face of that box
 AXLE_Y = 0.026  # m; centres of the wheels left and right of the middle
 WHEEL_INERTIA = (5.1e-7, 1.0e-6, 5.1e-7)  # kg m^2; cylinder of 5 g, radius 0.02, width 0.005 m
 ENCODER_STEP = 0.00628  # rad; Webots E-puck, 2 pi / 1000
@@ -30,15 +30,15 @@ MAX_WHEEL_SPEED = 6.28  # rad/s; Webots E-puck version 1 (1000 steps/s)
 FRICTION = 1.0  # wheel on floor; Webots ContactProperties.coulombFriction default
 GRAVITY = 9.81  # m/s^2; Webots WorldInfo default
 
-MAX_SPEED = MAX_WHEEL_SPEED * WHEEL_RADIUS  # m/s; 0.1256, both wheels at their limit
+MAX_SPEED = MAX_WHEEL_SPEED * WHEEL_RADIUS  # m/s; 0.1256, with both wheels at their limit
 MAX_TURN_RATE = 3.14  # rad/s; section 4 of the paper
 
 SENSORS = 8
 SENSOR_RANGE = 0.04  # m; section 4 of the paper, and the e-puck guide
 SENSOR_HEIGHT = 0.033  # m; Webots E-puck
-# x (m), y (m), yaw (rad) of ps0..ps7 in the robot's frame: Webots E-puck, yaws worked out from
-# its axis-angle rotations. Numbered clockwise from front-right. Every origin lies 3.5 to 6 mm
-# inside the hull.
+# x (m), y (m), yaw (rad) of ps0..ps7 in the robot's frame: Webots E-puck, with yaws computed from
+# its axis-angle rotations. The sensors are numbered clockwise from front-right. Every origin lies
+# 3.5 to 6 mm inside the hull.
 SENSOR_POSES = (
     (0.030, -0.010, -0.30081),
     (0.022, -0.025, -0.80081),
@@ -49,10 +49,10 @@ SENSOR_POSES = (
     (0.022, 0.025, 0.79920),
     (0.030, 0.010, 0.29920),
 )
-SENSOR_TILT = 0.16  # rad; every ray rises by this much, Webots E-puckDistanceSensor
-# Length of a ray (m), counts, sd of the counts as a share of them: Webots E-puckDistanceSensor,
-# linear in between, the end values beyond. The points up to 0.05 m are also those of
-# INFRARED_TABLE in driver.cpp of cyberbotics/epuck_ros2 (Apache-2.0).
+SENSOR_TILT = 0.16  # rad; upward tilt of every ray, Webots E-puckDistanceSensor
+# Ray length (m), counts, and standard deviation relative to the counts: Webots
+# E-puckDistanceSensor. It interpolates linearly and holds the end values beyond the table. The
+# points up to 0.05 m are also in INFRARED_TABLE, driver.cpp of cyberbotics/epuck_ros2 (Apache-2.0).
 INFRARED_TABLE = (
     (0.000, 4095.00, 0.00200),
     (0.005, 2133.33, 0.00300),
@@ -65,10 +65,10 @@ INFRARED_TABLE = (
     (0.060, 104.09, 0.03065),
     (0.070, 67.19, 0.04897),
 )
-# Counts of ps0..ps7 of one e-puck, 0, 1, .. 7 cm between its hull and a thing, before zeroing:
+# Counts of ps0..ps7 of one e-puck before zeroing, at 0, 1, .. 7 cm from its hull to an object:
 # sensorMean.txt and sensorVar.txt (which holds standard deviations) of
-# mohammad7t/Particle-Filter-for-e-puck-on-Webots, commit 0de64e89. That the robot was a real one
-# is inferred: each sensor has an offset of its own.
+# mohammad7t/Particle-Filter-for-e-puck-on-Webots, commit 0de64e89. We infer that the robot was a
+# real one: each sensor has its own offset.
 MEASURED_GAPS = (0.00, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.07)  # m
 MEASURED_INFRARED = (
     (3779.0, 1382.69, 760.04, 588.15, 519.47, 501.50, 487.47, 482.03),
@@ -90,10 +90,11 @@ MEASURED_INFRARED_SD = (
     (0.92, 3.07, 3.37, 4.20, 3.30, 2.68, 2.21, 1.79),
     (1.59, 4.42, 4.96, 6.21, 5.45, 4.67, 3.89, 7.91),
 )
-# The curve A / (gap + d)^2 + b of ps0..ps7: A (counts m^2), d (m), b (counts), fitted to the means
-# at 1 to 7 cm by least squares weighted by their sds, no residual above 13 counts (which binds
-# for ps0 alone: 13.1 without it); then the median of those sds, and the mean at 0 cm, beyond
-# which a sensor reports no more (counts). tests/sim/test_response.py fits it again.
+# The curve A / (gap + d)^2 + b of ps0..ps7: A (counts m^2), d (m), b (counts). It was fitted to the
+# means at 1 to 7 cm by least squares, weighted by their standard deviations. No residual may exceed
+# 13 counts; this limit binds for ps0 alone, which has 13.1 without it. The last two columns are the
+# median of those standard deviations, and the mean at 0 cm, which is the largest reading (counts).
+# tests/sim/test_response.py repeats the fit.
 INFRARED_FIT = (
     (0.16935, 0.0034172, 442.63, 12.06, 3779.0),
     (0.18230, 0.0015093, 179.89, 3.58, 3810.0),

@@ -1,6 +1,6 @@
-"""The robot and its world: model, body, drive, sensors and physics steps.
+"""The robot and its arena: model, body, drive, sensors and physics steps.
 
-Imports `config` and `epuck.py` alone. `physics.py` steps many arenas by MJX; `dispatch.py` is the
-only module that knows the faster ways of `fast/`, and everything works without them. Start with
-`physics.step`; `model.py` says what a robot is made of.
+The package imports only `config` and `epuck.py`. `physics.py` steps many arenas with MJX. Only
+`dispatch.py` uses the faster code of `fast/`; everything works without it. Start reading at
+`physics.step`. `model.py` defines the parts of a robot.
 """

@@ -1,7 +1,7 @@
-"""What a body is to the rest of the simulation: the same commands and poses for either one.
+"""Interface of a robot body: every body takes the same commands and returns the same poses.
 
-A body turns the speeds of its two wheels into controls, and positions of its joints into
-x, y and yaw. `planar.py` and `wheeled.py` are the two there are.
+A body converts the speeds of its two wheels to controls, and its joint positions to x, y and yaw.
+There are two bodies, `planar.py` and `wheeled.py`.
 """
 
 from collections.abc import Callable
@@ -15,18 +15,18 @@ from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.geometry import hull_name
 
 Array = Any
-Changes = dict[str, tuple[Any, Array]]  # field of the model: rows, and their new numbers
+Changes = dict[str, tuple[Any, Array]]  # field of the model: rows, and their new values
 
 
 class Chassis(NamedTuple):
-    """What a robot's chassis is in an episode, where it is not what the config says.
+    """Properties of the chassis in an episode; None keeps the config's value.
 
     Attributes:
       wheel_radius: [R, 2] left and right, m, or None.
       track: [R] between the points where the wheels grip the floor, m, or None.
       mass: [R] kg, or None.
-      friction: [R] of wheel on floor, or None.
-      hull_friction: [] of all hulls on what they touch, or None.
+      friction: [R] between wheels and floor, or None.
+      hull_friction: [] between hulls and everything that they touch, or None.
     """
 
     wheel_radius: Array | None = None
@@ -40,16 +40,16 @@ AS_BUILT = Chassis()
 
 
 class Rows(NamedTuple):
-    """Where the robots lie in the model's arrays.
+    """Rows of the robots in the model's arrays.
 
     Attributes:
       bodies: [R, B] hull first.
       dofs: [R, D].
-      actuators: [R, U]; [R, 0] of a model whose servos are forces.
-      wheel_geoms: [R, 2] left and right; [R, 0] of a body without wheels.
-      wheel_bodies: [R, 2] likewise.
-      grips: [R, 2] pairs of wheel and floor, likewise.
-      hulls: [P] pairs of a hull and what it may touch.
+      actuators: [R, U]; [R, 0] for a model with forces as servos.
+      wheel_geoms: [R, 2] left and right; [R, 0] for a body without wheels.
+      wheel_bodies: [R, 2] left and right; [R, 0] for a body without wheels.
+      grips: [R, 2] pairs of wheel and floor; [R, 0] for a body without wheels.
+      hulls: [P] pairs with a hull.
     """
 
     bodies: np.ndarray
@@ -62,13 +62,13 @@ class Rows(NamedTuple):
 
 
 class Servos(NamedTuple):
-    """Servos that are actuators to MuJoCo C, and to MJX, which pays for those, forces on joints.
+    """Servos: actuators in MuJoCo C; forces on joints in MJX, where actuators cost time.
 
     Attributes:
       add: adds the actuators to the robots of these names in a spec, for a physics step (s).
-      force: what they exert at the beginning of a physics step on the joints of robots with qpos
-        [..., R * Q], qvel [..., R * V], ctrl [..., R * U], a chassis, and the config's numbers, for
-        a physics step (s): [..., R * V] N or N m.
+      force: returns the servo forces on the joints at the beginning of a physics step, [..., R * V]
+        N or N m. Takes qpos [..., R * Q], qvel [..., R * V], ctrl [..., R * U], a chassis, the
+        config's numbers and the physics step (s).
     """
 
     add: Callable[[mujoco.MjSpec, list[str], RobotConfig, float], None]
@@ -81,14 +81,13 @@ class Body:
 
     Attributes:
       gravity: whether gravity acts along any of its joints.
-      cone: of its contacts' friction.
+      cone: friction cone of its contacts.
       add: adds a robot of this name to a spec, for a physics step (s); returns its contact geom.
-      qpos: positions of the joints [..., R * Q] of robots at rest at [..., R, 3] x (m), y (m),
-        yaw (rad).
+      qpos: joint positions [..., R * Q] of robots at rest at [..., R, 3] x (m), y (m), yaw (rad).
       pose: the inverse, [..., R, 3].
-      ctrl: controls [..., R * U] that hold wheel speeds [..., R, 2] (rad/s) of a chassis.
-      changes: what a chassis changes in the compiled model (the last argument is the model).
-      servos: what follows `ctrl`, if a description may do without it; None if `add` adds it.
+      ctrl: controls [..., R * U] for wheel speeds [..., R, 2] (rad/s) of a chassis.
+      changes: changes that a chassis makes to the compiled model, which is the last argument.
+      servos: servos that follow `ctrl`, if a spec can omit them; None if `add` adds them.
     """
 
     gravity: bool
@@ -102,7 +101,7 @@ class Body:
 
 
 def find_rows(model: mujoco.MjModel, robots: int) -> Rows:
-    """Looks the rows of the robots up by name.
+    """Looks up the rows of the robots by name.
 
     Args:
       model: compiled.
@@ -130,16 +129,17 @@ def find_rows(model: mujoco.MjModel, robots: int) -> Rows:
 
 
 def scale_mass(ratio: Array, rows: Rows, model: mujoco.MjModel) -> Changes:
-    """Changes a robot's mass, and all its inertia in proportion.
+    """Changes a robot's mass, and its inertia in proportion.
 
     Args:
-      ratio: [R] of the new mass to the one that is compiled in.
+      ratio: [R] of the new mass to the compiled mass.
       rows: of the robots.
       model: compiled.
 
     Returns:
-      Changes of the bodies. The inverse weights, by which MuJoCo softens contacts and which MJX
-      does not work out anew, shrink as the mass grows: exactly, but for what wheels' motors add.
+      Changes of the bodies. They include the inverse weights, with which MuJoCo softens contacts
+      and which MJX does not recompute. The weights shrink in proportion to the mass. This is exact
+      except for the share of the wheel motors.
     """
     bodies, dofs = rows.bodies, rows.dofs
     return {
@@ -152,25 +152,25 @@ def scale_mass(ratio: Array, rows: Rows, model: mujoco.MjModel) -> Changes:
 
 
 def rub(friction: Array, rows: Rows) -> tuple[Any, Array]:
-    """Changes the friction of hulls: rows of `pair_friction`, and their new numbers.
+    """Returns the change of hull friction: rows of `pair_friction`, and their new values.
 
     Args:
-      friction: [] of all hulls on what they touch.
+      friction: [] between hulls and everything that they touch.
       rows: of the robots.
 
     Returns:
-      As one of `Changes`.
+      The value of an entry of `Changes`.
     """
     return (rows.hulls[:, None], [0, 1]), friction * np.ones((len(rows.hulls), 2), np.float32)
 
 
 def _hull_pairs(model: mujoco.MjModel, robots: int) -> np.ndarray:
-    """The pairs [P] that hulls are in."""
+    """Returns the pairs [P] that contain a hull."""
     hulls = [model.geom(hull_name(f"robot{i}")).id for i in range(robots)]
     first, second = (np.isin(geom, hulls) for geom in (model.pair_geom1, model.pair_geom2))
     return np.flatnonzero(first | second).astype(np.int32)
 
 
 def _pair(model: mujoco.MjModel, geom: int) -> int:
-    """The one pair that a wheel's geom is in."""
+    """Returns the single pair that contains a wheel's geom."""
     return int(np.flatnonzero((model.pair_geom1 == geom) | (model.pair_geom2 == geom))[0])

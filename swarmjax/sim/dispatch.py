@@ -1,6 +1,6 @@
-"""Chooses the faster ways of `sim/fast/`, and the plain ones where there are none.
+"""Chooses the faster code of `sim/fast/` where it exists, and plain code elsewhere.
 
-Everything else in this room is plain MJX and plain loops, and works without `fast/`, slower.
+The rest of this package uses plain MJX and plain loops. It works without `fast/`, but more slowly.
 """
 
 import importlib
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from swarmjax.config import ConfigError
 
-# What judges policies goes through short axes too, and does without JAX and MJX.
+# Evaluations also use `pieces` and must run without JAX and MJX.
 if TYPE_CHECKING:
     import mujoco
 
@@ -21,23 +21,24 @@ if TYPE_CHECKING:
     from swarmjax.sim.model import Ids
 
 Array = Any
-# Iterations and line-search steps at most; see docs/design-notes.md for what was measured. MJX's
-# Newton method by `jax` is cut off where it is near enough; all else has room to converge.
+# Limits of iterations and line-search steps; docs/design-notes.md has the measurements. With
+# `jax`, the limits stop MJX's Newton method once it is close enough. All others can converge.
 _NEWTON_STEPS = {"planar": (3, 5), "wheeled": (30, 20)}
 _MOST_STEPS = (100, 50)  # MuJoCo's own
-# Of discs: the tightest jam of tests/sim/test_solver.py takes 150 to 200. With 100 it was 1.9e-4
-# off where MJX's own step is 2.4e-5 off, with 200 it is 4e-6 off; on an H200 they cost 1.5 % of
-# training.
+# Limit for discs: the tightest jam of tests/sim/test_solver.py takes 150 to 200 sweeps. Its error
+# was 1.9e-4 with 100 sweeps, 4e-6 with 200, and 2.4e-5 with MJX's own step. On an H200, 200 sweeps
+# cost 1.5 % of training time.
 _MOST_SWEEPS = 200
-# Where hulls rub, forces come to rest more slowly: a jam of friction 1.5 takes 400 sweeps to be
-# as near as one without friction, and MJX's Newton method by `jax` as many steps as wheels do.
+# Forces settle more slowly between hulls with friction. A jam with friction 1.5 takes 400 sweeps to
+# get as close as one without friction. With `jax`, MJX's Newton method takes as many steps as for
+# wheels.
 _MOST_RUBBING_SWEEPS = 400
-# In a jam of more wheeled robots the solver made for them leaves up to 7 mm/s (design note 38).
+# In a jam of more wheeled robots, the solver made for them leaves up to 7 mm/s (design note 38).
 MOST_WHEELED = 5
 
 
 def resolve_impl(impl: str) -> str:
-    """Turns `auto` into `warp` on an NVIDIA GPU that has Warp, `jax` elsewhere.
+    """Resolves `auto` to `warp` on an NVIDIA GPU with Warp installed, and to `jax` elsewhere.
 
     Args:
       impl: `auto`, `jax` or `warp`.
@@ -46,7 +47,7 @@ def resolve_impl(impl: str) -> str:
       `jax` or `warp`.
 
     Raises:
-      ConfigError: if Warp is asked for and not installed.
+      ConfigError: Warp is selected but not installed.
     """
     installed = importlib.util.find_spec("warp") is not None
     if impl == "warp" and not installed:
@@ -61,23 +62,23 @@ def resolve_impl(impl: str) -> str:
 
 
 def resolve_solver(solver: str, impl: str, body: str, robots: int, *, rubs: bool = False) -> str:
-    """Turns `auto` into `swarm` where that can be, `mjx` elsewhere.
+    """Resolves `auto` to `swarm` where available, and to `mjx` elsewhere.
 
-    The tests hold `swarm` to MuJoCo C at least as closely as MJX's own step, wherever this chooses
-    it (tests/sim/test_solver.py).
+    Where `swarm` is chosen, tests require it to match MuJoCo C at least as closely as MJX's own
+    step does (tests/sim/test_solver.py).
 
     Args:
       solver: `auto`, `mjx` or `swarm`.
       impl: `jax` or `warp`.
       body: `planar` or `wheeled`.
-      robots: that are compiled in.
+      robots: number of robots to compile for.
       rubs: whether hulls have friction.
 
     Returns:
       `mjx` or `swarm`.
 
     Raises:
-      ConfigError: if `swarm` is asked for where it cannot be.
+      ConfigError: `swarm` is selected but not available for this combination.
     """
     if solver == "swarm" and body == "wheeled" and impl != "warp":
         raise ConfigError(
@@ -105,13 +106,13 @@ def resolve_solver(solver: str, impl: str, body: str, robots: int, *, rubs: bool
 
 
 class EngineChoice(NamedTuple):
-    """How the physics is stepped: all that `auto` and null stand for is filled in.
+    """The engine to use, with `auto` and null resolved.
 
     Attributes:
       impl: `jax` or `warp`.
       solver: `mjx` or `swarm`.
-      iterations: of the solver, at most.
-      ls_iterations: steps of its line search, at most.
+      iterations: limit of solver iterations.
+      ls_iterations: limit of line-search steps.
     """
 
     impl: str
@@ -121,17 +122,17 @@ class EngineChoice(NamedTuple):
 
 
 def choose(sim: "SimConfig", robot: "RobotConfig") -> EngineChoice:
-    """Resolves the settings of the simulation for a robot.
+    """Resolves the simulation settings for a robot.
 
     Args:
       sim: the settings.
-      robot: that the model is compiled for.
+      robot: the robot that the model is compiled for.
 
     Returns:
-      What they come to on this device.
+      The resolved settings for this device.
 
     Raises:
-      ConfigError: if Warp is asked for and not installed, or a solver where it cannot be.
+      ConfigError: Warp is selected but not installed, or a solver is not available.
     """
     impl, body = resolve_impl(sim.impl), robot.body
     rubs = robot.hull_friction > 0.0
@@ -149,17 +150,17 @@ def choose(sim: "SimConfig", robot: "RobotConfig") -> EngineChoice:
 def load_engine(
     model: "mujoco.MjModel", ids: "Ids", robot: "RobotConfig", choice: EngineChoice, arenas: int
 ) -> "Engine":
-    """Loads what takes the physics steps.
+    """Loads the engine for physics steps.
 
     Args:
-      model: compiled, one arena; solver iterations are taken from here.
+      model: compiled model of one arena; provides the solver's iterations.
       ids: rows of the moving bodies.
-      robot: the robot's numbers.
-      choice: as `choose` made it.
-      arenas: how many arenas will be stepped together.
+      robot: settings of the robot.
+      choice: result of `choose`.
+      arenas: number of arenas stepped together.
 
     Returns:
-      MJX's engine for `mjx`, the one made for the robot's body for `swarm`.
+      MJX's engine for `mjx`; the engine made for the robot's body for `swarm`.
     """
     from swarmjax.sim import engine
 
@@ -181,13 +182,13 @@ def load_engine(
 
 
 def _push_apart(impl: str, *, rubs: bool) -> Any:
-    """What solves for the contacts of discs; those by Warp need it to be installed."""
+    """Returns the contact solver for discs; the Warp solvers need Warp to be installed."""
     name = f"{'rubbing' if rubs else 'planar'}_{impl}"
     return importlib.import_module(f"swarmjax.sim.fast.{name}").push_apart
 
 
 def load_paths(impl: str) -> ModuleType | None:
-    """Loads what finds shortest paths by Warp; None where plain JAX does.
+    """Loads the shortest-path finder in Warp; None where plain JAX finds them.
 
     Args:
       impl: `jax` or `warp`.
@@ -201,14 +202,14 @@ def load_paths(impl: str) -> ModuleType | None:
 
 
 def pieces(count: int, xp: Any) -> list[slice]:
-    """Cuts an axis of things up as is fastest to go through.
+    """Splits an axis of objects into the slices that are fastest to process.
 
     Args:
-      count: how many things there are.
+      count: number of objects.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      Slices that cover the axis; one of all things where `fast/unroll.py` is not there.
+      Slices that cover the axis; a single slice without `fast/unroll.py`.
     """
     try:
         from swarmjax.sim.fast import unroll
@@ -218,11 +219,11 @@ def pieces(count: int, xp: Any) -> list[slice]:
 
 
 def least(values: Iterable[Array], limit: float, xp: Any) -> Array:
-    """Least of what there is of all things.
+    """Returns the minimum over all objects, which come in pieces.
 
     Args:
-      values: [..., N] of things, one array a piece.
-      limit: where there is nothing less.
+      values: [..., N] values of objects, one array per piece.
+      limit: upper limit of the result.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
@@ -235,7 +236,7 @@ def least(values: Iterable[Array], limit: float, xp: Any) -> Array:
 
 
 def _discs() -> ModuleType | None:
-    """The engine of planar robots, or None without `fast/`."""
+    """Returns the engine module of planar robots; None without `fast/`."""
     try:
         from swarmjax.sim.fast import discs
     except ImportError:

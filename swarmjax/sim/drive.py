@@ -1,4 +1,4 @@
-"""Differential drive: from a policy's action to wheel speeds and to the motion they make."""
+"""Differential drive: converts a policy's action to wheel speeds, and those to motion."""
 
 from typing import Any, NamedTuple
 
@@ -6,18 +6,18 @@ from swarmjax.sim.config import RobotConfig
 
 Array = Any
 
-COMMAND_SIZE = 2  # numbers of an action that drive: forward speed and turn rate
+COMMAND_SIZE = 2  # action entries that drive: forward speed and turn rate
 
 
 class Drive(NamedTuple):
-    """The numbers of a differential drive.
+    """Properties of a differential drive.
 
     Attributes:
       wheel_radius: m.
       track: distance between the wheels, m.
-      max_wheel_speed: rad/s, of each wheel.
-      max_speed: upper end of the commanded forward speed (the lower end is 0), m/s.
-      max_turn_rate: the commanded turn rate lies in plus or minus this, rad/s.
+      max_wheel_speed: of each wheel, rad/s.
+      max_speed: upper limit of the commanded forward speed (the lower limit is 0), m/s.
+      max_turn_rate: limit of the commanded turn rate in both directions, rad/s.
     """
 
     wheel_radius: float
@@ -28,12 +28,12 @@ class Drive(NamedTuple):
 
 
 def from_config(robot: RobotConfig) -> Drive:
-    """Takes the drive's numbers out of the robot's config."""
+    """Takes the drive's properties from the robot's config."""
     return Drive(*(getattr(robot, name) for name in Drive._fields))
 
 
 def command(action: Array, drive: Drive, xp: Any) -> Array:
-    """Scales an action to a command, clipping it to -1..1 first.
+    """Clips an action to -1..1 and scales it to a command.
 
     Args:
       action: [..., 2], any real number; -1..1 spans the command's range.
@@ -49,10 +49,10 @@ def command(action: Array, drive: Drive, xp: Any) -> Array:
 
 
 def wheel_speeds(command: Array, drive: Drive, xp: Any) -> Array:
-    """Wheel speeds of a command, each wheel clamped to its own limit.
+    """Computes the wheel speeds of a command, with each wheel clamped to its own limit.
 
-    The robot clamps each wheel separately, so a fast command loses its turn first: above
-    v = 0.2072 m/s nothing is left of it.
+    The robot clamps each wheel separately, so a fast command loses its turn first. Above
+    v = 0.2072 m/s, the turn is lost entirely.
 
     Args:
       command: [..., 2] forward speed (m/s) and turn rate (rad/s).
@@ -68,7 +68,7 @@ def wheel_speeds(command: Array, drive: Drive, xp: Any) -> Array:
 
 
 def body_velocity(wheels: Array, wheel_radius: Array, track: Array, xp: Any) -> Array:
-    """Velocity of the body that rolls on these wheels without slip.
+    """Computes the velocity of the body that rolls on these wheels without slip.
 
     Args:
       wheels: [..., 2] left and right wheel speed, rad/s.

@@ -1,4 +1,4 @@
-"""What takes a physics step of one arena: by default MJX's own step, unpatched."""
+"""Engines that take a physics step of one arena; the default is MJX's own step, unpatched."""
 
 import contextlib
 import io
@@ -10,29 +10,30 @@ import mujoco
 import numpy as np
 from jax import Array
 
-# Warp stores the contacts of all arenas together, those of hulls and what they touch by this
-# average a robot, which is far more than a swarm makes. Contacts with the floor are counted apart.
+# Warp stores the contacts of all arenas together. This is the average number of hull contacts per
+# robot that it has memory for, far more than a swarm makes. Floor contacts are counted separately.
 CONTACTS_PER_ROBOT = 3
-# Contacts of one arena that there is room for: a disc touches six neighbours of its size at once.
+# Contacts per robot in one arena: a disc touches at most six neighbours of its size at once.
 ROWS_PER_ROBOT = 6
-FEW_ARENAS = 64  # in so few, all may be crowded at once: there is room for every pair
+FEW_ARENAS = 64  # up to this many may all be crowded at once, so every pair gets memory
 
-# Of MJX, by either implementation, or of a faster engine, by the same names.
+# Types of MJX, in either implementation, or of a faster engine with the same field names.
 Model = Any
 Data = Any
 
 
 @dataclass(frozen=True, eq=False)
 class Engine:
-    """What takes the physics steps of a program.
+    """Engine for the physics steps of a program.
 
     Attributes:
-      label: what steps the robots, in words.
-      model: of one arena, on the device.
+      label: description of the engine, in words.
+      model: model of one arena, on the device.
       template: data of one arena, to fill in.
-      step: model, data, side [] (m) and obstacles [M, 5] to the data a physics step later.
-      is_mjx: whether MJX steps: obstacles and walls then lie in its model and data. Any other
-        engine is told them, and its model has only the fields that it reads.
+      step: takes model, data, side [] (m) and obstacles [M, 5], and returns the data one physics
+        step later.
+      is_mjx: whether MJX takes the steps. Its model and data then hold obstacles and walls. Any
+        other engine gets them as arguments, and its model has only the fields that it reads.
       impl: `jax` or `warp`.
       solver: `mjx` or `swarm`.
     """
@@ -52,13 +53,13 @@ class Engine:
 
 
 def load_mjx(model: mujoco.MjModel, robots: int, impl: str, arenas: int) -> Engine:
-    """Puts a model on the device, to be stepped by MJX as it comes.
+    """Puts a model on the device for unpatched MJX.
 
     Args:
       model: compiled, one arena.
       robots: R.
       impl: `jax` or `warp`.
-      arenas: how many arenas will be stepped together (Warp shares its contact memory).
+      arenas: number of arenas stepped together (they share Warp's contact memory).
 
     Returns:
       MJX's engine.
@@ -71,13 +72,13 @@ def load_mjx(model: mujoco.MjModel, robots: int, impl: str, arenas: int) -> Engi
 
 
 def step_mjx(model: Model, data: Data, _side: Array, _obstacle: Array) -> Data:
-    """Takes one physics step by `mjx.step`; obstacles and walls lie in model and data."""
+    """Takes one physics step with `mjx.step`; model and data hold obstacles and walls."""
     return import_mjx().step(model, data)
 
 
 def import_mjx() -> Any:
-    """Imports MJX, which takes two to four seconds, and is not needed where all are discs."""
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints twice where Warp is not installed
+    """Imports MJX lazily: it takes two to four seconds, and planar robots do not need it."""
+    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints two lines if Warp is missing
         from mujoco import mjx
     return mjx
 
@@ -90,7 +91,7 @@ def quiet_warp() -> None:
 
 
 def _limits(model: mujoco.MjModel, robots: int, arenas: int) -> dict[str, int]:
-    """Room for contacts: of all arenas together, and for the solver's rows of each one."""
+    """Returns sizes of Warp's memory: contacts of all arenas, and solver rows of each arena."""
     on_floor = model.geom_type[model.pair_geom1] == mujoco.mjtGeom.mjGEOM_PLANE
     rows = _rows(model)
     pairs, floor = int(np.sum(~on_floor)), int(np.sum(on_floor))
@@ -103,7 +104,7 @@ def _limits(model: mujoco.MjModel, robots: int, arenas: int) -> dict[str, int]:
 
 
 def _rows(model: mujoco.MjModel) -> np.ndarray:
-    """Rows of the solver [P] that a contact of each pair takes."""
+    """Returns how many solver rows [P] a contact of each pair takes."""
     if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
         return model.pair_dim
     return np.where(model.pair_dim == 1, 1, 2 * (model.pair_dim - 1))

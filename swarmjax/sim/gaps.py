@@ -1,4 +1,4 @@
-"""Signed gaps between hulls and what they may touch, and contacts counted from them."""
+"""Signed gaps between hulls and the objects around them, and contacts counted from the gaps."""
 
 from typing import Any
 
@@ -9,11 +9,11 @@ from swarmjax.sim.infrared import Box, to_box_frame, turned
 
 Array = Any
 KINDS = ("robot", "obstacle", "wall")  # the last axis of gaps and contacts
-CONTACT_PAUSE = 0.1  # s; shorter separations are one contact that bounces
+CONTACT_PAUSE = 0.1  # s; a contact that reopens for less than this is still the same contact
 
 
 def gaps(pose: Array, side: Array, obstacle: Array, hull_radius: float, xp: Any) -> Array:
-    """Gap from each hull to the nearest thing of each kind; below 0 they overlap.
+    """Computes the gap from each hull to the nearest object of each kind; negative for overlap.
 
     Args:
       pose: [R, 3] x (m), y (m), yaw (rad); absent robots are parked far away.
@@ -23,7 +23,7 @@ def gaps(pose: Array, side: Array, obstacle: Array, hull_radius: float, xp: Any)
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [R, 3] m, in the order of `KINDS`; `inf` where there is nothing of the kind.
+      [R, 3] m, in the order of `KINDS`; `inf` without an object of that kind.
     """
     x, y = pose[:, :1], pose[:, 1:2]
     others = (_robot_distance(x, y, i, xp) for i in pieces(len(pose), xp))
@@ -38,14 +38,14 @@ def gaps(pose: Array, side: Array, obstacle: Array, hull_radius: float, xp: Any)
 
 
 def _robot_distance(x: Array, y: Array, piece: slice, xp: Any) -> Array:
-    """Distance [R, N] from the centres of robots, [R, 1] each, to a piece of the others, m."""
+    """Returns distances [R, N] (m) from robots, [R, 1] each, to a slice of the other robots."""
     across, along = x - x[piece, 0], y - y[piece, 0]
     itself = np.eye(len(x), dtype=bool)[:, piece]
     return xp.where(itself, xp.inf, xp.sqrt(across * across + along * along))
 
 
 def _box_distance(x: Array, y: Array, box: Box, xp: Any) -> Array:
-    """Signed distance [...] from points to turned rectangles, m."""
+    """Returns signed distances [...] from points to turned rectangles, m."""
     x, y = to_box_frame(x - box.x, y - box.y, box)
     x, y = xp.abs(x) - box.half_x, xp.abs(y) - box.half_y
     outside = xp.sqrt(xp.maximum(x, 0.0) ** 2 + xp.maximum(y, 0.0) ** 2)
@@ -53,11 +53,11 @@ def _box_distance(x: Array, y: Array, box: Box, xp: Any) -> Array:
 
 
 def count_contacts(gap: Array, apart: Array, control_step: float, xp: Any) -> tuple[Array, Array]:
-    """Counts contacts: a gap that closes after the robot was free of the kind for a while.
+    """Counts contacts: a contact begins when a gap closes that has been open for a while.
 
     Args:
       gap: [..., R, 3] now, m.
-      apart: [..., R, 3] for how long the gap has been open, s.
+      apart: [..., R, 3] time for which the gap has been open, s.
       control_step: s.
       xp: `numpy` or `jax.numpy`.
 
@@ -65,6 +65,6 @@ def count_contacts(gap: Array, apart: Array, control_step: float, xp: Any) -> tu
       [..., R, 3] whether a contact begins, and the new `apart`.
     """
     touching = gap <= 0.0
-    # Half a step of slack: sums of control steps do not meet the pause to the last bit.
+    # Half a step of slack, because sums of control steps do not match the pause exactly.
     begins = touching & (apart > CONTACT_PAUSE - 0.5 * control_step)
     return begins, xp.where(touching, 0.0, apart + control_step)

@@ -1,4 +1,4 @@
-"""Geoms that touch nothing but through an explicit pair."""
+"""Geoms that can touch only through an explicit pair."""
 
 from collections.abc import Sequence
 
@@ -6,13 +6,13 @@ import mujoco
 
 from swarmjax import epuck
 
-HULL_GROUP = 3  # contact spheres, through which rays pass
-FLOOR_GROUP = 4  # wheels, skids and floor: likewise; wheels reach beyond the hull
-# Contacts are between a sphere at the height of the robot's centre of mass and upright faces: in
-# the plane that is exactly a disc of the hull's radius, at one contact point a pair instead of a
-# capsule's two, and a push neither tips the robot nor loads a skid more than the push itself.
+HULL_GROUP = 3  # contact spheres, which rays ignore
+FLOOR_GROUP = 4  # wheels, skids and floor, which rays ignore; wheels reach beyond the hull
+# Contacts are between a sphere at the height of the robot's centre of mass and upright faces. In
+# the plane this is exactly a disc of the hull's radius. It needs one contact point per pair, while
+# a capsule needs two. A push neither tips the robot nor puts extra load on a skid.
 CONTACT_HEIGHT = epuck.COM_HEIGHT
-SPIN = 5e-3, 1e-4, 1e-4  # MuJoCo's own torsional and rolling friction: unused by condim 3
+SPIN = 5e-3, 1e-4, 1e-4  # MuJoCo's default torsional and rolling friction; condim 3 ignores it
 
 
 def add_geom(
@@ -26,12 +26,12 @@ def add_geom(
     """Adds a massless geom and returns its name.
 
     Args:
-      body: whose it is.
+      body: parent body.
       name: of the geom.
       kind: shape.
-      size: three numbers, m, as MuJoCo means them for the shape.
+      size: three numbers, m, with MuJoCo's meaning for the shape.
       place: in the frame of the body, m.
-      group: which rays see it.
+      group: determines which rays see the geom.
 
     Returns:
       `name`.
@@ -43,7 +43,7 @@ def add_geom(
 
 
 def add_hull(body: mujoco.MjsBody, name: str, radius: float) -> str:
-    """Adds the hull that touches things, and returns its name.
+    """Adds the hull that makes contact, and returns its name.
 
     Args:
       body: of the robot, its origin on the floor.
@@ -59,7 +59,7 @@ def add_hull(body: mujoco.MjsBody, name: str, radius: float) -> str:
 
 
 def hull_name(robot: str) -> str:
-    """Names the hull of a robot of this name."""
+    """Returns the name of a robot's hull."""
     return f"{robot}_hull"
 
 

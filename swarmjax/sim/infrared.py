@@ -1,8 +1,8 @@
-"""Eight infrared rays a robot, by geometry: a ray against the walls, discs and turned boxes.
+"""Eight infrared rays per robot, computed from the geometry of walls, discs and turned boxes.
 
-One function a shape; each returns the distance at which the ray meets the shape, `inf` where it
-misses, and 0 where it starts inside: a sensor sits 3.5 to 6 mm behind the hull's surface, so a
-robot that is pressed against something has its sensor inside that thing. NumPy or JAX.
+There is one function per shape. It returns the distance at which a ray meets the shape, `inf` for a
+miss, and 0 for a ray that starts inside. Sensors sit 3.5 to 6 mm behind the hull's surface, so a
+robot pressed against an object has its sensor inside that object. Runs on NumPy or JAX.
 """
 
 import itertools
@@ -18,7 +18,7 @@ SENSOR_POSES = np.array(epuck.SENSOR_POSES, np.float32)
 
 
 class Mount(NamedTuple):
-    """How far off its nominal pose each sensor sits; None where none does.
+    """Mounting errors of the sensors; None without errors.
 
     Attributes:
       yaw: [..., R, K] rad, counter-clockwise.
@@ -30,7 +30,7 @@ class Mount(NamedTuple):
 
 
 class Reflectance(NamedTuple):
-    """How bright things are, above 0 and at most 1; None is 1.
+    """Reflectances of surfaces, above 0 and at most 1; None means 1.
 
     Attributes:
       wall: [...] of all the walls.
@@ -44,7 +44,7 @@ class Reflectance(NamedTuple):
 
 
 class Ray(NamedTuple):
-    """Rays in the world frame. Their coordinates are kept apart, so that XLA has none to gather.
+    """Rays in the world frame; separate coordinate arrays spare XLA any gathering.
 
     Attributes:
       x: [...] of the origin, m.
@@ -60,7 +60,7 @@ class Ray(NamedTuple):
 
 
 class Box(NamedTuple):
-    """Turned rectangles, their turn worked out once for all that look at them.
+    """Turned rectangles, with sine and cosine computed once for all rays.
 
     Attributes:
       x: [...] of the centre, m.
@@ -89,7 +89,7 @@ def rays(pose: Array, xp: Any, mount: Mount | None = None) -> tuple[Array, Array
     Args:
       pose: [..., 3] x (m), y (m), yaw (rad).
       xp: `numpy` or `jax.numpy`.
-      mount: errors of the sensors' poses; None is none.
+      mount: mounting errors of the sensors; None without errors.
 
     Returns:
       Origins and unit directions, [..., K, 2] each, world frame.
@@ -102,7 +102,7 @@ def _cast(pose: Array, xp: Any, mount: Mount | None) -> Ray:
     """Places the rays [..., K] of robots [..., 3] in the world."""
     cos, sin = xp.cos(pose[..., 2])[..., None], xp.sin(pose[..., 2])[..., None]
     x, y, bearing = SENSOR_POSES.T
-    # The angle-sum identities save a sine and a cosine for every ray that sits where it should.
+    # Angle-sum identities avoid a sine and a cosine per ray for sensors with the nominal yaw.
     ahead, aside = np.cos(bearing), np.sin(bearing)
     if mount is not None and mount.yaw is not None:
         ahead, aside = xp.cos(bearing + mount.yaw), xp.sin(bearing + mount.yaw)
@@ -117,7 +117,7 @@ def _cast(pose: Array, xp: Any, mount: Mount | None) -> Ray:
 
 
 def ray_walls(ray: Ray, half: Array, xp: Any) -> Array:
-    """Distance to the walls of a square arena centred on the origin.
+    """Returns the distance to the walls of a square arena centred on the origin.
 
     Args:
       ray: [...].
@@ -134,13 +134,13 @@ def ray_walls(ray: Ray, half: Array, xp: Any) -> Array:
 
 
 def _to_wall(at: Array, toward: Array, half: Array, xp: Any) -> Array:
-    """Distance [...] along a ray to the wall that it looks at, of the two across one axis."""
+    """Returns the distance [...] to the wall ahead, one of the two walls across an axis."""
     pace = xp.maximum(xp.abs(toward), 1e-9)  # a ray along a wall never meets it
     return (half - xp.where(toward < 0.0, -at, at)) / pace
 
 
 def ray_disc(ray: Ray, x: Array, y: Array, radius: float, xp: Any) -> Array:
-    """Distance to a disc.
+    """Returns the distance to a disc.
 
     Args:
       ray: [...].
@@ -162,7 +162,7 @@ def ray_disc(ray: Ray, x: Array, y: Array, radius: float, xp: Any) -> Array:
 
 
 def ray_box(ray: Ray, box: Box, xp: Any) -> Array:
-    """Distance to a turned rectangle, by the slab method in the rectangle's own frame.
+    """Returns the distance to a turned rectangle, by the slab method in the rectangle's frame.
 
     Args:
       ray: [...].
@@ -182,21 +182,21 @@ def ray_box(ray: Ray, box: Box, xp: Any) -> Array:
 
 
 def _cross(at: Array, toward: Array, half: Array, xp: Any) -> tuple[Array, Array]:
-    """Where [...] a ray enters and leaves the slab between two faces of a rectangle."""
-    # A ray along a face gets a tiny slope, which decides between meeting the slab and missing it.
+    """Returns where [...] a ray enters and leaves the slab between two faces of a rectangle."""
+    # A ray along a face gets a tiny slope, which decides whether it hits or misses the slab.
     pace = 1.0 / xp.where(xp.abs(toward) < 1e-9, 1e-9, toward)
     first, second = (-half - at) * pace, (half - at) * pace
     return xp.minimum(first, second), xp.maximum(first, second)
 
 
 def turned(box: Array, xp: Any) -> Box:
-    """Takes rectangles [..., 5], x (m), y (m), yaw (rad), half edges (m), apart."""
+    """Splits rectangles [..., 5] into x (m), y (m), yaw (rad) and half edges (m)."""
     x, y, yaw, half_x, half_y = (box[..., i] for i in range(5))
     return Box(x, y, xp.cos(yaw), xp.sin(yaw), half_x, half_y)
 
 
 def to_box_frame(x: Array, y: Array, box: Box) -> tuple[Array, Array]:
-    """Turns vectors (x, y) from the world's frame into that of rectangles, [...] each."""
+    """Rotates vectors (x, y) from the world frame into the frames of rectangles, [...] each."""
     return box.cos * x + box.sin * y, box.cos * y - box.sin * x
 
 
@@ -209,7 +209,7 @@ def distances(
     xp: Any,
     mount: Mount | None = None,
 ) -> Array:
-    """What the infrared sensors of a swarm see, as ideal distances.
+    """Returns the exact distances that the infrared sensors of a swarm see.
 
     Args:
       pose: [..., R, 3] x (m), y (m), yaw (rad) of the robots; absent ones are parked far away.
@@ -217,9 +217,9 @@ def distances(
       obstacle: [..., M, 5] x (m), y (m), yaw (rad), half edges (m); absent ones are parked far
         away.
       hull_radius: m.
-      limit: reach of a sensor from its own origin, m.
+      limit: range of a sensor from its own origin, m.
       xp: `numpy` or `jax.numpy`.
-      mount: errors of the sensors' poses; None is none.
+      mount: mounting errors of the sensors; None without errors.
 
     Returns:
       [..., R, K] distance from the sensor's origin to the nearest surface, m, 0..limit.
@@ -238,22 +238,22 @@ def sights(
     mount: Mount | None,
     xp: Any,
 ) -> tuple[Array, Array]:
-    """What the infrared sensors of a swarm see, and how bright it is.
+    """Returns what the infrared sensors of a swarm see: distances and reflectances.
 
     Args:
       pose: [..., R, 3] as for `distances`, as are all but `reflectance`.
       side: [...] of the arena, m.
       obstacle: [..., M, 5] x (m), y (m), yaw (rad), half edges (m).
       hull_radius: m.
-      limit: reach of a sensor from its own origin, m.
-      reflectance: of things.
-      mount: errors of the sensors' poses; None is none.
+      limit: range of a sensor from its own origin, m.
+      reflectance: of surfaces.
+      mount: mounting errors of the sensors; None without errors.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
       [..., R, K] distance from the sensor's origin to the nearest surface, m, 0..limit; and the
-      reflectance of what is there, 1 where nothing is. Of two things at the same distance, the
-      wall counts before a robot and a robot before an obstacle, of a kind the brightest.
+      reflectance of that surface, 1 without one. At equal distances, a wall takes precedence over a
+      robot, and a robot over an obstacle. Within one kind, the brightest counts.
     """
     wall, robot, box = _reaches(pose, side, obstacle, hull_radius, mount, xp)
     walls = None if reflectance.wall is None else reflectance.wall[..., None]
@@ -267,7 +267,7 @@ def sights(
 
 
 def _brightest(reaches: list[Array], here: Array, shade: Array | None, xp: Any) -> Array | float:
-    """Reflectance [..., R, K] of the things of one kind, [..., N], that rays meet at `here`."""
+    """Returns reflectances [..., R, K] of the objects of one kind that rays meet at `here`."""
     if shade is None:
         return 1.0
     found = 0.0
@@ -281,7 +281,7 @@ def _brightest(reaches: list[Array], here: Array, shade: Array | None, xp: Any) 
 def _reaches(
     pose: Array, side: Array, obstacle: Array, hull_radius: float, mount: Mount | None, xp: Any
 ) -> tuple[list[Array], list[Array], list[Array]]:
-    """Distances (m) to the walls, the other robots and the obstacles, [..., R, K, 1] a piece."""
+    """Returns distances (m) to walls, other robots and obstacles: pieces [..., R, K, N]."""
     ray = _cast(pose, xp, mount)
     wall = ray_walls(ray, 0.5 * side[..., None, None], xp)[..., None]
     ray = Ray(*(part[..., None] for part in ray))

@@ -1,7 +1,7 @@
-"""The MuJoCo model of one arena: robots, obstacles and walls, from one builder.
+"""Builds the MuJoCo model of one arena: robots, obstacles and walls.
 
-Everything that a stage may change (side, obstacles, who is there) is a pose or a size, set at
-run time; the model itself is compiled once for the largest case. MuJoCo only, no JAX.
+A stage changes only poses and sizes (side, obstacles, presence), which are set at run time. The
+model itself is compiled once, for the largest case. This module uses MuJoCo only, no JAX.
 """
 
 import copy
@@ -18,20 +18,20 @@ from swarmjax.sim.geometry import SPIN, add_geom, add_ray_hull
 from swarmjax.sim.planar import PLANAR
 from swarmjax.sim.wheeled import WHEELED
 
-WALL_HALF_THICKNESS = 0.05  # m; a robot sinks 4 mm into a wall at most, so none gets through
+WALL_HALF_THICKNESS = 0.05  # m; a robot sinks at most 4 mm into a wall, so none gets through
 WALL_HALF_LENGTH = 2.5  # m; longer than half the largest arena (4 m)
 HALF_HEIGHT = 0.05  # m; walls and obstacles are 0.1 m high (Webots RectangleArena)
 WALLS = 4
 BODIES: dict[str, Body] = {"planar": PLANAR, "wheeled": WHEELED}
-# How obstacles and walls are described. MuJoCo C relies on what it worked out of the world's geoms
-# when it compiled them (`geom_sameframe`, a hierarchy of bounds for rays), so there they are bodies
-# that it knows to move. MJX relies on neither, and pays for every body; and for every actuator, so
-# that a body's `Servos` are left to whoever steps the world.
+# Representation of obstacles and walls. When MuJoCo C compiles geoms of the world, it precomputes
+# data for them (`geom_sameframe`, a bounding hierarchy for rays). So in MuJoCo C they are movable
+# bodies. MJX does not use that data, but every body costs time, so there they are geoms of the
+# world. Every actuator costs time too, so a body's `Servos` are left to the engine.
 Fixtures = Literal["mocap", "world"]
 
 
 class ArenaSize(NamedTuple):
-    """What the model is compiled for.
+    """Sizes that the model is compiled for.
 
     Attributes:
       robots: largest number of robots, R.
@@ -45,13 +45,13 @@ class ArenaSize(NamedTuple):
 
 
 class Ids(NamedTuple):
-    """Where things lie in the model's arrays.
+    """Rows of objects in the model's arrays.
 
     Attributes:
-      fixture_geom: [M + 4] rows of `geom_size`, one after the other: obstacles, then walls east,
-        north, west, south.
-      fixture_mocap: [M + 4] rows of `mocap_pos` likewise; -1 of geoms of the world.
-      obstacle_geom: [M] the first of `fixture_geom`.
+      fixture_geom: [M + 4] consecutive rows of `geom_size`: obstacles, then walls east, north,
+        west, south.
+      fixture_mocap: [M + 4] rows of `mocap_pos` in the same order; -1 for geoms of the world.
+      obstacle_geom: [M] the first rows of `fixture_geom`.
       hull_body: [R] bodies, for `bodyexclude` of a ray.
       robots: rows of the robots.
     """
@@ -71,18 +71,18 @@ def build(
     ray_geoms: bool = False,
     fixtures: Fixtures = "mocap",
 ) -> mujoco.MjSpec:
-    """Describes one arena.
+    """Builds the spec of one arena.
 
     Args:
-      robot: the robot's numbers.
-      size: what to compile for.
+      robot: settings of the robot.
+      size: sizes to compile for.
       timestep: one physics step, s.
-      ray_geoms: add the hull as the cylinder that a ray sees; the analytic sensors need none.
-      fixtures: obstacles and walls are `mocap` bodies, for MuJoCo C, or geoms of the `world`, whose
-        poses MJX is told, as it is the forces of servos.
+      ray_geoms: whether to add the cylinder hulls that rays see; analytic sensors need none.
+      fixtures: `mocap` makes obstacles and walls bodies, for MuJoCo C. `world` makes them geoms of
+        the world, for MJX, which gets their poses and the servos' forces at run time.
 
     Returns:
-      The spec, ready to compile: qpos, qvel and ctrl hold each robot in turn, as its body says.
+      The spec, ready to compile. qpos, qvel and ctrl hold each robot in turn, in its body's layout.
     """
     spec = mujoco.MjSpec()
     _set_options(spec, timestep, BODIES[robot.body], rubs=robot.hull_friction > 0.0)
@@ -103,7 +103,7 @@ def build(
 
 
 def ids(model: mujoco.MjModel, size: ArenaSize) -> Ids:
-    """Looks the rows of robots, obstacles and walls up by name."""
+    """Looks up the rows of robots, obstacles and walls by name."""
     boxes = [model.geom(f"{name}_box").id for name in _fixture_names(size)]
     fixture_geom = np.array(boxes, np.int32)
     return Ids(
@@ -116,17 +116,17 @@ def ids(model: mujoco.MjModel, size: ArenaSize) -> Ids:
 
 
 def resize_obstacles(model: mujoco.MjModel, ids: Ids, half: np.ndarray) -> mujoco.MjModel:
-    """Gives the obstacles of a compiled arena other sizes.
+    """Changes the obstacle sizes of a compiled arena.
 
-    MuJoCo derives the bounds of a box from its size when it compiles one, and nothing else.
+    From a box's size, MuJoCo's compiler derives only its bounds.
 
     Args:
-      model: of `build`, with `fixtures="mocap"`; it stays as it is.
-      ids: of `ids`.
+      model: made by `build` with `fixtures="mocap"`; it stays unchanged.
+      ids: made by `ids`.
       half: [M, 2] half edges, m.
 
     Returns:
-      The model that `build` makes with these sizes.
+      The same model as `build` makes with these sizes.
     """
     found, geoms = copy.copy(model), ids.obstacle_geom
     size = np.column_stack([half, np.full(len(half), HALF_HEIGHT)])
@@ -137,7 +137,7 @@ def resize_obstacles(model: mujoco.MjModel, ids: Ids, half: np.ndarray) -> mujoc
 
 
 def fixture_rectangles(side: Any, obstacle: Any, xp: Any) -> Any:
-    """Outlines the obstacles, and the walls east, north, west and south of the arena.
+    """Returns the rectangles of obstacles, and of the walls east, north, west and south.
 
     Args:
       side: [] of the arena, m.
@@ -145,7 +145,7 @@ def fixture_rectangles(side: Any, obstacle: Any, xp: Any) -> Any:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [M + 4, 5] likewise.
+      [M + 4, 5], in the same format as `obstacle`.
     """
     bearing = np.arange(WALLS, dtype=np.float32) * np.float32(np.pi / 2)
     away = 0.5 * side + WALL_HALF_THICKNESS
@@ -156,7 +156,7 @@ def fixture_rectangles(side: Any, obstacle: Any, xp: Any) -> Any:
 
 
 def fixture_poses(side: Any, obstacle: Any, xp: Any) -> tuple[Any, Any]:
-    """Places the obstacles, and the walls east, north, west and south of the arena.
+    """Returns the poses of obstacles, and of the walls east, north, west and south.
 
     Args:
       side: [] of the arena, m.
@@ -174,26 +174,26 @@ def fixture_poses(side: Any, obstacle: Any, xp: Any) -> tuple[Any, Any]:
 
 
 def _fixture_names(size: ArenaSize) -> list[str]:
-    """Obstacles, then walls."""
+    """Returns the names of obstacles, then walls."""
     return [f"obstacle{i}" for i in range(size.obstacles)] + [f"wall{i}" for i in range(WALLS)]
 
 
 def _rubbing(friction: float) -> dict[str, Any]:
-    """How a hull meets things: condim 1 slides, condim 3 has Coulomb friction along the face."""
+    """Returns hull contact options: condim 1 slides, condim 3 has Coulomb friction on the face."""
     if friction == 0.0:
         return {"condim": 1}
     return {"condim": 3, "friction": [friction, friction, *SPIN]}
 
 
 def _set_options(spec: mujoco.MjSpec, timestep: float, body: Body, *, rubs: bool) -> None:
-    """Euler: the servos are discrete. What acts on nothing is switched off; MJX pays for asking."""
+    """Selects Euler, as servos are discrete, and disables unused features, which cost MJX time."""
     if rubs:
         spec.option.cone = body.cone
     spec.option.timestep = timestep
     spec.option.gravity = [0.0, 0.0, -epuck.GRAVITY]
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     off = mujoco.mjtDisableBit
-    # No joint has damping (whose factorisation is a flag of its own), a spring, or dry friction.
+    # No joint has damping (its factorisation has its own flag), a spring, or dry friction.
     spec.option.disableflags |= int(off.mjDSBL_EULERDAMP | off.mjDSBL_DAMPER | off.mjDSBL_SPRING)
     spec.option.disableflags |= int(off.mjDSBL_FRICTIONLOSS)
     if not body.gravity:
@@ -201,7 +201,7 @@ def _set_options(spec: mujoco.MjSpec, timestep: float, body: Body, *, rubs: bool
 
 
 def _add_box(spec: mujoco.MjSpec, name: str, half: float, fixtures: Fixtures) -> str:
-    """Adds a box whose pose is set at run time and returns the name of its geom."""
+    """Adds a box with a pose that is set at run time, and returns the name of its geom."""
     world = spec.worldbody
     body = world.add_body(name=name, mocap=True) if fixtures == "mocap" else world
     thickness = WALL_HALF_THICKNESS if name.startswith("wall") else half

@@ -1,6 +1,6 @@
-"""From a command to the wheels of a real robot: it comes late or not at all, and inexactly.
+"""Realistic motors: commands arrive late or get lost, and wheels follow them inexactly.
 
-Code takes the array module, as all that training and the judge without JAX share.
+The code takes the array module, since training and JAX-free evaluation share it.
 """
 
 import math
@@ -12,23 +12,23 @@ from swarmjax.sim.realism_config import RealismConfig
 
 Array = Any
 
-# Steps of the motor in one turn of the wheel: 20 in a turn of the motor, geared down by 50; the
-# guide of the e-puck, and the same for both versions.
+# Motor steps in one turn of the wheel: 20 per turn of the motor, with a 50:1 gear. Source: the
+# e-puck guide; both versions have the same number.
 STEPS_PER_TURN = 1000
 _STEPS_PER_RADIAN = STEPS_PER_TURN / (2.0 * math.pi)
-# Ticks of the timer in a second; between two steps lies a whole number of them. e-puck 1: 0.1 ms,
-# `e_motors.c` of e-puck-library. e-puck 2: 0.01 ms and two to each step, `motors.c` of
-# e-puck2_main-processor.
+# Timer ticks per second. The time between two steps is a whole number of ticks. e-puck 1: ticks of
+# 0.1 ms, `e_motors.c` of e-puck-library. e-puck 2: ticks of 0.01 ms, two for each step, `motors.c`
+# of e-puck2_main-processor.
 _TICKS = {"epuck1": 10_000, "epuck2": 50_000}
 
 
 class Motor(NamedTuple):
-    """Commands on their way to the wheels; what no factor needs is None.
+    """Commands on their way to the wheels; fields that no factor uses are None.
 
     Attributes:
       queue: [..., D, R, 2] the last commands sent, newest first; D is the largest latency.
-      held: [..., R] control steps of a stall that are left, int32.
-      applied: [..., R, 2] the command that the wheels had last.
+      held: [..., R] remaining control steps of a stall, int32.
+      applied: [..., R, 2] the command that the wheels followed last.
     """
 
     queue: Array | None
@@ -37,15 +37,15 @@ class Motor(NamedTuple):
 
 
 def init(realism: RealismConfig, robots: int, xp: Any) -> Motor | None:
-    """Starts an episode: all commands so far were zero, the robots at rest.
+    """Starts an episode: all previous commands are zero, and the robots are at rest.
 
     Args:
-      realism: says which parts there are.
+      realism: determines which fields are used.
       robots: R.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      The state of one arena, or None where commands come at once and always.
+      The state of one arena; None if commands always arrive at once.
     """
     depth = 0 if realism.action_latency is None else realism.action_latency[1]
     stalls = realism.stall is not None
@@ -68,25 +68,25 @@ def deliver(
     control_step: float,
     xp: Any,
 ) -> tuple[Motor | None, Array]:
-    """Sends a command off, and returns the one that reaches the wheels in this control step.
+    """Sends a command, and returns the one that reaches the wheels in this control step.
 
-    A late command arrives whole control steps later. While the link stalls, the wheels keep the
-    last command that arrived, as stepper motors do. After it they follow the newest one that is
-    due by then; those before it are lost. On a real robot a packet's header took 9.3 ms in the
-    mean and 1.95 s at worst (620 of them over WiFi, log of UNIFR_API_EPUCK).
+    A late command arrives a whole number of control steps later. While the link stalls, the wheels
+    keep the last command that arrived, as stepper motors do. After the stall they follow the newest
+    command that is due; older ones are lost. On a real robot, the header of a packet took 9.3 ms on
+    average and at most 1.95 s (620 packets over WiFi, log of UNIFR_API_EPUCK).
 
     Args:
-      motor: as of the last control step, with the leading axes of `command`.
-      command: [..., R, 2] sent now, of any unit.
+      motor: state of the last control step, with the leading axes of `command`.
+      command: [..., R, 2] sent now, in any unit.
       latency: [..., R] control steps, 0 to the largest of `realism`, int32; None is 0.
-      realism: for the stalls' probability and length; fixes the program.
+      realism: provides probability and length of stalls; fixed for a program.
       seed: [...] uint32 of the episode.
       clock: [...] or [] control steps since the start.
       control_step: s.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      The new state, and [..., R, 2] the command that the wheels follow now.
+      The new state, and the command [..., R, 2] that the wheels follow now.
     """
     if motor is None:
         return None, command
@@ -105,10 +105,10 @@ def deliver(
 def _stall(
     held: Array, realism: RealismConfig, seed: Array, clock: Array, control_step: float, xp: Any
 ) -> Array:
-    """Lets stalls begin where none runs; returns the control steps left with this one, [..., R]."""
+    """Starts stalls; returns the stalled control steps left, including this one, [..., R]."""
     robots = held.shape[-1:]
     begins = noise.uniform(seed, clock, Stream.STALL, robots, xp) < realism.stall
-    # In control steps first, so that a fixed length rounds the same in NumPy and JAX.
+    # Convert to control steps first, so that a fixed length rounds the same in NumPy and JAX.
     low, high = (seconds / control_step for seconds in realism.stall_time)
     share = noise.uniform(seed, clock, Stream.STALL_TIME, robots, xp)
     length = xp.round(low + share * (high - low)).astype(xp.int32)
@@ -116,22 +116,22 @@ def _stall(
 
 
 def disturb(wheels: Array, realism: RealismConfig, seed: Array, clock: Array, xp: Any) -> Array:
-    """Turns the wheel speeds that are asked for into those that the floor sees.
+    """Converts requested wheel speeds to actual ones.
 
-    The firmware rounds first, because all that it knows is the command. What grip and load do to
-    the wheel comes on top and need not be a speed that the timer can make: a factor 1 + N(0, sd),
-    fresh for each wheel and control step, as in ARGoS' `epuck_wheels` (sd 0.05 in IRIDIA's
+    First the firmware rounds the speed, since it knows only the command. Then grip and load change
+    it by a factor 1 + N(0, sd), drawn for each wheel and control step. The result need not be a
+    speed that the timer can make. ARGoS' `epuck_wheels` has the same factor (sd 0.05 in IRIDIA's
     experiments).
 
     Args:
       wheels: [..., R, 2] left and right wheel speed, rad/s.
-      realism: `speed_quantisation` and `speed_noise`; fixes the program.
+      realism: provides `speed_quantisation` and `speed_noise`; fixed for a program.
       seed: [...] uint32 of the episode.
       clock: [...] or [] control steps since the start.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [..., R, 2] rad/s; the argument itself where both factors are off.
+      [..., R, 2] rad/s; the argument itself if both factors are off.
     """
     if realism.speed_quantisation is not None:
         wheels = quantise(wheels, realism.speed_quantisation, xp)
@@ -144,21 +144,21 @@ def disturb(wheels: Array, realism: RealismConfig, seed: Array, clock: Array, xp
 def quantise(speed: Array, version: Literal["epuck1", "epuck2"], xp: Any) -> Array:
     """Rounds wheel speeds to those that the firmware's timer can make.
 
-    A command is a whole number of steps per second, its fraction cut off, so that below one step
-    per second nothing moves. The time between steps is a whole number of ticks, cut off again,
-    which makes the wheel faster: up to 1000 steps per second by less than 10 % on version 1 and
-    2 % on version 2. `e_motors.c` of e-puck-library, `motors.c` of e-puck2_main-processor.
+    A command is truncated to a whole number of steps per second, so below one step per second
+    nothing moves. The time between steps is truncated to a whole number of ticks, which makes the
+    wheel faster. Up to 1000 steps per second, the error is less than 10 % on version 1 and 2 % on
+    version 2. Sources: `e_motors.c` of e-puck-library, `motors.c` of e-puck2_main-processor.
 
     Args:
       speed: [...] rad/s.
-      version: whose firmware.
+      version: version of the firmware.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [...] rad/s, of the same sign and type.
+      [...] rad/s, with the same sign and type.
     """
     ticks = _TICKS[version]
-    # One tick between steps is the least; cutting off there also keeps to what an int32 holds.
+    # The least time between steps is one tick. This limit also keeps the value within an int32.
     steps = xp.minimum(xp.floor(xp.abs(speed) * _STEPS_PER_RADIAN), ticks).astype(xp.int32)
     interval = (ticks // xp.maximum(steps, 1)).astype(speed.dtype)
     made = xp.sign(speed) * (ticks / _STEPS_PER_RADIAN) / interval

@@ -1,7 +1,7 @@
-"""Random numbers by counting: a hash of where a number is used, and no state to carry along.
+"""Counter-based random numbers: each number is a hash of where it is used, without any state.
 
-The same seed, clock, stream and index give the same number in NumPy and in JAX, so that a level
-replays exactly with everything that is random about it. Not for secrets.
+The same seed, clock, stream and index give the same number in NumPy and in JAX. A level therefore
+replays exactly, with all its randomness. Do not use these numbers for secrets.
 """
 
 import enum
@@ -12,13 +12,13 @@ import numpy as np
 
 Array = Any
 
-MOST = math.sqrt(48.0 * math.log(2.0))  # 5.77; `normal` goes no further from 0
+MOST = math.sqrt(48.0 * math.log(2.0))  # 5.77; largest magnitude of `normal`
 
 
 class Stream(enum.IntEnum):
-    """What a random number is for; a value, once given out, stays, or old levels replay otherwise.
+    """Purpose of a random number; values must never change, so that old levels still replay.
 
-    Those up to `HULL_FRICTION` are drawn once an episode, at clock 0, the others at each
+    Streams up to `HULL_FRICTION` are drawn once per episode, at clock 0; the others at each
     control step.
     """
 
@@ -56,25 +56,26 @@ class Stream(enum.IntEnum):
 
 
 def bits(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: Any) -> Array:
-    """Hashes (seed, clock, stream, index) to whole numbers, of which every bit is fair.
+    """Hashes (seed, clock, stream, index) to integers with unbiased bits.
 
-    The four words are taken up one after the other, each mixed before it is joined and the result
-    mixed after: so no seed runs through the numbers of another, shifted by a clock or an index,
-    and none changes places with a clock. What an index gets does not depend on the shape, so
-    robots that are added leave the others' numbers alone.
+    The four words are combined one after the other. Each word is mixed before it is combined, and
+    the result is mixed again. So the numbers of one seed are not the shifted numbers of another
+    seed, and swapping seed and clock changes the result. The number at an index does not depend on
+    the shape, so adding robots leaves the others' numbers unchanged.
 
     Args:
       seed: [...] uint32.
       clock: [...] or [] control steps since the start, 0 or more.
-      stream: what the numbers are for, one of `Stream`.
-      shape: of the numbers for one seed; their index counts through it, the last axis fastest.
+      stream: purpose of the numbers, one of `Stream`.
+      shape: shape of the numbers for one seed; the index counts along the last axis first.
       xp: `numpy` or `jax.numpy`; both give the same numbers.
 
     Returns:
       [..., *shape] uint32.
     """
-    # A last axis throughout, because NumPy warns of an overflow of scalars only.
-    key = _mix(_mix(xp.asarray(seed, xp.uint32)[..., None]))  # once, it would commute with clock
+    # Keep a last axis throughout, because NumPy warns about overflow only for scalars.
+    # Mixed only once, the seed would commute with the clock.
+    key = _mix(_mix(xp.asarray(seed, xp.uint32)[..., None]))
     index = np.arange(math.prod(shape), dtype=np.uint32)
     for word in (xp.asarray(clock, xp.uint32)[..., None], np.full(1, stream, np.uint32), index):
         key = _mix(key ^ _mix(word))
@@ -87,20 +88,20 @@ def uniform(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: 
     Args:
       seed: [...] uint32.
       clock: [...] or [] control steps since the start, 0 or more.
-      stream: what the numbers are for, one of `Stream`.
-      shape: of the numbers for one seed.
+      stream: purpose of the numbers, one of `Stream`.
+      shape: shape of the numbers for one seed.
       xp: `numpy` or `jax.numpy`; both give the same numbers.
 
     Returns:
       [..., *shape] float32 in [0, 1).
     """
-    # The most that a float32 holds: every step of 2**-24 below 1 is a number of its own.
+    # 24 bits are the most that a float32 below 1 can hold without rounding two values together.
     whole = bits(seed, clock, stream, shape, xp) >> 8
     return whole.astype(xp.float32) * np.float32(2.0**-24)
 
 
 def normal(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: Any) -> Array:
-    """Draws standard normal numbers, two from each two uniform ones.
+    """Draws standard normal numbers, from two uniform numbers for each pair.
 
     Box and Muller, "A Note on the Generation of Random Normal Deviates", Annals of Mathematical
     Statistics 29 (1958), pages 610-611, equation 1. The smallest uniform number bounds the result
@@ -109,9 +110,9 @@ def normal(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: A
     Args:
       seed: [...] uint32.
       clock: [...] or [] control steps since the start, 0 or more.
-      stream: what the numbers are for, one of `Stream`.
-      shape: of the numbers for one seed.
-      xp: `numpy` or `jax.numpy`; both give the same numbers but for the rounding of log and cos.
+      stream: purpose of the numbers, one of `Stream`.
+      shape: shape of the numbers for one seed.
+      xp: `numpy` or `jax.numpy`; both give the same numbers up to rounding of log and cos.
 
     Returns:
       [..., *shape] float32.
@@ -128,8 +129,8 @@ def normal(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: A
 def _mix(word: Array) -> Array:
     """Scrambles uint32 one to one: flipping any bit flips each other bit with probability 1/2.
 
-    `triple32inc` of Chris Wellons, "Prospecting for Hash Functions" (2018) and the tables of
-    github.com/skeeto/hash-prospector: bias 0.0208, where a perfect one measures 0.021.
+    This is `triple32inc` from Chris Wellons, "Prospecting for Hash Functions" (2018) and the tables
+    of github.com/skeeto/hash-prospector. Its bias is 0.0208; a perfect hash measures 0.021.
     """
     word = word + np.uint32(1)
     word = (word ^ (word >> 17)) * np.uint32(0xED5AD4BB)

@@ -1,8 +1,8 @@
-"""Many arenas' rigid bodies on one device: MJX, by `impl=jax` or `impl=warp`.
+"""Physics of many arenas on one device: MJX, with `impl=jax` or `impl=warp`.
 
-The state of an arena is `PhysicsState`: positions, velocities and the solver's warm start, the
-same for every engine and all that a step reads. Inside a rollout the engine's whole data is
-carried instead, because rebuilding it at every control step costs a quarter of the speed.
+The state of an arena is `PhysicsState`: positions, velocities and the solver's warm start. It is
+the same for every engine, and a step reads nothing else. Within a rollout, the engine's complete
+data is carried instead, since rebuilding it at every control step costs a quarter of the speed.
 """
 
 import functools
@@ -22,7 +22,7 @@ from swarmjax.sim.body import AS_BUILT, Body, Chassis
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.engine import Data, Engine, Model
 
-# Where a rotation about the z axis has cosines, sines and ones.
+# Places of cosines, sines and ones in a rotation matrix about the z axis.
 _COSINES = np.diag([1.0, 1.0, 0.0]).astype(np.float32)
 _SINES = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], np.float32)
 _ONES = np.diag([0.0, 0.0, 1.0]).astype(np.float32)
@@ -31,12 +31,12 @@ Fields = dict[str, Array]
 
 
 class PhysicsState(NamedTuple):
-    """What is physically the state of an arena (or, with a leading axis, of many).
+    """Physical state of an arena, or of many with a leading axis.
 
     Attributes:
-      qpos: [Q] positions of the joints, each robot in turn, as its body says.
-      qvel: [V] their rates.
-      qacc_warmstart: [V] where the solver starts.
+      qpos: [Q] joint positions of each robot in turn, in its body's layout.
+      qvel: [V] joint velocities.
+      qacc_warmstart: [V] starting point of the solver.
     """
 
     qpos: Array
@@ -46,13 +46,13 @@ class PhysicsState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Physics:
-    """The compiled side of the physics: fixed for a program.
+    """The compiled physics, fixed for a program.
 
     Attributes:
-      engine: what takes the physics steps.
-      host: the model as MuJoCo compiled it.
+      engine: takes the physics steps.
+      host: the model as compiled by MuJoCo.
       ids: rows of the moving bodies.
-      robot: the robot's numbers.
+      robot: settings of the robot.
       substeps: physics steps per control step.
     """
 
@@ -69,11 +69,11 @@ class Physics:
 
 
 def build_kernels(physics: Physics, states: PhysicsState) -> None:
-    """Makes Warp build MJX's kernels, which it does at their first step: half a minute, once.
+    """Makes Warp build MJX's kernels, which otherwise happens at the first step: half a minute.
 
     Args:
-      physics: the compiled side, whose engine `builds_kernels`.
-      states: [A] arenas; as many as the program will step, since contacts are sized for them.
+      physics: the compiled physics; its engine `builds_kernels`.
+      states: [A] arenas; as many as the program will step, since contact memory depends on it.
     """
 
     def step_once(state: PhysicsState) -> Array:
@@ -83,28 +83,28 @@ def build_kernels(physics: Physics, states: PhysicsState) -> None:
 
 
 def rest(physics: Physics, pose: Array) -> PhysicsState:
-    """Returns robots at rest at poses [R, 3], x (m), y (m), yaw (rad)."""
+    """Returns the state of robots at rest at poses [R, 3], x (m), y (m), yaw (rad)."""
     still = jnp.zeros(physics.host.nv)
     return PhysicsState(physics.body.qpos(pose, jnp), still, still)
 
 
 def unpack(physics: Physics, state: PhysicsState) -> Data:
-    """Fills the data of one arena in, to carry through a rollout."""
+    """Expands the state of one arena to the engine's data, for a rollout."""
     return physics.engine.template.replace(**state._asdict())
 
 
 def pack(data: Data) -> PhysicsState:
-    """Keeps of the data what is physically the state."""
+    """Extracts the physical state from the engine's data."""
     return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
 
 
 def poses(physics: Physics, data: Data | PhysicsState) -> Array:
-    """Returns [R, 3] x (m), y (m), yaw (rad) of the robots."""
+    """Returns the robots' poses [R, 3]: x (m), y (m), yaw (rad)."""
     return physics.body.pose(data.qpos, jnp)
 
 
 def is_finite(data: Data) -> Array:
-    """Returns [] whether the arena's physics is still sound."""
+    """Returns [] whether positions and velocities of the arena are finite."""
     return jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all()
 
 
@@ -116,15 +116,15 @@ def step(
     wheels: Array,
     chassis: Chassis = AS_BUILT,
 ) -> Data:
-    """Moves one arena on by one control step.
+    """Advances one arena by one control step.
 
     Args:
-      physics: the compiled side.
+      physics: the compiled physics.
       data: the arena.
       side: [] of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
       wheels: [R, 2] speeds of the left and right wheel that the motors hold, rad/s.
-      chassis: of the robots, where it is not the config's.
+      chassis: differences of the robots from the config.
 
     Returns:
       The arena, one control step later.
@@ -147,16 +147,16 @@ def step(
 
 
 def _drive(physics: Physics, data: Data, ctrl: Array, chassis: Chassis) -> Data:
-    """Lets the servos act in the next physics step: as actuators, or as the forces that they are.
+    """Applies the servos in the next physics step, as actuators or as forces.
 
     Args:
-      physics: the compiled side.
+      physics: the compiled physics.
       data: the arena.
-      ctrl: [R * U] as its body says.
+      ctrl: [R * U] in the body's layout.
       chassis: of the robots.
 
     Returns:
-      The arena, with what acts on its joints from now until the physics step is over.
+      The arena, with what acts on its joints during the next physics step.
     """
     servos, timestep = physics.body.servos, physics.host.opt.timestep
     if servos is None:
@@ -166,14 +166,14 @@ def _drive(physics: Physics, data: Data, ctrl: Array, chassis: Chassis) -> Data:
 
 
 def _fixtures(physics: Physics, side: Array, obstacle: Array) -> tuple[Fields, Fields]:
-    """Puts this arena's obstacles and walls where the implementation looks for them.
+    """Places obstacles and walls of an arena where the implementation reads them.
 
-    `jax` works the poses of all geoms out from the model. `warp` passes over those of the world,
-    which stay in the data as they were made, or set here; it overwrites the poses of all others.
-    An engine that is not MJX is told side and obstacles themselves.
+    `jax` computes the poses of all geoms from the model. `warp` does not compute the poses of geoms
+    of the world, so they are set in the data; it overwrites the poses of all other geoms. An engine
+    that is not MJX takes side and obstacles directly.
 
     Args:
-      physics: the compiled side.
+      physics: the compiled physics.
       side: [] of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
@@ -200,8 +200,8 @@ def _fixtures(physics: Physics, side: Array, obstacle: Array) -> tuple[Fields, F
 def _with_rows(array: Array, rows: Any, first: int) -> Array:
     """Replaces the rows from `first` on.
 
-    By a choice: `.at` under `vmap` is a scatter, and of a concatenation every part is a branch, all
-    of which a GPU takes.
+    It uses `where`: `.at` becomes a scatter under `vmap`, and a concatenation becomes a branch per
+    part, all of which a GPU takes.
     """
     count, end = len(array), first + len(rows)
     row = np.arange(count).reshape(-1, *[1] * (array.ndim - 1))
@@ -210,22 +210,22 @@ def _with_rows(array: Array, rows: Any, first: int) -> Array:
 
 
 def _wall_matrices() -> np.ndarray:
-    """Rotation matrices [4, 3, 3] of the walls."""
+    """Returns the rotation matrices [4, 3, 3] of the walls."""
     turn = sim_model.fixture_poses(np.float32(0.0), np.zeros((0, 5), np.float32), np)[1]
     return _matrices(2.0 * np.arctan2(turn[:, 3], turn[:, 0]), np)
 
 
 def _matrices(yaw: Any, xp: Any) -> Any:
-    """Rotation matrices [F, 3, 3] about the z axis by angles [F], rad; no concatenation."""
+    """Returns rotation matrices [F, 3, 3] about the z axis by angles [F], without concatenation."""
     cos, sin = (angle[:, None, None] for angle in (xp.cos(yaw), xp.sin(yaw)))
     return cos * _COSINES + sin * _SINES + _ONES
 
 
 def _change(physics: Physics, fields: Fields, chassis: Chassis) -> Model:
-    """Sets what this arena's model has of its own: these fields, and the chassis."""
+    """Sets the parts of the model that differ between arenas: `fields` and the chassis."""
     model, rows_of = physics.engine.model, physics.ids.robots
     changes = physics.body.changes(chassis, rows_of, physics.robot, physics.host)
-    if not physics.engine.is_mjx:  # then the model has only the fields that are read
+    if not physics.engine.is_mjx:  # its model has only the fields that it reads
         changes = {
             name: changes[name] for name in changes if getattr(model, name, None) is not None
         }

@@ -1,10 +1,10 @@
-"""The planar body: three degrees of freedom, and a servo that stands for wheels on a floor.
+"""The planar body: three degrees of freedom, and a servo in place of wheels on a floor.
 
-It trains five times faster than the wheeled one. Its forces are limited by what the wheels could
-pass to the floor, but a servo that is deadbeat over 32 ms seldom reaches that: it has its speed in
-one step where wheels take two thirds of one, and blocked it pushes with m v / dt = 0.6 N where
-wheels push with 1.0 N. It also turns freely while it is blocked, where two slipping wheels hardly
-turn: what policies that push things lose on the wheeled body (docs/robot.md).
+It trains five times faster than the wheeled body. Its forces are limited to what wheels can pass to
+the floor, but the servo is deadbeat over 32 ms and seldom reaches that limit. It reaches its speed
+in one step, where wheels get two thirds of the way. When blocked, it pushes with m v / dt = 0.6 N,
+where wheels push with 1.0 N. A blocked planar robot also turns freely, while two slipping wheels
+hardly turn. Policies that push objects therefore perform worse on the wheeled body (docs/robot.md).
 """
 
 import itertools
@@ -22,11 +22,11 @@ from swarmjax.sim.geometry import add_hull
 
 Array = Any
 _SERVOS = "forward", "lateral", "turn"
-_WRENCH = 0, 1, 5  # where they push and turn: along x, along y, about z of the robot
+_WRENCH = 0, 1, 5  # their axes in the robot's frame: force along x and y, torque about z
 
 
 class _Numbers(NamedTuple):
-    """Numbers of the three servos, [3], or [R, 3] of robots that differ.
+    """Gains and limits of the three servos: [3], or [R, 3] if robots differ.
 
     Attributes:
       gain: N s/m, N s/m, N m s/rad.
@@ -42,7 +42,7 @@ def _add(spec: mujoco.MjSpec, name: str, robot: RobotConfig, timestep: float) ->
     body = spec.worldbody.add_body(name=name)
     body.explicitinertial = True
     body.mass = robot.mass
-    # The first two never turn; MuJoCo asks that no axis exceed the other two together.
+    # The robot never turns about x and y, but MuJoCo requires the triangle inequality of moments.
     body.inertia = [robot.yaw_inertia] * 3
     slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
     body.add_joint(name=f"{name}_x", type=slide, axis=[1, 0, 0])
@@ -52,7 +52,7 @@ def _add(spec: mujoco.MjSpec, name: str, robot: RobotConfig, timestep: float) ->
 
 
 def _add_servos(spec: mujoco.MjSpec, names: list[str], robot: RobotConfig, timestep: float) -> None:
-    """Adds the servos of the forward, lateral and turning velocity as actuators."""
+    """Adds the servos of forward, lateral and turning velocity as actuators."""
     for name in names:
         spec.body(name).add_site(name=f"{name}_axle")
     servos = list(zip(_SERVOS, _WRENCH, *_servos(robot, timestep), strict=True))
@@ -69,12 +69,12 @@ def _add_servos(spec: mujoco.MjSpec, names: list[str], robot: RobotConfig, times
 
 
 def _servos(robot: RobotConfig, timestep: float) -> _Numbers:
-    """The servos of a robot that is what the config says.
+    """Returns the servos of a nominal robot.
 
-    Gains are deadbeat, mass / timestep, times the share of the way that a first-order lag goes in
-    one step: the velocity is that of the lag at every step, whatever its length. The force limits
-    are what the wheels can pass to the floor (Coulomb): mu m g along either axis, and mu m g times
-    half the track as a torque.
+    The gains are deadbeat, mass / timestep, multiplied by the share of the way that a first-order
+    lag goes in one step. The velocity then equals the lag's at every step, for any step length. The
+    force limits are those that wheels can pass to the floor (Coulomb): mu m g along either axis,
+    and a torque of mu m g times half the track.
     """
     grip = robot.friction * robot.mass * epuck.GRAVITY
     share = servo_share(robot.motor_lag, timestep)
@@ -83,12 +83,12 @@ def _servos(robot: RobotConfig, timestep: float) -> _Numbers:
 
 
 def _ratios(chassis: Chassis, robot: RobotConfig, xp: Any) -> _Numbers:
-    """What a chassis multiplies them by: [R, 3], or with axes of 1 where all are alike.
+    """Returns the factors of a chassis on gains and limits: [R, 3], or 1 for axes without change.
 
-    A servo stays deadbeat for another mass; the grip follows mass, friction and track.
+    A servo stays deadbeat for another mass. The grip depends on mass, friction and track.
     """
     mass = _ratio(chassis.mass, robot.mass)
-    # From float64 on, which MuJoCo C computes in: what is drawn is of float32.
+    # Start in float64, which MuJoCo C uses; the drawn factors are float32.
     grip = np.ones((1, 1)) * mass * _ratio(chassis.friction, robot.friction)
     if chassis.track is None:
         return _Numbers(mass, grip)
@@ -98,7 +98,7 @@ def _ratios(chassis: Chassis, robot: RobotConfig, xp: Any) -> _Numbers:
 
 
 def _ratio(drawn: Array | None, nominal: float) -> Array:
-    """[R, 1] of what an episode has [R] to what the config says; [1, 1] if that is the same."""
+    """Returns ratios [R, 1] of drawn values [R] to the nominal one; [1, 1] if none are drawn."""
     return np.ones((1, 1)) if drawn is None else drawn[:, None] / nominal
 
 
@@ -111,10 +111,10 @@ def _force(
     timestep: float,
     xp: Any,
 ) -> Array:
-    """Forces of the servos along x and y of the world, and about z.
+    """Returns the servos' forces along x and y of the world, and torques about z.
 
-    What the actuators of `_add_servos` do (MuJoCo, Computation: actuation model): gain * (set point
-    - velocity in the robot's frame), clamped, and turned into the world by its heading.
+    This replicates the actuators of `_add_servos` (MuJoCo, Computation: actuation model): gain *
+    (set point - velocity in the robot's frame), clamped, and rotated to the world by the heading.
     """
     numbers, ratios = _servos(robot, timestep), _ratios(chassis, robot, xp)
     gain, limit = numbers.gain * ratios.gain, numbers.limit * ratios.limit
@@ -126,20 +126,20 @@ def _force(
 
 
 def _turn(vector: Array, cos: Array, sin: Array, xp: Any) -> Array:
-    """Turns [..., R, 3] x, y and what is about z by an angle [..., R] of this cos and sin."""
+    """Rotates x and y of vectors [..., R, 3] by angles [..., R], given as cos and sin."""
     x, y, about = vector[..., 0], vector[..., 1], vector[..., 2]
     return xp.stack([cos * x - sin * y, sin * x + cos * y, about], axis=-1)
 
 
 def servo_share(lag: float, timestep: float) -> float:
-    """Share of the way to its set point that a first-order servo goes in one physics step.
+    """Returns the share of the way that a first-order servo goes in one physics step.
 
     Args:
       lag: time constant, s; 0 reaches the set point in one step.
       timestep: s.
 
     Returns:
-      1 - exp(-timestep / lag), so that n steps go the closed form's 1 - exp(-n timestep / lag).
+      1 - exp(-timestep / lag). After n steps, the share is exactly 1 - exp(-n timestep / lag).
     """
     return 1.0 if lag == 0.0 else -math.expm1(-timestep / lag)
 
@@ -161,7 +161,7 @@ def _pose(qpos: Array, xp: Any) -> Array:
 
 
 def _ctrl(wheels: Array, chassis: Chassis, robot: RobotConfig, xp: Any) -> Array:
-    """Velocity of the body that rolls on these wheels without slip."""
+    """Returns the velocity of a body that rolls on these wheels without slip."""
     radius = robot.wheel_radius if chassis.wheel_radius is None else chassis.wheel_radius
     track = robot.effective_track if chassis.track is None else chassis.track
     velocity = body_velocity(wheels, radius, track, xp)
@@ -170,7 +170,7 @@ def _ctrl(wheels: Array, chassis: Chassis, robot: RobotConfig, xp: Any) -> Array
 
 
 def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjModel) -> Changes:
-    """Mass and inertia, friction of hulls, and where the servos are actuators, theirs."""
+    """Changes mass and inertia, hull friction, and the servos if they are actuators."""
     changes: Changes = {}
     if chassis.mass is not None:
         changes |= scale_mass(chassis.mass / robot.mass, rows, model)
@@ -189,8 +189,8 @@ def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjM
 
 PLANAR = Body(
     gravity=False,
-    # A hull's push and its friction are then two numbers, as soft as without friction; the cone of
-    # two edges in the plane is Coulomb's own (docs/design-notes.md, "Hulls that rub").
+    # With this cone, a hull's push and its friction are two numbers, as soft as without friction.
+    # Planar friction has only two cone edges, so it is exactly Coulomb's (docs/design-notes.md).
     cone=mujoco.mjtCone.mjCONE_ELLIPTIC,
     add=_add,
     qpos=_qpos,

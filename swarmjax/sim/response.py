@@ -1,12 +1,12 @@
-"""What an infrared sensor reports: from the ray that it casts to counts, and back.
+"""Infrared sensor models: convert ray lengths to counts, and back.
 
-A ray is the horizontal distance from the sensor's origin to the nearest thing, in metres; the
-real one rises by `epuck.SENSOR_TILT`, so against an upright face it is longer by 1 / cos(tilt).
+A ray is the horizontal distance from the sensor's origin to the nearest object, in metres. The real
+ray rises by `epuck.SENSOR_TILT`, so it is longer by 1 / cos(tilt) against an upright face.
 
-`webots` is the lookup table of Webots' E-puck: (length of the ray) / reflectance -> counts, with
-multiplicative noise; free space reads 67.19. `real` is a curve fitted to a measured robot, each
-sensor its own: reflectance * A / (gap + d)^2 counts above free space, with additive noise, and
-free space zeroed as the firmware does. NumPy or JAX.
+`webots` is the lookup table of Webots' E-puck. It maps (length of the ray) / reflectance to counts,
+with multiplicative noise; free space reads 67.19. `real` is a curve fitted to each sensor of a
+measured robot. It gives reflectance * A / (gap + d)^2 counts above free space, with additive noise.
+Free space is zeroed, as the firmware does. The code runs on NumPy or JAX.
 """
 
 import math
@@ -22,16 +22,16 @@ Response = Literal["webots", "real"]
 
 _RISE = math.cos(epuck.SENSOR_TILT)
 _LENGTH, _COUNTS, _SHARE = zip(*epuck.INFRARED_TABLE, strict=True)
-# m; further away nothing is seen, so rays need not be cast any further. Webots' table ends there,
-# for things of reflectance 1 at most. The measured curve would still read 13 to 22 counts; the
-# longest that any simulator of the e-puck lets its sensors see is 0.10 to 0.12 m (ARGoS, Enki).
+# m; nothing is seen beyond this distance, so rays end there. Webots' table ends at this length, for
+# objects of reflectance 1 at most. The measured curve would still read 13 to 22 counts there. The
+# longest range in any e-puck simulator is 0.10 to 0.12 m (ARGoS, Enki).
 REACH = {"webots": _LENGTH[-1] * _RISE, "real": 0.10}
 _STRENGTH, _DEPTH, _FREE, _SD, _SATURATION = np.array(epuck.INFRARED_FIT, np.float32).T
 _SPAN = _SATURATION - _FREE
 
 
 def _distance_to_hull() -> np.ndarray:
-    """Returns [K] m from the origins of the sensors along their rays to the hull's surface."""
+    """Returns distances [K] from the sensors' origins along their rays to the hull's surface, m."""
     x, y, yaw = np.array(epuck.SENSOR_POSES).T
     outward = x * np.cos(yaw) + y * np.sin(yaw)
     spare = epuck.HULL_RADIUS**2 - x**2 - y**2
@@ -42,13 +42,13 @@ TO_HULL = _distance_to_hull()
 
 
 class Wear(NamedTuple):
-    """How each sensor differs from a nominal one, [..., R, K] each; None where it does not.
+    """Differences of each sensor from a nominal one, [..., R, K] each; None for no difference.
 
     Attributes:
-      noise: times the response's own noise; None is no noise at all.
-      gain: times what a reflection adds to the reading of free space.
-      offset: counts that the reading is always off by.
-      dead: bool, whether the sensor never sees anything.
+      noise: factor on the model's own noise; None for no noise at all.
+      gain: factor on the reflected part of the reading.
+      offset: constant error of the reading, counts.
+      dead: whether the sensor never detects anything, bool.
     """
 
     noise: Array | None = None
@@ -68,15 +68,15 @@ def read(
     """Reads the sensors.
 
     Args:
-      response: of which robot.
-      ray: [..., R, K] horizontal distance from the sensor's origin to the nearest thing, m.
-      reflectance: [..., R, K] of that thing, above 0 and at most 1; None is 1.
+      response: sensor model.
+      ray: [..., R, K] horizontal distance from the sensor's origin to the nearest object, m.
+      reflectance: [..., R, K] of that object, above 0 and at most 1; None is 1.
       wear: of the sensors.
-      normal: [..., R, K] standard normal, fresh for each sample; None is no noise.
+      normal: [..., R, K] standard normal, drawn for each sample; None for no noise.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [..., R, K] counts, not clamped: noise takes a `real` reading below 0.
+      [..., R, K] counts, not clamped: noise can take a `real` reading below 0.
     """
     if wear.dead is not None:
         ray = xp.where(wear.dead, xp.inf, ray)
@@ -94,35 +94,35 @@ def read(
 
 
 def expected(response: Response, ray: Array, xp: Any) -> Array:
-    """Counts [..., R, K] of nominal sensors, free of noise, for rays [..., R, K] (m)."""
+    """Returns noise-free counts [..., R, K] of nominal sensors for rays [..., R, K] (m)."""
     return read(response, ray, None, Wear(), None, xp)
 
 
 def distance(response: Response, counts: Array, xp: Any) -> Array:
-    """The ray at which a nominal sensor reads so: the inverse of `expected`.
+    """Returns the ray that a nominal sensor's counts correspond to: the inverse of `expected`.
 
     Args:
-      response: of which robot.
+      response: sensor model.
       counts: [..., R, K].
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [..., R, K] m, falling as counts rise, 0..`REACH[response]`. A saturated `real` sensor is
-      as far away as one can be that saturates.
+      [..., R, K] m, falling as counts rise, 0..`REACH[response]`. A saturated `real` sensor gives
+      the largest distance at which it saturates.
     """
     reach = REACH[response]
     if response == "webots":
         return xp.clip(_RISE * _interpolate(counts, _COUNTS[::-1], _LENGTH[::-1], xp), 0.0, reach)
-    # Any reading that is below what is seen at the reach will do as the least.
+    # Any lower limit works that is below the reading at the largest distance.
     echo = xp.clip(counts, 1.0, _SPAN)
     return xp.clip(xp.sqrt(_STRENGTH / echo) - _DEPTH + TO_HULL, 0.0, reach)
 
 
 def _webots(ray: Array, bright: Array, gain: Array, xp: Any) -> tuple[Array, Array]:
-    """Returns counts and their sd by the table of Webots' E-puck.
+    """Returns counts and their standard deviation, from the table of Webots' E-puck.
 
-    Webots divides the length by the reflectance before it looks it up, and multiplies the counts
-    by 1 + share * normal (DistanceSensor, section "Sensor noise").
+    Webots divides the length by the reflectance before the lookup, and multiplies the counts by
+    1 + share * normal (DistanceSensor, section "Sensor noise").
     """
     length = ray / (_RISE * bright)
     above = [counts - _COUNTS[-1] for counts in _COUNTS]
@@ -131,17 +131,17 @@ def _webots(ray: Array, bright: Array, gain: Array, xp: Any) -> tuple[Array, Arr
 
 
 def _real(ray: Array, bright: Array, gain: Array, xp: Any) -> tuple[Array, Array]:
-    """Returns counts above free space, and their sd, by the curve fitted to a measured robot."""
+    """Returns counts above free space and their standard deviation, from the fitted curve."""
     gap = xp.maximum(ray - TO_HULL, 0.0)
     echo = bright * gain * _STRENGTH / (gap + _DEPTH) ** 2
     return xp.where(ray < REACH["real"], xp.minimum(echo, _SPAN), 0.0), _SD
 
 
 def _interpolate(x: Array, knots: Sequence[float], values: Sequence[float], xp: Any) -> Array:
-    """Interpolates linearly between rising knots, with the end values beyond them.
+    """Interpolates linearly between increasing knots, and holds the end values outside them.
 
-    A sum of ramps, one a segment: cheaper on an accelerator than a search, and exact where the
-    last value is small, for it is built up from there.
+    It sums one ramp per segment. This is cheaper on an accelerator than a search. It is exact where
+    the last value is small, since the sum starts from there.
     """
     result = values[-1]
     for i, start in enumerate(knots[:-1]):

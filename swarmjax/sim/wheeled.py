@@ -1,16 +1,15 @@
 """The wheeled body: the whole e-puck, free in space, on two driven wheels and two skids.
 
-The motors are steppers behind a 50:1 gear: what is commanded is the speed of a wheel, and no load
-below the one at which steps are lost changes it (Webots gives its motors 10 N m, which comes to
-the same). Here that is a velocity servo on a large reflected inertia, deadbeat in one physics
-step: the floor, which passes mu m g r / 2 = 0.016 N m to each wheel, changes its speed by 0.2 %
-of its limit in 16 ms, and the next step undoes it. A motor with only the inertia of the wheel
-(1e-6 kg m^2) is no substitute: with a stable gain it lags by milliseconds that depend on the time
-step.
+The motors are steppers behind a 50:1 gear. A command sets the speed of a wheel, and no load changes
+it until steps are lost. (Webots gives its motors 10 N m, which has the same effect.) Here the motor
+is a velocity servo on a large reflected inertia, deadbeat in one physics step. The floor passes
+mu m g r / 2 = 0.016 N m to each wheel. Over 16 ms this changes the wheel's speed by 0.2 % of its
+limit, and the next step undoes it. A motor with only the wheel's inertia (1e-6 kg m^2) does not
+work: with a stable gain it lags by milliseconds that depend on the time step.
 
-The grip of wheel on floor is a contact that takes out half the penetration and all slip within
-one physics step, as far as friction allows. MuJoCo's default contact takes 10 to 30 ms for it,
-depending on the time step, in which the wheel creeps.
+The grip of wheels on the floor is a contact. Within one physics step it removes half the
+penetration and, as far as friction allows, all slip. MuJoCo's default contact takes 10 to 30 ms for
+this, depending on the time step, and the wheel creeps meanwhile.
 """
 
 from typing import Any
@@ -26,14 +25,14 @@ from swarmjax.sim.planar import servo_share
 
 Array = Any
 FLOOR = "floor"
-ROTOR_INERTIA = 0.02  # kg m^2, reflected through the gear; chosen, see above
+ROTOR_INERTIA = 0.02  # kg m^2, reflected through the gear; chosen as explained above
 SKID_RADIUS = 0.005  # m; half the height of the box under the Webots e-puck
 _QPOS = 9  # x, y, z, quaternion (w, x, y, z), left wheel, right wheel
-REST_DEPTH = 1e-5  # m; as deep as the wheels stand in the floor, at 16 ms: 9e-6
-_PENETRATION = 0.5  # share that one physics step takes out
-_IMPEDANCE = 0.999  # of the grip: a thousandth of the weight's acceleration is left to it
-# m; the frame of a wheel, whose tyre is 5 mm wide, so that its geom lies beside it: MuJoCo takes a
-# geom that is compiled into its body's frame to stay there, whatever `geom_pos` says later.
+REST_DEPTH = 1e-5  # m; depth of the wheels in the floor at rest; at 16 ms it is 9e-6
+_PENETRATION = 0.5  # share that one physics step removes
+_IMPEDANCE = 0.999  # of the grip; it leaves a thousandth of gravity's acceleration
+# m; y of a wheel's frame. The tyre is 5 mm wide, so its geom lies off this frame. MuJoCo would
+# treat a geom compiled at the origin of its body's frame as fixed there, whatever `geom_pos` is.
 _INNER_EDGE = epuck.AXLE_Y - 0.0025
 _SIDES = np.array([1.0, -1.0], np.float32)  # left, right
 
@@ -50,20 +49,20 @@ def _add(spec: mujoco.MjSpec, name: str, robot: RobotConfig, timestep: float) ->
     for label, x in (("front", epuck.SKID_X), ("back", -epuck.SKID_X)):
         place = [x, 0.0, SKID_RADIUS + epuck.SKID_CLEARANCE]
         skid = add_geom(body, f"{name}_{label}", sphere, [SKID_RADIUS, 0, 0], place, FLOOR_GROUP)
-        # condim 1: skids carry and do not brake, as Webots' smooth box is meant to.
+        # condim 1: skids carry weight but do not brake, like the intended smooth box of Webots.
         spec.add_pair(geomname1=FLOOR, geomname2=skid, condim=1, **_grip(timestep))
     return add_hull(body, name, robot.hull_radius)
 
 
 def _add_floor(spec: mujoco.MjSpec) -> None:
-    """Adds the floor with the first robot."""
+    """Adds the floor together with the first robot."""
     if spec.geom(FLOOR) is None:
         plane = mujoco.mjtGeom.mjGEOM_PLANE
         add_geom(spec.worldbody, FLOOR, plane, [0, 0, 1], [0, 0, 0], FLOOR_GROUP)
 
 
 def _set_inertia(body: mujoco.MjsBody, robot: RobotConfig) -> None:
-    """Gives the body what of the robot's mass and inertia is not its wheels'."""
+    """Gives the body the robot's mass and inertia, less those of its wheels."""
     wheel = epuck.WHEEL_MASS
     yaw = robot.yaw_inertia - 2.0 * (wheel * epuck.AXLE_Y**2 + epuck.WHEEL_INERTIA[0])
     body.explicitinertial = True
@@ -80,10 +79,10 @@ def _add_wheel(
     robot: RobotConfig,
     timestep: float,
 ) -> None:
-    """Adds a wheel, its motor, and its grip on the floor; `side` is 1 left and -1 right.
+    """Adds a wheel, its motor, and its grip on the floor; `side` is 1 for left and -1 for right.
 
-    Its geom is a sphere around the point on the axle above which the tyre meets the floor: it
-    rolls as a wheel of the same radius does, and always grips at the same distance from the other.
+    The wheel's geom is a sphere, centred on the axle above the tyre's contact point. It rolls like
+    a wheel of the same radius. The distance between the contact points of both wheels is constant.
     """
     wheel = body.add_body(name=name, pos=[0.0, side * _INNER_EDGE, robot.wheel_radius])
     wheel.explicitinertial = True
@@ -103,7 +102,7 @@ def _add_wheel(
 
 
 def _grip(timestep: float) -> dict[str, list[float]]:
-    """A contact with the floor by stiffness and damping (negative `solref`) per unit of mass."""
+    """Returns a floor contact's stiffness and damping (negative `solref`) per unit of mass."""
     return {
         "solref": [-_PENETRATION / timestep**2, -1.0 / timestep],
         "solimp": [_IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0],
@@ -131,22 +130,22 @@ def _ctrl(wheels: Array, chassis: Chassis, robot: RobotConfig, xp: Any) -> Array
 
 
 def encoders(qpos: Array, xp: Any) -> Array:
-    """Angles that the wheels' encoders report.
+    """Returns the angles that the wheels' encoders report.
 
     Args:
       qpos: [..., R * 9] of wheeled robots.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [..., R, 2] left and right since the start, rad, in whole steps of 0.00628 (Webots E-puck,
-      1000 steps a turn), rounded down.
+      [..., R, 2] angles of the left and right wheel since the start, rad, rounded down to whole
+      steps of 0.00628 (Webots E-puck, 1000 steps per turn).
     """
     angle = qpos.reshape(*qpos.shape[:-1], -1, _QPOS)[..., 7:]
     return xp.floor(angle / epuck.ENCODER_STEP) * epuck.ENCODER_STEP
 
 
 def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjModel) -> Changes:
-    """Wheels of another size carry their axle at another height, so that the skids stay clear."""
+    """Returns the changes; wheels of another size move their axle, so that the skids stay clear."""
     changes: Changes = {}
     if chassis.mass is not None:
         changes |= scale_mass(chassis.mass / robot.mass, rows, model)
@@ -162,7 +161,7 @@ def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjM
 
 
 def _frictions(chassis: Chassis, rows: Rows) -> tuple[Any, Array]:
-    """Friction of the wheels on the floor, of hulls on what they touch, or of both."""
+    """Returns the change of friction: wheels on the floor, hulls on everything, or both."""
     if chassis.friction is None:
         return rub(chassis.hull_friction, rows)
     grip = chassis.friction[:, None, None].repeat(2, axis=1).repeat(2, axis=2)
@@ -176,8 +175,8 @@ def _frictions(chassis: Chassis, rows: Rows) -> tuple[Any, Array]:
 
 WHEELED = Body(
     gravity=True,
-    # What MuJoCo has by default, and what the grip of the wheels was measured with: a model has one
-    # cone, and MJX has no elliptic one beside skids of condim 1.
+    # MuJoCo's default, with which the grip of the wheels was measured. A model has only one cone,
+    # and MJX supports no elliptic cone together with skids of condim 1.
     cone=mujoco.mjtCone.mjCONE_PYRAMIDAL,
     add=_add,
     qpos=_qpos,

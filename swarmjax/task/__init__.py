@@ -1,5 +1,5 @@
-"""One arena as an environment: levels, observations, rewards and the electronics between.
+"""One arena as an environment: levels, observations, rewards and the robots' electronics.
 
-Imports `sim`. Nothing here knows of learning, of a curriculum or of many arenas: `env.load`,
-`env.reset` and `env.step` are the whole interface. Start with `env.step`.
+The package imports `sim`. It has no learning code, no curriculum and no batch of arenas. Its whole
+interface is `env.load`, `env.reset` and `env.step`. Start reading at `env.step`.
 """

@@ -1,10 +1,13 @@
-"""When a robot has arrived, and who drives: the two rules of `task.arrival`, in any array module.
+"""The two arrival rules of `task.arrival`: when a robot has arrived, and whether it may drive.
 
-`latch`: a robot that comes within its target has arrived and stands for good. `hold`: it has
-arrived while it is within its target; it goes on driving, and may leave again. By both an episode
-is complete once all robots have arrived, which by `hold` means all in the same control step: "stay
-at target" of multi-agent path finding (Stern et al. 2019, "Multi-Agent Pathfinding: Definitions,
-Variants, and Benchmarks").
+- `latch`: a robot that comes within its target has arrived and stops for good.
+- `hold`: a robot counts as arrived while it is within its target. It keeps driving and may leave.
+
+Under both rules an episode is complete once all robots have arrived. Under `hold`, all robots must
+be within their targets in the same control step. Multi-agent path finding calls this "stay at
+target" (Stern et al. 2019, "Multi-Agent Pathfinding: Definitions, Variants, and Benchmarks").
+
+The functions take arrays of any array module.
 """
 
 from typing import Any, Literal
@@ -13,12 +16,12 @@ Arrival = Literal["latch", "hold"]
 
 
 def arrived(rule: Arrival, before: Any, within: Any) -> Any:
-    """Tells which robots have arrived.
+    """Returns which robots have arrived.
 
     Args:
-      rule: of the task.
+      rule: the arrival rule of the task.
       before: [..., R] whether the robot had arrived before the control step, bool.
-      within: [..., R] whether it is within its target after it, bool.
+      within: [..., R] whether the robot is within its target after the control step, bool.
 
     Returns:
       [..., R] bool.
@@ -27,10 +30,10 @@ def arrived(rule: Arrival, before: Any, within: Any) -> Any:
 
 
 def drives(rule: Arrival, before: Any) -> Any:
-    """Tells which robots obey their commands in a control step.
+    """Returns which robots obey their commands in a control step.
 
     Args:
-      rule: of the task.
+      rule: the arrival rule of the task.
       before: [..., R] whether the robot had arrived before the control step, bool.
 
     Returns:

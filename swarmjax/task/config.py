@@ -1,4 +1,4 @@
-"""What a robot is asked to do: the settings of task and reward."""
+"""Settings of the task and its reward."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,18 +11,18 @@ from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.arrival import Arrival
 
-# Beyond, returns squared, as the value's loss has them, may leave float32.
+# The value loss squares returns. With larger weights the squares could overflow float32.
 _MOST_WEIGHT = 1e6
 
 
 def _weight(meaning: str) -> dict[str, Any]:
-    """Return the metadata of a weight of the reward."""
+    """Returns the metadata of a reward weight."""
     return about(meaning, -_MOST_WEIGHT, _MOST_WEIGHT)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RewardConfig(Section):
-    """Weights of the named terms of the reward: equation 3 of the paper, and prices."""
+    """Weights of the reward terms: equation 3 of the paper, and penalties."""
 
     renamed: ClassVar[Mapping[str, str]] = {"time": "step_penalty"}
 
@@ -33,14 +33,14 @@ class RewardConfig(Section):
     )
     proximity: float = field(
         default=0.0,
-        metadata=_weight("per control step before arrival with something in infrared range"),
+        metadata=_weight("per control step before arrival with an object in infrared range"),
     )
     arrival: float = field(
-        default=0.0, metadata=_weight("once: on arrival, by hold when all are there")
+        default=0.0, metadata=_weight("once, on arrival; with hold, once all have arrived")
     )
-    contact: float = field(default=-0.2, metadata=_weight("per contact event, of whatever kind"))
+    contact: float = field(default=-0.2, metadata=_weight("per contact event of any kind"))
     robot_contact: float = field(
-        default=0.0, metadata=_weight("besides, per contact event with another robot")
+        default=0.0, metadata=_weight("added to contact, per contact event with another robot")
     )
     touching: float = field(
         default=0.0, metadata=_weight("per control step in which the robot touches something")
@@ -50,41 +50,41 @@ class RewardConfig(Section):
     )
     extra: dict[str, float] = field(
         default_factory=ByName,
-        metadata=_weight("weights of the terms of extensions, by their names; 0: off"),
+        metadata=_weight("weights of extension terms, by name; 0: off"),
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class NeighboursConfig(Section):
-    """What a robot hears of others: range, bearing and the numbers that they broadcast."""
+    """What a robot receives from other robots: range, bearing and broadcast numbers."""
 
     count: int = field(
-        default=0, metadata=about("nearest robots that are heard; 0: robots do not hear", 0, 32)
+        default=0, metadata=about("nearest neighbours observed; 0: no neighbour messages", 0, 32)
     )
     range: float = field(
-        # AutoMoDe's reference models have a board; that it reaches about as far is assumed.
+        # AutoMoDe's reference models use a range-and-bearing board. We assume the same range.
         default=0.7,
         metadata=about("between centres, m", above=0.0, high=10.0),
     )
     message_size: int = field(
-        default=0, metadata=about("numbers that a robot broadcasts in a control step", 0, 32)
+        default=0, metadata=about("numbers that a robot broadcasts per control step", 0, 32)
     )
 
     @property
     def width(self) -> int:
-        """Entries of an observation that belong to one neighbour, W; 0 if robots do not hear."""
+        """Observation entries per neighbour, W; 0 without neighbour messages."""
         return 4 + self.message_size if self.count else 0
 
     @property
     def size(self) -> int:
-        """Entries of an observation that belong to all neighbours, K W."""
+        """Observation entries for all neighbours, K W."""
         return self.count * self.width
 
     def _check(self) -> None:
         if self.message_size and not self.count:
             raise ConfigError(
-                f"message_size is {self.message_size}, but count is 0 and nobody hears: give a "
-                "count of 1 or more, or message_size=0."
+                f"message_size is {self.message_size}, but count is 0, so no robot receives "
+                "messages: give a count of 1 or more, or message_size=0."
             )
 
 
@@ -100,13 +100,17 @@ class TaskConfig(Section):
     )
     target_radius: float = field(
         default=0.05,
-        metadata=about("distance of the centres that counts as arrival, m", above=0.0, high=0.1),
+        metadata=about(
+            "distance between the centres of robot and target that counts as arrival, m",
+            above=0.0,
+            high=0.1,
+        ),
     )
     arrival: Arrival = field(
         default="latch",
         metadata=about(
-            "latch: a robot that comes within its target stops for good; hold: it goes on, and the "
-            "episode is complete when all are within their targets at once"
+            "latch: a robot that comes within its target stops for good; hold: it keeps driving, "
+            "and the episode is complete when all are within their targets at once"
         ),
     )
     sensor_range: float = field(
@@ -118,11 +122,11 @@ class TaskConfig(Section):
     )
     observations: tuple[str, ...] | None = field(
         default=None,
-        metadata=about("of extensions, in their order; null: all of them"),
+        metadata=about("observations of extensions, in order; null: all of them"),
     )
     history: int = field(
         default=1,
-        metadata=about("observations that the policy takes: the current and earlier ones", 1, 64),
+        metadata=about("observations that the policy sees: the current and earlier ones", 1, 64),
     )
     neighbours: NeighboursConfig = field(default_factory=NeighboursConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
@@ -131,12 +135,12 @@ class TaskConfig(Section):
         if self.history > 1 and self.neighbours.count:
             raise ConfigError(
                 f"history is {self.history}, but neighbours.count is {self.neighbours.count}: "
-                "choose one, history=1 or neighbours.count=0; algo.memory=gru goes with hearing."
+                "choose one, history=1 or neighbours.count=0; neighbours work with algo.memory=gru."
             )
 
 
 def describe(robot: RobotConfig, task: TaskConfig, realism: RealismConfig) -> str:
-    """Say in part of a sentence which robot does the task, with which sensors."""
+    """Returns part of a sentence that describes the robot, its sensors and the task."""
     rubs = f" of friction {robot.hull_friction:g}" if robot.hull_friction else ""
     return (
         f"hull {robot.hull_radius:g} m{rubs}, infrared to {task.sensor_range:g} m, at most "
@@ -147,16 +151,16 @@ def describe(robot: RobotConfig, task: TaskConfig, realism: RealismConfig) -> st
 
 
 def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, steps: int) -> None:
-    """Refuse realism that the robot or the length of an episode rules out.
+    """Refuses realism settings that contradict the robot or the episode length.
 
     Args:
-        realism: held to its own bounds already.
-        robot: the robot it is for.
-        task: read for the control step.
+        realism: settings, already checked against their own bounds.
+        robot: the robot that they apply to.
+        task: provides the control step.
         steps: control steps of an episode.
 
     Raises:
-        ConfigError: keys are named from the top.
+        ConfigError: a setting is too large; the message names the full key.
     """
     hull, seconds = robot.hull_radius, steps * task.control_step
     for key, value, most in (
@@ -183,9 +187,9 @@ def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, 
 
 
 def resolve_encoding(task: TaskConfig, realism: RealismConfig) -> Literal["metric", "webots"]:
-    """Return what the policy observes.
+    """Returns the encoding of observations.
 
-    `metric` are metres and radians as they are. `webots` are counts / 1023, distance / 1.5 m and
+    `metric` observes metres and radians. `webots` observes counts / 1023, distance / 1.5 m and
     (bearing + pi) / (2 pi), as in deepworlds' find_and_avoid.
     """
     if task.encoding != "auto":

@@ -1,8 +1,8 @@
 """A robot's electronics: commands on their way to the wheels, sensors on their way to the policy.
 
-Between the policy and the world lie motors, sensors and messages; what realism makes of them is
-here, for training and for the judge alike. A factor that is off leaves no trace: with none on,
-a policy observes the rays as they are, and its wheels turn as commanded.
+Motors, sensors and messages connect the policy to the arena. This module applies the realism
+factors to them, both in training and in evaluation. A factor that is off has no effect. With all
+factors off, a policy observes the exact ray lengths, and the wheels turn as commanded.
 """
 
 from collections.abc import Sequence
@@ -27,20 +27,20 @@ from swarmjax.task.observation import Encoding, Layout, Readings, View
 
 Array = Any
 _DEAF = NeighboursConfig()
-_SLACK = 1e-4  # of a period: a sample that is due now is not put off by rounding
+_SLACK = 1e-4  # share of a period; rounding must not delay a sample that is due now
 
 
 @dataclass(frozen=True, kw_only=True)
 class Electronics:
-    """What is the same for every episode of a program.
+    """Settings of the electronics, fixed for all episodes of a program.
 
     Attributes:
       realism: which factors are on.
-      encoding: what the policy observes.
-      sensor_range: beyond which it observes no infrared distance, m.
+      encoding: how observations are encoded.
+      sensor_range: largest infrared distance that is observed, m.
       control_step: s.
-      own: observations of an extension that follow the built-in ones.
-      neighbours: what is heard of other robots.
+      own: observations of an extension, placed after the built-in ones.
+      neighbours: which neighbour messages are observed.
     """
 
     realism: RealismConfig
@@ -52,7 +52,7 @@ class Electronics:
 
     @cached_property
     def layout(self) -> Layout:
-        """What the entries of an observation are."""
+        """Names, units and scales of the observation's entries."""
         return observation.layout(self.encoding, self.own, self.neighbours)
 
     @property
@@ -69,12 +69,12 @@ class Electronics:
 
 
 class Memory(NamedTuple):
-    """What the electronics carry from one control step to the next; None where nothing is.
+    """State that the electronics keep between control steps; None for an unused part.
 
     Attributes:
-      motor: commands under way.
+      motor: delayed commands.
       infrared: [..., R, K] the last sample, before it is scaled.
-      seen: [..., D, R, O] observations under way, newest first.
+      seen: [..., D, R, O] delayed observations, newest first.
     """
 
     motor: Motor | None
@@ -83,15 +83,15 @@ class Memory(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """What there is to be sensed.
+    """Exact quantities that the sensors measure.
 
     Attributes:
       ray: [..., R, K] m, 0 to `Electronics.reach`.
-      reflectance: [..., R, K] of what each ray meets, or None for 1.
+      reflectance: [..., R, K] reflectance of the surface that each ray hits; None for 1.
       distance: [..., R] to the target, m.
       bearing: [..., R] of the target, rad.
       own: [..., R, E] observations of an extension; None without any.
-      heard: who can hear whom; None if robots do not hear.
+      heard: neighbours within reach; None without neighbour messages.
     """
 
     ray: Array
@@ -103,17 +103,17 @@ class Sight(NamedTuple):
 
 
 def view(sight: Sight, pose: Array, level: Level, arrived: Array, clock: Array) -> View:
-    """Puts together what observations of an extension look at.
+    """Assembles the `View` that observations of an extension receive.
 
     Args:
-      sight: what there is to be sensed.
+      sight: exact sensor quantities.
       pose: [..., R, 3] x (m), y (m), yaw (rad).
-      level: what the episode started from.
+      level: the level that the episode started from.
       arrived: [..., R] whether the robot has arrived.
       clock: [...] or [] control steps since the start.
 
     Returns:
-      The view, of one arena or of many.
+      The view of one arena or of many.
     """
     return View(
         pose=pose,
@@ -137,14 +137,14 @@ def load(
     own: Sequence[Observation] = (),
     neighbours: NeighboursConfig | None = None,
 ) -> Electronics:
-    """Puts the electronics together.
+    """Creates the electronics from the settings.
 
     Args:
       task: the task.
       realism: the factors.
-      encoding: what a policy was trained to observe; None follows the task.
+      encoding: encoding that the policy was trained with; None for the task's.
       own: observations of an extension.
-      neighbours: what a policy was trained to hear; None follows the task.
+      neighbours: neighbour settings that the policy was trained with; None for the task's.
 
     Returns:
       The electronics.
@@ -160,21 +160,21 @@ def load(
 
 
 def chassis(factors: Factors) -> Chassis:
-    """What the robots' chassis are in an episode."""
+    """Returns the chassis of the robots in an episode."""
     return Chassis(
         factors.wheel_radius, factors.track, factors.mass, factors.friction, factors.hull_friction
     )
 
 
 def mount(factors: Factors) -> infrared.Mount | None:
-    """How the sensors of an episode sit; None as they should."""
+    """Returns how the sensors are mounted in an episode; None for the nominal mounting."""
     if factors.infrared_yaw is None and factors.infrared_position is None:
         return None
     return infrared.Mount(factors.infrared_yaw, factors.infrared_position)
 
 
 def reflectance(factors: Factors) -> infrared.Reflectance | None:
-    """How bright the things of an episode are; None where all have 1."""
+    """Returns the reflectances in an episode; None if all are 1."""
     found = infrared.Reflectance(
         factors.reflectance_wall, factors.reflectance_obstacle, factors.reflectance_robot
     )
@@ -184,12 +184,14 @@ def reflectance(factors: Factors) -> infrared.Reflectance | None:
 def begin(
     electronics: Electronics, factors: Factors, sight: Sight, clock: Array, xp: Any
 ) -> tuple[Memory, Array]:
-    """Starts an episode: nothing is under way, and what is seen first has been seen all along.
+    """Starts an episode with no command under way.
+
+    Delayed observations are filled with the first one.
 
     Args:
       electronics: of the program.
       factors: of the episode.
-      sight: where the robots start.
+      sight: exact sensor quantities at the start.
       clock: [...] or [] zero.
       xp: `numpy` or `jax.numpy`.
 
@@ -220,19 +222,19 @@ def drive(
     clock: Array,
     xp: Any,
 ) -> tuple[Memory, Array]:
-    """Sends commands to the wheels.
+    """Turns commands into wheel speeds.
 
     Args:
       electronics: of the program.
-      memory: before.
+      memory: before the control step.
       factors: of the episode.
       command: [..., R, 2] forward speed (m/s) and turn rate (rad/s).
-      motors: the drive as the robot's firmware knows it.
+      motors: the drive with the nominal values that the firmware uses.
       clock: [...] or [] control steps since the start.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      The memory after, and the speeds [..., R, 2] (rad/s) at which the wheels are driven.
+      The new memory, and the driven wheel speeds [..., R, 2] (rad/s).
     """
     realism = electronics.realism
     queue, command = motor.deliver(
@@ -260,18 +262,18 @@ def sense(
     clock: Array,
     xp: Any,
 ) -> tuple[Memory, Array]:
-    """Senses what there is, and lets the policy see what has arrived of it.
+    """Samples the sensors and returns the observation that reaches the policy now.
 
     Args:
       electronics: of the program.
-      memory: before.
+      memory: before the control step.
       factors: of the episode.
-      sight: what there is.
-      clock: [...] or [] control steps since the start, the one just done included.
+      sight: exact sensor quantities.
+      clock: [...] or [] control steps since the start, including the current one.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      The memory after, and the observation [..., R, O].
+      The new memory, and the observation [..., R, O].
     """
     readings = _read(electronics, factors, sight, clock, xp)
     if memory.infrared is not None:
@@ -290,7 +292,7 @@ def sense(
 def _read(
     electronics: Electronics, factors: Factors, sight: Sight, clock: Array, xp: Any
 ) -> Readings:
-    """Reads what there is now."""
+    """Takes readings of all sensors."""
     sample = _read_infrared(electronics, factors, sight, clock, xp)
     distance, bearing = _find_target(electronics.realism, factors, sight, clock, xp)
     heard = None
@@ -301,8 +303,8 @@ def _read(
 
 
 def _is_due(clock: Array, period: Array, control_step: float, xp: Any) -> Array:
-    """Tells [..., R] whether a sample fell into the control step that has just ended."""
-    clock = xp.asarray(clock, xp.float32)  # in NumPy too: both round alike, and sample at once
+    """Returns [..., R] whether a sample was due in the control step that has just ended."""
+    clock = xp.asarray(clock, xp.float32)  # NumPy and JAX must round alike, to sample alike
     ended = clock[..., None] * control_step / period + _SLACK
     return xp.floor(ended) > xp.floor(ended - control_step / period)
 
@@ -310,7 +312,7 @@ def _is_due(clock: Array, period: Array, control_step: float, xp: Any) -> Array:
 def _read_infrared(
     electronics: Electronics, factors: Factors, sight: Sight, clock: Array, xp: Any
 ) -> Array:
-    """Samples the sensors: [..., R, K] metres or counts, as the encoding has it."""
+    """Samples the infrared sensors: [..., R, K] metres or counts, depending on the encoding."""
     kind, encoding = electronics.realism.infrared, electronics.encoding
     if kind == "ideal":
         ray = sight.ray
@@ -329,7 +331,7 @@ def _read_infrared(
     counts = response.read(kind, sight.ray, sight.reflectance, wear, normal, xp)
     if kind == encoding:
         return counts
-    # What the counts mean to a robot whose owner has calibrated it.
+    # A calibrated robot converts counts back to a distance.
     ray = response.distance(kind, counts, xp)
     if encoding == "metric":
         return xp.minimum(ray, electronics.sensor_range)
@@ -339,7 +341,7 @@ def _read_infrared(
 def _find_target(
     realism: RealismConfig, factors: Factors, sight: Sight, clock: Array, xp: Any
 ) -> tuple[Array, Array]:
-    """Distance and bearing [..., R] of the targets, as an overhead camera sees them."""
+    """Returns distance and bearing [..., R] of the targets, as an overhead camera sees them."""
     distance, bearing = sight.distance, sight.bearing
     robots = distance.shape[-1:]
     if realism.target_distance_noise is not None:

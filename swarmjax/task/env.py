@@ -1,7 +1,7 @@
-"""One arena: reset and step, pure functions that join the files beside this one.
+"""Reset and step of one arena, as pure functions.
 
-`vmap` them over arenas. Nothing here resets by itself: a step reports what it came
-to, and the rollout decides what comes next.
+Use `vmap` to run many arenas. Arenas do not reset themselves here: a step reports its outcome, and
+the rollout decides whether to reset.
 """
 
 from collections.abc import Sequence
@@ -44,18 +44,18 @@ from swarmjax.task.stage_config import StageConfig, make_room
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What fixes the compiled environment.
+    """Everything that is fixed in the compiled environment.
 
     Attributes:
-      robot: the robot's numbers.
-      task: what robots are asked to do.
-      realism: how sensors answer, and what is drawn for each episode.
-      physics: the compiled side of the physics.
+      robot: settings of the robot.
+      task: settings of the task.
+      realism: sensor models, and factors drawn for each episode.
+      physics: the compiled physics.
       spacing: sizes that levels are drawn with.
       drive: the robot's drive.
-      electronics: what lies between policy and world.
-      terms: of the reward, by an extension, with their weights.
-      drawings: ways of drawing levels, by an extension.
+      electronics: the motors, sensors and messages between policy and arena.
+      terms: reward terms of an extension, with their weights.
+      drawings: level drawings of an extension.
     """
 
     robot: RobotConfig
@@ -70,32 +70,33 @@ class World:
 
     @property
     def observation_size(self) -> int:
-        """Entries of what a policy takes, O: of `task.history` observations together."""
+        """Size of the policy's input, O: all `task.history` observations together."""
         return self.task.history * self.electronics.layout.size
 
     @property
     def action_size(self) -> int:
-        """Numbers of an action, U: the command, then what is broadcast."""
+        """Size of an action, U: the command, followed by the broadcast numbers."""
         return sim_drive.COMMAND_SIZE + self.electronics.neighbours.message_size
 
 
 @struct.dataclass
 class EnvState:
-    """State of one arena, or with a leading axis of many.
+    """State of one arena, or of many with a leading axis.
 
     Attributes:
-      sim: `PhysicsState` at the edges of a rollout, the physics' data inside.
-      level: what the episode started from.
-      factors: what realism makes of the episode; they follow from the level's seed.
-      memory: what the robots' electronics carry along.
-      observation: [R, O] what the policy takes: what it sees now, then earlier observations
+      sim: `PhysicsState` before and after a rollout; the physics' own data within it.
+      level: the level that the episode started from.
+      factors: realism factors of the episode, drawn from the level's seed.
+      memory: state of the robots' electronics.
+      observation: [R, O] input of the policy: the current observation, then earlier ones
         (`task.history`).
       clock: [] control steps since the start, int32.
-      arrived: [R] whether the robot has arrived; by `task.arrival=hold`, is within its target now.
+      arrived: [R] whether the robot has arrived; with `task.arrival=hold`, whether it is within
+        its target now.
       distance: [R] to the target, m.
-      apart: [R, 3] for how long there was no contact of each kind, s.
+      apart: [R, 3] time since the last contact of each kind, s.
       episode: sums since the start.
-      path: the shortest paths to the targets; None where the reward does not ask.
+      path: the shortest paths to the targets; None if the reward does not use them.
     """
 
     sim: Any
@@ -112,17 +113,18 @@ class EnvState:
 
 
 class TimeStep(NamedTuple):
-    """What a control step came to, all of it before any reset.
+    """Outcome of a control step, before any reset.
 
     Attributes:
       observation: [R, O].
       reward: [R].
-      terminated: [R] the robot arrived in this step; by `task.arrival=hold`, all are there now.
-      truncated: [R] the time ran out for the robot.
-      valid: [R] the robot drove (by `latch`: had not arrived), and the physics sound: a transition
-        to learn from.
-      done: [] the arena's episode is over.
-      sound: [] the physics is finite, and so are rewards, distances and observations.
+      terminated: [R] whether the robot arrived in this step; with `task.arrival=hold`, whether all
+        are within their targets.
+      truncated: [R] whether the robot ran out of time.
+      valid: [R] whether to learn from the transition: the robot drove (with `latch`, it had not
+        arrived before) and the physics is sound.
+      done: [] whether the arena's episode is over.
+      sound: [] whether physics, rewards, distances and observations are all finite.
     """
 
     observation: Array
@@ -147,20 +149,20 @@ def load(
     """Builds the model and puts it on the device.
 
     Args:
-      stages: those whose levels it will run; their largest obstacle is compiled in.
-      robot: the robot; None for the default one, and so for the settings below.
-      task: what it is asked to do.
-      realism: how its sensors answer, and what is drawn for each episode.
-      sim: who steps the physics, and the room for robots and obstacles.
-      arenas: how many arenas will be stepped together, at most; only Warp needs to know.
-      extensions: pieces that are not part of the package; `task` names those that are used.
+      stages: stages to run; the model is compiled for their largest obstacle.
+      robot: the robot; None for the default, as for the settings below.
+      task: the task.
+      realism: sensor models, and factors drawn for each episode.
+      sim: physics engine, and largest numbers of robots and obstacles.
+      arenas: largest number of arenas stepped together; only Warp uses it.
+      extensions: extension pieces; `task` names the ones to use.
 
     Returns:
       The world that `reset` and `step` run in.
 
     Raises:
-      ConfigError: if Warp is asked for and not installed, or a solver where it cannot be, or a
-        piece of an extension is missing or of the wrong shape.
+      ConfigError: Warp is selected but not installed, a solver cannot run here, or a piece of an
+        extension is missing or returns a wrong shape.
     """
     robot, task = robot or RobotConfig(), task or TaskConfig()
     realism, sim = realism or RealismConfig(), make_room(sim or SimConfig(), stages)
@@ -194,7 +196,7 @@ def _load_physics(
     sim: SimConfig,
     arenas: int,
 ) -> physics.Physics:
-    """Compiles the model of one arena, and loads what steps it."""
+    """Compiles the model of one arena, and loads the engine that steps it."""
     largest = task_factors.largest(robot, realism)
     substeps, choice = physics_substeps(robot, sim.substeps), dispatch.choose(sim, largest)
     spec = model.build(largest, size, task.control_step / substeps, fixtures="world")
@@ -210,10 +212,10 @@ def reset(world: World, level: Level) -> EnvState:
 
     Args:
       world: the compiled environment.
-      level: what to start from.
+      level: the level to start from.
 
     Returns:
-      The state, its `sim` packed.
+      The state, with `sim` packed.
     """
     robots, obstacles = level.present.shape[0], level.obstacle_present.shape[0]
     factors = task_factors.draw(level.seed, world.realism, world.robot, robots, obstacles, jnp)
@@ -238,7 +240,7 @@ def reset(world: World, level: Level) -> EnvState:
 
 
 def _begin_path(world: World, level: Level) -> geodesic.Path | None:
-    """Finds the shortest paths, if the reward looks at them."""
+    """Finds the shortest paths if the reward uses them."""
     if not world.task.reward.path_progress:
         return None
     fast = dispatch.load_paths(world.physics.engine.impl)
@@ -246,21 +248,21 @@ def _begin_path(world: World, level: Level) -> geodesic.Path | None:
 
 
 def look_around(world: World, state: EnvState) -> Array:
-    """Lists what is around each robot of an arena, as a critic in training may see it.
+    """Lists the surroundings of each robot, for a critic in training.
 
     Args:
       world: the compiled environment.
       state: the arena.
 
     Returns:
-      [R, P] as `surroundings.look` has it.
+      [R, P], as `surroundings.look` returns it.
     """
     pose = physics.poses(world.physics, state.sim)
     return surroundings.look(pose, state.level, state.arrived)
 
 
 def _no_episode(robots: int) -> Episode:
-    """Returns the sums of an episode that has just begun."""
+    """Returns the zero sums of a new episode."""
     return Episode(
         reward=jnp.zeros(robots),
         contacts=jnp.zeros((robots, len(sim_gaps.KINDS)), jnp.int32),
@@ -270,16 +272,17 @@ def _no_episode(robots: int) -> Episode:
 
 
 def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeStep]:
-    """Moves one arena on by one control step.
+    """Advances one arena by one control step.
 
     Args:
       world: the compiled environment.
-      state: the arena; `sim` is the physics' data. Whatever else a caller keeps with an arena, by
-        a class of its own made from `EnvState`, passes through.
-      action: [R, U], -1..1 spans the command, what is beyond is clipped; from the third: broadcast.
+      state: the arena, with `sim` as the physics' own data. Fields of a subclass of `EnvState`
+        pass through unchanged.
+      action: [R, U] command, clipped to -1..1, which spans its range. Broadcast numbers start at
+        the third entry.
 
     Returns:
-      The new state, and what the step came to.
+      The new state, and the outcome of the step.
     """
     chex.assert_shape(action, (state.level.present.shape[0], world.action_size))
     level, rule = state.level, world.task.arrival
@@ -304,7 +307,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     sound &= _is_finite(seen, level.present[:, None])
     valid = active & sound
     gained = jnp.where(valid, gained, 0.0)
-    # The step of an arena that broke is not learned from, and the critic need not see it either.
+    # Learning skips the step of a broken arena, so the critic need not see it either.
     seen = jnp.where(sound, observation.stack(seen, state.observation, jnp), state.observation)
     episode = _tally(state.episode, gained, begins, earned, valid & ~state.arrived)
     timeout = clock >= world.task.step_limit
@@ -332,7 +335,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
 
 
 def _count_contacts(world: World, state: EnvState, pose: Array) -> tuple[Array, Array]:
-    """Tells which contacts [R, 3] begin at poses [R, 3], and how long all have been apart."""
+    """Returns which contacts [R, 3] begin at poses [R, 3], and the time since the last contacts."""
     level = state.level
     gap = sim_gaps.gaps(pose, level.side, level.obstacle, world.robot.hull_radius, jnp)
     begins, apart = sim_gaps.count_contacts(gap, state.apart, world.task.control_step, jnp)
@@ -347,7 +350,7 @@ def _earned(
     begins: Array,
     touching: Array,
 ) -> reward.Step:
-    """Puts together what the built-in terms of the reward look at."""
+    """Assembles the input of the built-in reward terms."""
     return reward.Step(
         state.distance,
         sight.distance,
@@ -363,7 +366,7 @@ def _earned(
 def _follow_path(
     world: World, state: EnvState, pose: Array, earned: reward.Step
 ) -> tuple[geodesic.Path | None, reward.Step]:
-    """Measures the shortest paths from poses [R, 3], and adds what the reward sees of them."""
+    """Measures the shortest paths from poses [R, 3], and adds them to the reward's input."""
     if state.path is None:
         return None, earned
     fast = dispatch.load_paths(world.physics.engine.impl)
@@ -372,14 +375,14 @@ def _follow_path(
 
 
 def _is_finite(numbers: Array, counted: Array) -> Array:
-    """Tells whether the numbers [R, ...] of the robots that are counted are finite, []."""
+    """Returns [] whether the numbers [R, ...] of all counted robots are finite."""
     return jnp.all(jnp.isfinite(numbers) | ~counted)
 
 
 def _move(
     world: World, state: EnvState, action: Array, active: Array
 ) -> tuple[Any, Memory, Array, Array]:
-    """Lets the robots drive that may.
+    """Steps the physics, with the commands of active robots only.
 
     Returns:
       Data, memory, poses, and whether the physics is sound.
@@ -393,13 +396,13 @@ def _move(
     chassis = task_electronics.chassis(found)
     data = physics.step(world.physics, state.sim, level.side, level.obstacle, wheels, chassis)
     sound = physics.is_finite(data)
-    # What follows stays finite: an arena that broke is seen where it last was, and reset.
+    # Keep everything below finite: a broken arena shows its last poses until it is reset.
     before, after = (physics.poses(world.physics, each) for each in (state.sim, data))
     return data, memory, jnp.where(sound, after, before), sound
 
 
 def _look(world: World, pose: Array, level: Level, factors: Factors, said: Array | None) -> Sight:
-    """Works out what can be sensed at poses [R, 3], after robots said this [R, M]."""
+    """Computes the sensor quantities at poses [R, 3], after robots broadcast numbers [R, M]."""
     distance, bearing = observation.to_target(pose, level.target, jnp)
     radius, reach = world.robot.hull_radius, world.electronics.reach
     mount, shades = task_electronics.mount(factors), task_electronics.reflectance(factors)
@@ -408,7 +411,7 @@ def _look(world: World, pose: Array, level: Level, factors: Factors, said: Array
         ray, bright = infrared.distances(*arena, jnp, mount), None
     else:
         ray, bright = infrared.sights(*arena, shades, mount, jnp)
-    # Looked at by several: without the barrier XLA works rays out anew for each, on a GPU.
+    # Several consumers read these. Without the barrier, XLA recomputes the rays for each on a GPU.
     ray, bright = jax.lax.optimization_barrier((ray, bright))
     return _hear(world, Sight(ray, bright, distance, bearing), pose, level, said)
 
@@ -416,7 +419,7 @@ def _look(world: World, pose: Array, level: Level, factors: Factors, said: Array
 def _look_by_extension(
     world: World, sight: Sight, pose: Array, level: Level, arrived: Array, clock: Array
 ) -> Sight:
-    """Adds what the observations of an extension see."""
+    """Adds the observations of an extension."""
     if not world.electronics.own:
         return sight
     view = task_electronics.view(sight, pose, level, arrived, clock)
@@ -424,13 +427,13 @@ def _look_by_extension(
 
 
 def _speak(world: World, action: Array, active: Array) -> Array | None:
-    """Takes what is broadcast [R, M] out of actions [R, U]; None if nothing is."""
+    """Extracts the broadcast numbers [R, M] from actions [R, U]; None without any."""
     size = world.electronics.neighbours.message_size
     return hearing.broadcast(action, size, active, jnp) if size else None
 
 
 def _hear(world: World, sight: Sight, pose: Array, level: Level, said: Array | None) -> Sight:
-    """Adds who can be heard at poses [R, 3], with what they said [R, M]; None: nothing yet."""
+    """Adds neighbours in reach at poses [R, 3], and their broadcasts [R, M]; None at the start."""
     settings = world.electronics.neighbours
     if not settings.count:
         return sight
@@ -442,10 +445,10 @@ def _hear(world: World, sight: Sight, pose: Array, level: Level, said: Array | N
 def _fill(
     world: World, step: reward.Step, state: EnvState, action: Array, pose: Array
 ) -> reward.Step:
-    """Adds what only the terms of an extension look at, if there are any."""
+    """Adds the fields that only extension terms read, if there are such terms."""
     if not world.terms:
         return step
-    if world.action_size > sim_drive.COMMAND_SIZE:  # terms see what moves the robot
+    if world.action_size > sim_drive.COMMAND_SIZE:  # terms see only the motion command
         action = action[:, : sim_drive.COMMAND_SIZE]
     return step._replace(
         outside=~state.arrived,
@@ -460,7 +463,7 @@ def _fill(
 def _tally(
     episode: Episode, gained: Array, begins: Array, earned: reward.Step, counted: Array
 ) -> Episode:
-    """Adds a step to the sums of the episode; `counted` [R] were on their way in a sound arena."""
+    """Adds a step to the episode's sums, for the `counted` robots [R] only."""
     sensed = counted & (reward.proximity(earned) > 0.0)
     return Episode(
         reward=episode.reward + gained,

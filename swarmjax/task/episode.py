@@ -1,4 +1,4 @@
-"""What episodes come to: while they last, and when they have ended."""
+"""Statistics of running and finished episodes."""
 
 from typing import NamedTuple
 
@@ -6,15 +6,15 @@ from jax import Array
 
 
 class Episode(NamedTuple):
-    """What an episode has come to so far.
+    """Sums of a running episode.
 
     Attributes:
       reward: [R] sum of rewards.
       contacts: [R, 3] contacts of each kind.
-      sensed: [R] those of them with an infrared ray shorter than its range (the paper's
-        collision rule).
-      moving: [R] control steps that began before arrival; by `task.arrival=hold`, outside the
-        target.
+      sensed: [R] contacts with an infrared ray shorter than its range (the paper's collision
+        rule).
+      moving: [R] control steps that began before arrival; with `task.arrival=hold`, those that
+        began outside the target.
     """
 
     reward: Array
@@ -24,15 +24,15 @@ class Episode(NamedTuple):
 
 
 class Robots(NamedTuple):
-    """What became of the robots of episodes that ended, [T, A, R], zero where none did.
+    """Results of each robot in finished episodes, [T, A, R]; zero where no episode ended.
 
     Attributes:
-      present: took part; where not, the rest means nothing.
-      reached: had arrived at the end.
-      reward: sum over the episode, nothing discounted.
+      present: whether the robot was present; if not, ignore its other fields.
+      reached: whether it had arrived at the end.
+      reward: undiscounted sum over the episode.
       robot_steps: control steps before arrival.
-      sensed: those with an infrared ray shorter than its range.
-      contacts: of all kinds.
+      sensed: contacts with an infrared ray shorter than its range.
+      contacts: contacts of all kinds.
     """
 
     present: Array
@@ -44,22 +44,22 @@ class Robots(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """Episodes that ended, [T, A, ...], zero where none did.
+    """Finished episodes, [T, A, ...]; zero where no episode ended.
 
     Attributes:
-      episodes: 1 where one ended.
-      stage: on which it began.
-      cohort: in which it began; -1 where none ended.
-      targets: robots that took part.
+      episodes: 1 where an episode ended.
+      stage: stage that the episode began on.
+      cohort: cohort that the episode began in; -1 where none ended.
+      targets: robots present.
       reached: robots that had arrived at the end.
-      all_reached: 1 where every robot had.
+      all_reached: 1 where every robot had arrived.
       steps: control steps.
-      robot_steps: control steps before arrival, over all robots.
-      sensed: those with an infrared ray shorter than its range.
-      contacts: [.., 3] of each kind, over all robots.
-      reward: sum over all robots, nothing discounted.
-      broken: 1 where it ended because the physics was no longer finite.
-      robots: each robot by itself, if `run.episodes` asks for it.
+      robot_steps: control steps before arrival, summed over robots.
+      sensed: contacts with an infrared ray shorter than its range.
+      contacts: [.., 3] contacts of each kind, summed over robots.
+      reward: undiscounted, summed over robots.
+      broken: 1 where the episode ended because the physics was no longer finite.
+      robots: results per robot, if `run.episodes` asks for them.
     """
 
     episodes: Array

@@ -1,4 +1,4 @@
-"""What pieces of an extension compute in an arena, and whether they fit it."""
+"""Runs the pieces of an extension in an arena, and checks that they fit it."""
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +20,7 @@ from swarmjax.task.pieces import Chosen
 from swarmjax.task.reward import Step
 from swarmjax.task.stage import Stage, select
 
-_TRIED = 8  # levels of a drawing that are looked at before a program is built
+_TRIED = 8  # levels of a drawing to check before the program is built
 
 
 def look(own: Sequence[Observation], view: View) -> Array:
@@ -31,7 +31,7 @@ def look(own: Sequence[Observation], view: View) -> Array:
       view: of the arena.
 
     Returns:
-      [R, E] in their units, one after the other.
+      [R, E] in their own units, concatenated in order.
     """
     robots = len(view.pose)
     found = [jnp.reshape(each.function(view), (robots, each.size)) for each in own]
@@ -39,16 +39,16 @@ def look(own: Sequence[Observation], view: View) -> Array:
 
 
 def draw(uniforms: Any, stage: Stage, spacing: Spacing, drawings: Sequence[LevelDrawing]) -> Level:
-    """Draws a level of a stage with JAX, by an extension where the stage says so.
+    """Draws a level of a stage with JAX, using the stage's extension drawing if it has one.
 
     Args:
       uniforms: as `level.sample` takes them.
       stage: fields [].
       spacing: sizes.
-      drawings: ways of drawing, in the order that `stage.drawing` counts.
+      drawings: extension drawings, in the order that `stage.drawing` counts.
 
     Returns:
-      The level; what is absent is parked outside.
+      The level; absent robots and obstacles are parked outside.
     """
     drawn = level.sample(uniforms, stage, spacing, jnp)
     if not drawings:
@@ -64,16 +64,16 @@ def draw(uniforms: Any, stage: Stage, spacing: Spacing, drawings: Sequence[Level
 def check_levels(
     drawings: Sequence[LevelDrawing], stages: Stage, spacing: Spacing, names: Sequence[str]
 ) -> None:
-    """Refuses drawings whose levels put robots or targets outside of the walls, or robots together.
+    """Refuses drawings that place robots or targets outside the walls, or hulls that overlap.
 
     Args:
-      drawings: ways of drawing.
+      drawings: extension drawings.
       stages: [S], as NumPy arrays.
       spacing: sizes.
       names: [S] of the stages.
 
     Raises:
-      ConfigError: naming the piece, the stage and what is wrong with one of its levels.
+      ConfigError: a drawn level is invalid; the message names the piece, the stage and the fault.
     """
     count = level.uniform_count(spacing)
     uniforms = np.random.default_rng(0).random((_TRIED, count), dtype=np.float32)
@@ -90,7 +90,7 @@ def check_levels(
 
 
 def _problem(found: Level, spacing: Spacing) -> str | None:
-    """Says what is wrong with a level, if anything is."""
+    """Describes the fault of a level; None if it has none."""
     start, target = found.start[found.present], found.target[found.present]
     if not all(np.isfinite(field).all() for field in (start, target, found.obstacle)):
         return "holds a number that is not finite: return numbers"
@@ -101,28 +101,28 @@ def _problem(found: Level, spacing: Spacing) -> str | None:
             x, y = place[outside[0]]
             return (
                 f"robot {outside[0]} {what} at ({x:.3g}, {y:.3g}) m: stay within {room:.3g} m of "
-                "the middle, the walls less the hull"
+                "the middle, which keeps the hull inside the walls"
             )
     apart = np.linalg.norm(start[:, None, :2] - start[None, :, :2], axis=-1)
     close = np.argwhere(np.triu(apart < 2.0 * spacing.hull_radius, 1))
     if close.size:
         first, second = close[0]
-        return f"robots {first} and {second} start within each other: keep two hulls apart"
+        return f"robots {first} and {second} overlap at the start: keep two hulls apart"
     return None
 
 
 def redraw(piece: LevelDrawing, drawn: Level) -> Level:
-    """Draws a level of one arena by an extension, for a judge that has it in NumPy.
+    """Draws a level of one arena by an extension, for an evaluation in NumPy.
 
     Args:
-      piece: the way of drawing.
-      drawn: the level as drawn without it.
+      piece: the level drawing.
+      drawn: the level as drawn without the extension.
 
     Returns:
-      The level, as NumPy arrays; what is absent is parked outside.
+      The level, as NumPy arrays; absent robots and obstacles are parked outside.
 
     Raises:
-      ConfigError: if obstacles have changed their sizes, for which a judge is compiled.
+      ConfigError: the drawing changes obstacle sizes, which are fixed in the compiled model.
     """
     own = _compiled(piece)(drawn)
     found = level.park(Level(*(np.asarray(field) for field in own)), np)
@@ -135,14 +135,14 @@ def redraw(piece: LevelDrawing, drawn: Level) -> Level:
 
 
 def earn(piece: RewardTerm, steps: Mapping[str, Any]) -> np.ndarray:
-    """Computes a term of an extension over control steps of one arena, for a judge in NumPy.
+    """Computes an extension's reward term over many control steps of one arena, in NumPy.
 
     Args:
       piece: the term.
       steps: the fields of `Step`, all but `sensor_range` with a leading axis N.
 
     Returns:
-      [N, R], without its weight.
+      [N, R], not weighted.
     """
     reach = np.full(len(steps["distance"]), steps["sensor_range"], np.float32)
     each = Step(**{**steps, "sensor_range": reach})
@@ -155,7 +155,7 @@ def _compiled(piece: LevelDrawing) -> Callable[[Level], Level]:
 
 
 def check(chosen: Chosen, robots: int, obstacles: int) -> None:
-    """Refuses pieces that return something of another shape or type; nothing is compiled.
+    """Refuses pieces that return a wrong shape or type; compiles nothing.
 
     Args:
       chosen: the pieces.
@@ -163,7 +163,7 @@ def check(chosen: Chosen, robots: int, obstacles: int) -> None:
       obstacles: M.
 
     Raises:
-      ConfigError: naming the piece, and what it should return.
+      ConfigError: a piece returns something else; the message says what it should return.
     """
     for piece in chosen.observations:
         shapes = [(robots, piece.size)] + ([(robots,)] if piece.size == 1 else [])
@@ -175,7 +175,7 @@ def check(chosen: Chosen, robots: int, obstacles: int) -> None:
 
 
 def _check_floats(piece: Piece, shapes: list[tuple[int, ...]], argument: Any) -> None:
-    """Refuses a piece that returns anything but float numbers of one of these shapes."""
+    """Refuses a piece that does not return floats of one of these shapes."""
     found = trace(piece, argument)
     wanted = f"float numbers of shape {' or '.join(str(list(shape)) for shape in shapes)}"
     if not hasattr(found, "shape") or not hasattr(found, "dtype"):
@@ -187,7 +187,7 @@ def _check_floats(piece: Piece, shapes: list[tuple[int, ...]], argument: Any) ->
 
 
 def _check_drawing(piece: LevelDrawing, drawn: Level) -> None:
-    """Refuses a drawing that returns no level."""
+    """Refuses a drawing that does not return a valid level."""
     found = trace(piece, drawn, jax.eval_shape(jax.random.key, 0))
     if not isinstance(found, Level):
         raise ConfigError(
@@ -202,14 +202,14 @@ def _check_drawing(piece: LevelDrawing, drawn: Level) -> None:
 
 
 def trace(piece: Piece, *arguments: Any) -> Any:
-    """Returns the shapes that a piece returns, or says in one sentence why it fails.
+    """Returns the shapes that a piece returns.
 
     Args:
       piece: the piece.
-      arguments: shapes of what it takes.
+      arguments: shapes of its arguments.
 
     Raises:
-      ConfigError: if it raises anything.
+      ConfigError: the piece raises an exception; the message repeats it in one sentence.
     """
     try:
         return jax.eval_shape(piece.function, *arguments)
@@ -218,7 +218,7 @@ def trace(piece: Piece, *arguments: Any) -> Any:
 
 
 def label(piece: Piece) -> str:
-    """Names a piece and where it stands: the file first."""
+    """Returns the name of a piece, after the file that defines it."""
     code = getattr(piece.function, "__code__", None)
     file = f"{code.co_filename}: " if code is not None else ""
     return f"{file}{piece.kind} {piece.name}"

@@ -1,7 +1,7 @@
-"""What realism makes of one episode: the robots, sensors and surfaces that it happens to have.
+"""Realism factors of one episode: the properties of its robots, sensors and surfaces.
 
-Everything comes from the episode's seed, so that it is part of the level. Code takes the array
-module, so that NumPy and JAX draw the same.
+All factors follow from the episode's seed, so they are part of the level. The code takes the array
+module as an argument, so NumPy and JAX draw the same factors.
 """
 
 from dataclasses import replace
@@ -15,7 +15,7 @@ from swarmjax.sim.realism_config import RealismConfig
 
 Array = Any
 
-# What is drawn afresh at each control step and needs the seed as well.
+# Settings that draw random numbers at every control step. They need the seed as well.
 _PER_STEP = (
     "speed_noise",
     "stall",
@@ -31,20 +31,20 @@ class Factors(NamedTuple):
     """The factors of an episode; None where one is off.
 
     Attributes:
-      seed: [...] uint32 of all that is drawn at each control step; None where nothing is random.
+      seed: [...] uint32 seed of everything drawn at each control step; None without randomness.
       wheel_radius: [..., R, 2] of the left and the right wheel, m.
       track: [..., R] effective, m.
       max_wheel_speed: [..., R] rad/s.
       mass: [..., R] kg.
-      friction: [..., R] of the wheels on the floor.
-      hull_friction: [...] of all hulls on what they touch.
-      infrared_noise: [..., R, K] times the noise of the response.
-      infrared_gain: [..., R, K] times what a reflection adds.
+      friction: [..., R] between wheels and floor.
+      hull_friction: [...] between hulls and everything that they touch.
+      infrared_noise: [..., R, K] factor on the noise of the response.
+      infrared_gain: [..., R, K] factor on the reflected part of the response.
       infrared_offset: [..., R, K] counts.
       infrared_yaw: [..., R, K] rad.
       infrared_position: [..., R, K, 2] m, in the robot's frame.
       infrared_period: [..., R] s between samples.
-      dead: [..., R, K] whether the sensor never sees anything.
+      dead: [..., R, K] whether the sensor never detects anything.
       reflectance_wall: [...] of all walls.
       reflectance_obstacle: [..., M].
       reflectance_robot: [..., R].
@@ -74,7 +74,7 @@ class Factors(NamedTuple):
 
 
 class _Source(NamedTuple):
-    """Draws the numbers of an episode, each kind from a stream of its own."""
+    """Draws the numbers of an episode, each kind from its own random stream."""
 
     seed: Array
     xp: Any
@@ -82,14 +82,14 @@ class _Source(NamedTuple):
     def uniform(
         self, bounds: tuple[float, float] | None, stream: Stream, *shape: int
     ) -> Array | None:
-        """Draws [..., *shape] evenly from low..high, within the rounding of float32."""
+        """Draws [..., *shape] uniformly from low..high, within the rounding of float32."""
         if bounds is None:
             return None
         low, high = bounds
         return low + noise.uniform(self.seed, 0, stream, shape, self.xp) * (high - low)
 
     def whole(self, bounds: tuple[int, int] | None, stream: Stream, *shape: int) -> Array | None:
-        """Draws [..., *shape] whole numbers, each of low..high as likely as the next."""
+        """Draws [..., *shape] integers uniformly from low..high."""
         if bounds is None:
             return None
         low, high = bounds
@@ -103,7 +103,7 @@ class _Source(NamedTuple):
         return deviation * noise.normal(self.seed, 0, stream, shape, self.xp)
 
     def chance(self, probability: float | None, stream: Stream, *shape: int) -> Array | None:
-        """Draws [..., *shape] whether something is the case."""
+        """Draws [..., *shape] booleans that are true with the given probability."""
         if probability is None:
             return None
         return noise.uniform(self.seed, 0, stream, shape, self.xp) < probability
@@ -114,27 +114,30 @@ def draw(
 ) -> Factors:
     """Draws the factors of an episode.
 
-    Each factor has random numbers of its own: switching one off leaves the others as they were.
-    So does a larger number of robots for those that were there before. Ranges and their sources
-    stand in configs/realism/.
+    Each factor has its own random numbers, so switching one off leaves the others unchanged.
+    Adding robots leaves the factors of the existing robots unchanged. `configs/realism/` holds the
+    ranges and their sources.
 
-    A wheel's radius wears, and the tyre's thickness is common to a robot, hence one radius a
-    robot and a small difference between its wheels on top. The track is the effective one: tyres
-    grip somewhere across their width. Latency is that of one robot's link and stays, as does the
-    rate at which its firmware samples. Gain, offset, yaw and place belong to a sensor, paint to a
-    thing: the arena's walls are of one piece. Friction is that of two surfaces on each other; all
-    hulls, boxes and walls of an episode are alike.
+    The factors are drawn per robot, per sensor or per surface, according to their cause:
+
+    - Wheel radius: wheels wear, and both tyres of a robot have nearly the same thickness. So each
+      robot draws one radius, plus a small difference between its wheels.
+    - Track: the effective one, since tyres grip somewhere across their width.
+    - Latency and sampling period: fixed for a robot, by its radio link and its firmware.
+    - Gain, offset, yaw and position: one per sensor.
+    - Reflectance: one per obstacle or robot. All walls of the arena share one.
+    - Friction: between two surfaces. All hulls, boxes and walls of an episode are alike.
 
     Args:
-      seed: [...] uint32, one an episode.
-      realism: what is drawn, and from where; fixes the program.
-      robot: the nominal robot, whose wheels a mismatch alone acts on.
+      seed: [...] uint32, one per episode.
+      realism: which factors are drawn, and their ranges; fixed for a program.
+      robot: the nominal robot; its wheel radius is used if only a mismatch is drawn.
       robots: largest number of robots, R.
       obstacles: largest number of obstacles, M.
       xp: `numpy` or `jax.numpy`; both draw the same.
 
     Returns:
-      The factors, their leading axes those of `seed`.
+      The factors, with the leading axes of `seed`.
     """
     source, sensors = _Source(xp.asarray(seed, xp.uint32), xp), (robots, epuck.SENSORS)
     uniform, whole, normal = source.uniform, source.whole, source.normal
@@ -166,10 +169,10 @@ def draw(
 def _wheel_radius(
     source: _Source, realism: RealismConfig, robot: RobotConfig, robots: int
 ) -> Array | None:
-    """Draws [..., R, 2] the radii of left and right wheels, m.
+    """Draws the radii [..., R, 2] of left and right wheels, m.
 
-    The mismatch is (right - left) / mean, so each wheel takes half of it: a robot that is told to
-    drive straight turns by mismatch / track radians in every metre.
+    The mismatch is (right - left) / mean, and each wheel takes half of it. A robot commanded to
+    drive straight then turns by mismatch / track radians per metre.
     """
     if realism.wheel_radius is None and realism.wheel_mismatch is None:
         return None
@@ -181,20 +184,20 @@ def _wheel_radius(
 
 
 def _is_random(found: Factors, realism: RealismConfig) -> bool:
-    """Returns whether anything is drawn, now or at a control step."""
+    """Returns whether anything is random, at the start or at a control step."""
     later = (getattr(realism, name) for name in _PER_STEP)
     return any(value is not None for value in (*found, *later))
 
 
 def largest(robot: RobotConfig, realism: RealismConfig) -> RobotConfig:
-    """The robot with the most of any episode: what the model is compiled for.
+    """Returns the robot with the largest values of any episode, which the model is compiled for.
 
     Args:
       robot: the nominal robot.
-      realism: what is drawn.
+      realism: which factors are drawn.
 
     Returns:
-      The same robot with wheels and a hull's friction that no draw exceeds.
+      The robot, with wheel radius and hull friction that no draw exceeds.
     """
     most = realism.wheel_radius[1] if realism.wheel_radius else robot.wheel_radius
     half = 0.5 * (realism.wheel_mismatch or 0.0)

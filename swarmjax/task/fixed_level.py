@@ -1,9 +1,11 @@
 """The paper's fixed level: the same starts, targets and obstacles at every reset.
 
-The paper gives no coordinates. These restate the published example that its task comes from
-(deepworlds, find_and_avoid: a 0.7 m arena, one robot from (-0.26, 0.27) facing +x to (0.26,
--0.23), a fence of 0.50 x 0.06 m centred on (-0.10, 0.16)), scaled with the arena, with the swarm
-in a row at the start and the targets clustered, 0.1 m apart, on the far side.
+The paper gives no coordinates. Those here come from the published example that its task is based
+on: find_and_avoid of deepworlds. It has a 0.7 m arena, and one robot that drives from
+(-0.26, 0.27), facing +x, to (0.26, -0.23). A fence of 0.50 x 0.06 m is centred on (-0.10, 0.16).
+
+The coordinates are scaled with the arena. The swarm starts in a row. Its targets are clustered
+0.1 m apart on the far side.
 """
 
 from typing import Any
@@ -14,19 +16,19 @@ Array = Any
 
 EXAMPLE_SIDE = 0.7  # m; deepworlds find_and_avoid
 START = (-0.26, 0.27)  # m, in the example's arena
-TARGET = (0.26, -0.23)  # m, likewise
-FENCE = (-0.10, 0.16)  # m, centre, likewise
-FENCE_HALF_LENGTH = 0.25 / EXAMPLE_SIDE  # of the side, likewise
-FENCE_HALF_WIDTH = 0.03  # m; not scaled, as the wall of a real arena would not be
+TARGET = (0.26, -0.23)  # m, in the example's arena
+FENCE = (-0.10, 0.16)  # m, centre, in the example's arena
+FENCE_HALF_LENGTH = 0.25 / EXAMPLE_SIDE  # share of the arena's side
+FENCE_HALF_WIDTH = 0.03  # m; not scaled, since a real wall keeps its thickness
 BOX_HALF = 0.05  # m; the 0.1 m boxes of the stock e-puck world
 SPACING = 0.1  # m; between starts, and between targets: wider than a robot
-# Centres of the boxes in the example's arena, in the order in which they appear: between starts
-# and targets, at least 0.10 m clear of each other in arenas of 1 m and more. This project's own.
+# Centres of the boxes in the example's arena, in order of use. They lie between starts and targets,
+# at least 0.10 m clear of each other in arenas of 1 m and more. This project chose them.
 BOXES = ((0.0, 0.02), (-0.17, -0.12), (0.17, 0.1), (0.02, -0.2))
 
 
 def most_robots(side: float) -> int:
-    """How many robots the row of starts holds in an arena of `side` m."""
+    """Returns how many robots fit into the row of starts in an arena of `side` m."""
     scale = side / EXAMPLE_SIDE
     return 1 + int((0.5 * side - 0.06 - START[0] * scale) // SPACING)
 
@@ -67,12 +69,12 @@ def targets(robots: int, side: Array, xp: Any) -> Array:
 
 
 def obstacles(count: int, side: Array, fenced: Array, xp: Any) -> Array:
-    """Places the obstacles: the fence, as often as asked, or boxes.
+    """Places the obstacles: either boxes, or `count` copies of the fence.
 
     Args:
       count: M.
       side: [] of the arena, m.
-      fenced: [] whether it is the fence.
+      fenced: [] whether the obstacles are the fence.
       xp: `numpy` or `jax.numpy`.
 
     Returns:

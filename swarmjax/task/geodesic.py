@@ -1,14 +1,16 @@
-"""How far it is to the target along the shortest path around walls and boxes.
+"""Distance to the target along the shortest path around walls and boxes.
 
 A visibility graph (Lozano-Pérez & Wesley 1979, "An Algorithm for Planning Collision-Free Paths
-Among Polyhedral Obstacles"), solved for every target once an episode: from then on the distance is
-the least, over the corners that a robot sees, of the way to the corner and the way on from there.
-Rewards of navigation count progress along it (Wijmans et al. 2020, "DD-PPO", section 4).
+Among Polyhedral Obstacles") is solved once per episode for every target. The distance from a robot
+is then a minimum over the corners that it can see. For each corner, the distance to the corner and
+the distance from the corner to the target are added. Navigation rewards count progress along this
+path (Wijmans et al. 2020, "DD-PPO", section 4).
 
-Other robots do not count. Obstacles are widened by a little less than a robot's radius, with square
-corners, so that a robot that touches one is still outside. Lengths are then a millimetre too short
-to three centimetres too long, and a gap of 59 to 74 mm counts as a way though no robot fits. What
-matters to a reward is which way round a path leads, and that it gets shorter on the way.
+Other robots are ignored. Obstacles are widened by a little less than a robot's radius, with square
+corners, so a robot that touches an obstacle is still outside. Path lengths are therefore between a
+millimetre too short and three centimetres too long. A gap of 59 to 74 mm counts as passable, but
+no robot fits through. Neither matters to the reward: it needs the right way around the obstacles,
+and a length that shrinks along that way.
 """
 
 from collections.abc import Callable
@@ -21,19 +23,19 @@ from jax import Array
 from swarmjax.task.level import PARKING, Level
 from swarmjax.task.surroundings import into_frame
 
-# Of the hull's radius: by how much obstacles are widened, and how far off corners lie. Contacts
-# are soft, so a robot that is pushed against a wall is a little nearer than its radius.
+# Shares of the hull's radius by which obstacles are widened, and by which corners are set off.
+# Contacts are soft, so a robot pushed against a wall can come closer to it than its radius.
 _WIDENED = 0.8
 _CORNER = 0.9
 _SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
 
 
 class Roadmap(NamedTuple):
-    """Where paths turn, and how far it is from there.
+    """Corners where paths can turn, and the distances from there to the targets.
 
     Attributes:
-      corner: [K, 2] of the widened obstacles, x and y, m.
-      to_go: [R, K] from each corner to each robot's target, m; inf where no path leads.
+      corner: [K, 2] x and y of the corners of the widened obstacles, m.
+      to_go: [R, K] from each corner to each robot's target, m; inf without a path.
     """
 
     corner: Array
@@ -41,7 +43,7 @@ class Roadmap(NamedTuple):
 
 
 class Path(NamedTuple):
-    """What an arena keeps of the paths of its robots.
+    """Path state of an arena.
 
     Attributes:
       roadmap: of the episode.
@@ -56,12 +58,12 @@ def begin(level: Level, hull_radius: float, fast: Any = None) -> Path:
     """Finds the paths of an episode.
 
     Args:
-      level: what it starts from.
+      level: the level that the episode starts from.
       hull_radius: of robots, m.
-      fast: what finds them by Warp, `swarmjax.sim.fast.paths_warp`; None: plain JAX.
+      fast: path finder in Warp, `swarmjax.sim.fast.paths_warp`; None for plain JAX.
 
     Returns:
-      The paths from where robots start. A robot that has none is as far away as the straight line.
+      The paths from the starts. A robot without a path gets its straight-line distance.
     """
     level = jax.tree.map(jnp.asarray, level)
     roadmap = survey(level, hull_radius, fast)
@@ -71,17 +73,17 @@ def begin(level: Level, hull_radius: float, fast: Any = None) -> Path:
 
 
 def go_on(path: Path, place: Array, level: Level, hull_radius: float, fast: Any = None) -> Path:
-    """Measures the paths from where robots are now.
+    """Measures the paths from the robots' current places.
 
     Args:
-      path: before.
-      place: [R, 2] where the robots are now, m.
+      path: of the previous control step.
+      place: [R, 2] current places of the robots, m.
       level: of the episode.
       hull_radius: of robots, m.
-      fast: as of `begin`.
+      fast: as for `begin`.
 
     Returns:
-      The paths from there. A robot from where none is found keeps its distance.
+      The new paths. A robot without a path keeps its previous distance.
     """
     distance = _measured(path.roadmap, place, level, hull_radius, fast, path.distance)
     return path._replace(distance=distance)
@@ -90,21 +92,21 @@ def go_on(path: Path, place: Array, level: Level, hull_radius: float, fast: Any 
 def _measured(
     roadmap: Roadmap, place: Array, level: Level, hull_radius: float, fast: Any, otherwise: Array
 ) -> Array:
-    """Returns the distances [R], those of `otherwise` where no path leads."""
+    """Returns the distances [R], with values of `otherwise` for robots without a path."""
     distance = measure(roadmap, place, level, hull_radius, fast)
     return jnp.where(jnp.isfinite(distance), distance, otherwise)
 
 
 def survey(level: Level, hull_radius: float, fast: Any = None) -> Roadmap:
-    """Solves the visibility graph of a level for the targets of its robots.
+    """Solves the visibility graph of a level for the robots' targets.
 
     Args:
-      level: of which obstacles and targets count.
+      level: obstacles and targets.
       hull_radius: of robots, m.
-      fast: as of `begin`.
+      fast: as for `begin`.
 
     Returns:
-      The corners, four an obstacle, and how far it is from there.
+      The corners, four per obstacle, with the distances from them to the targets.
     """
     corner = jax.lax.optimization_barrier(_corners(level, _CORNER * hull_radius))
     if fast is not None and len(corner):
@@ -121,7 +123,7 @@ def survey(level: Level, hull_radius: float, fast: Any = None) -> Roadmap:
     direct = jnp.where(usable, _legs(targets, corners, level, hull_radius), jnp.inf)
 
     def shorten(carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        # Bellman and Ford's step: a path may have one corner more.
+        # One Bellman-Ford step allows paths with one more corner.
         to_go, _ = carry
         further = jnp.min(legs + to_go[:, None, :], axis=-1, initial=jnp.inf)
         shorter = jnp.minimum(to_go, further)
@@ -141,10 +143,10 @@ def measure(
       place: [R, 2] x and y, m.
       level: of the episode.
       hull_radius: of robots, m.
-      fast: as of `begin`.
+      fast: as for `begin`.
 
     Returns:
-      [R] m; inf where no path leads.
+      [R] m; inf without a path.
     """
     if fast is not None and len(roadmap.corner):
         known = level.target, roadmap.corner, roadmap.to_go, _frames(level)
@@ -157,7 +159,7 @@ def measure(
 
 
 class _Places(NamedTuple):
-    """Places, [P, 2] x and y, m, and where they lie in the frames of the obstacles, [M, P] each."""
+    """Places [P, 2] x and y (m), and their coordinates [M, P] in the frames of the obstacles."""
 
     place: Array
     x: Array
@@ -165,7 +167,7 @@ class _Places(NamedTuple):
 
 
 def _corners(level: Level, off: float) -> Array:
-    """Lists the corners [4 M, 2] of obstacles that are widened by `off`, m."""
+    """Lists the corners [4 M, 2] of obstacles widened by `off`, m."""
     x, y, yaw, half_x, half_y = (each[:, None] for each in level.obstacle.T)
     sign = jnp.asarray(_SIGNS)
     in_x, in_y = sign[:, 0] * (half_x + off), sign[:, 1] * (half_y + off)
@@ -175,7 +177,7 @@ def _corners(level: Level, off: float) -> Array:
 
 
 def _frames(level: Level) -> Array:
-    """Lists obstacles [M, 6]: x, y (m), cosine and sine of yaw, half edges (m); absent ones far."""
+    """Lists obstacles [M, 6]: x, y (m), cos and sin of yaw, half edges (m); absent ones far off."""
     x, y, yaw, half_x, half_y = level.obstacle.T
     x = jnp.where(level.obstacle_present, x, PARKING)
     return jnp.stack([x, y, jnp.cos(yaw), jnp.sin(yaw), half_x, half_y], axis=-1)
@@ -184,13 +186,13 @@ def _frames(level: Level) -> Array:
 def _locate(place: Array, level: Level) -> _Places:
     """Turns places [P, 2] into coordinates in the frames of the obstacles."""
     local = into_frame(level.obstacle[:, None, :3], place)
-    # Pairs of places look at this. Without the barrier XLA puts all of it into the code of each
-    # pair, and compiles that for minutes on a GPU.
+    # Each pair of places uses these coordinates. Without the barrier, XLA inlines their computation
+    # into the code of every pair, which takes minutes to compile on a GPU.
     return _Places(place, *jax.lax.optimization_barrier(local))
 
 
 def _covers(places: _Places, level: Level, off: float) -> Array:
-    """Tells which places [P] lie within an obstacle that is widened by `off`, m."""
+    """Returns which places [P] lie within an obstacle widened by `off`, m."""
 
     def within(i: Array) -> Array:
         half_x, half_y = level.obstacle[i, 3] + off, level.obstacle[i, 4] + off
@@ -201,7 +203,7 @@ def _covers(places: _Places, level: Level, off: float) -> Array:
 
 
 def _legs(begin: _Places, end: _Places, level: Level, hull_radius: float) -> Array:
-    """Measures the straight ways [B, E] from B places to E others; inf where barred."""
+    """Measures straight lines [B, E] from B places to E others, m; inf where one is blocked."""
     away_x, away_y = (end.place[None] - begin.place[:, None]).transpose(2, 0, 1)
     rows = _Places(begin.place, begin.x[:, :, None], begin.y[:, :, None])
     columns = _Places(end.place, end.x[:, None], end.y[:, None])
@@ -211,16 +213,18 @@ def _legs(begin: _Places, end: _Places, level: Level, hull_radius: float) -> Arr
 
 
 def _is_barred(begin: _Places, end: _Places, level: Level, off: float) -> Array:
-    """Tells whether segments meet an obstacle that is widened by `off`.
+    """Returns whether segments meet an obstacle widened by `off`.
+
+    The test uses separating axes (Ericson 2005, "Real-Time Collision Detection", section 5.3.3).
 
     Args:
-      begin: where they begin; the axes behind that of the obstacles broadcast.
-      end: where they end.
-      level: whose obstacles.
+      begin: where the segments begin; the axes after the obstacle axis broadcast.
+      end: where the segments end.
+      level: provides the obstacles.
       off: m.
 
     Returns:
-      [...]. By separating axes (Ericson 2005, "Real-Time Collision Detection", section 5.3.3).
+      [...] bool.
     """
 
     def meets(i: Array) -> Array:
@@ -240,10 +244,10 @@ def _is_barred(begin: _Places, end: _Places, level: Level, off: float) -> Array:
 
 
 def _any(of: Callable[[Array], Array], like: Array) -> Array:
-    """Tells whether something holds of any obstacle, [...]; `like` is [M, ...].
+    """Returns [...] whether `of` holds for any obstacle; `like` has shape [M, ...].
 
-    One obstacle after the other: as a reduction, or written out, XLA compiles it for minutes on a
-    GPU.
+    The obstacles are handled in a loop. With a reduction or unrolled code, XLA takes minutes to
+    compile on a GPU.
     """
     nothing = jnp.zeros(like.shape[1:], bool)
     if not len(like):

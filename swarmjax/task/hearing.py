@@ -1,9 +1,10 @@
-"""Range and bearing: what a robot hears of those around it, and what they broadcast.
+"""Range and bearing of neighbours, and the numbers that they broadcast.
 
-As the e-puck's infrared board for local communication (Gutiérrez et al. 2009, "Open E-puck Range &
-Bearing miniaturized board for local communication in swarm robotics") and AutoMoDe's reference
-models have it: distance and bearing of a neighbour, and the few numbers of its packet. Walls inside
-the arena and boxes hide a neighbour; other robots do not. NumPy or JAX.
+A robot receives a neighbour's distance and bearing and the few numbers of its packet. The model
+follows the e-puck's infrared board for local communication (Gutiérrez et al. 2009, "Open E-puck
+Range & Bearing miniaturized board for local communication in swarm robotics") and AutoMoDe's
+reference models. Inner walls and boxes block reception; other robots do not. The code runs on NumPy
+or JAX.
 """
 
 from typing import Any, NamedTuple
@@ -20,13 +21,12 @@ Array = Any
 
 
 class Heard(NamedTuple):
-    """What can be heard.
+    """Neighbours within reach.
 
     Attributes:
-      distance: [..., R, R] from the one that hears (first) to the one that sends, m; inf where
-        nothing can be heard.
-      bearing: [..., R, R] of the sender from the x axis of the one that hears, rad.
-      message: [..., R, M] what each broadcast in the control step before, -1..1.
+      distance: [..., R, R] from receiver (first axis) to sender, m; inf without reception.
+      bearing: [..., R, R] of the sender, from the receiver's x axis, rad.
+      message: [..., R, M] numbers that each robot broadcast in the last control step, -1..1.
     """
 
     distance: Array
@@ -42,18 +42,18 @@ def reachable(
     settings: NeighboursConfig,
     xp: Any,
 ) -> Heard:
-    """Works out who could hear whom.
+    """Determines which robots can receive which others.
 
     Args:
       pose: [..., R, 3] x (m), y (m), yaw (rad).
-      present: [..., R] whether the robot takes part.
-      hidden: [..., R, R] whether a wall or a box is between two robots.
-      message: [..., R, M] what each broadcast; None before anything was.
-      settings: range and numbers of a message.
+      present: [..., R] whether the robot is present.
+      hidden: [..., R, R] whether a wall or a box lies between two robots.
+      message: [..., R, M] numbers that each robot broadcast; None before the first broadcast.
+      settings: range and message size.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      What can be heard.
+      The neighbours within reach.
     """
     if message is None:
         message = xp.zeros((*pose.shape[:-1], settings.message_size), xp.float32)
@@ -71,7 +71,7 @@ def reachable(
 
 
 def hidden(pose: Array, obstacle: Array, xp: Any) -> Array:
-    """Tells whether a wall or a box crosses the line between two robots' centres.
+    """Returns whether a wall or a box crosses the line between two robots' centres.
 
     Args:
       pose: [..., R, 3] x (m), y (m), yaw (rad).
@@ -91,7 +91,7 @@ def hidden(pose: Array, obstacle: Array, xp: Any) -> Array:
 
 
 def _apart(pose: Array, xp: Any) -> tuple[Array, Array, Array]:
-    """Offsets x and y [..., R, R] of all robots from each (m), and their distances."""
+    """Returns offsets x and y [..., R, R] from each robot to all others, and the distances (m)."""
     x, y = (pose[..., None, :, axis] - pose[..., :, None, axis] for axis in range(2))
     return x, y, xp.sqrt(x * x + y * y)
 
@@ -104,19 +104,19 @@ def listen(
     clock: Array,
     xp: Any,
 ) -> Array:
-    """Lists the nearest neighbours of each robot whose packets arrive.
+    """Lists the nearest neighbours of each robot, among those with a packet that arrives.
 
     Args:
-      heard: what can be heard.
-      settings: how many are listed.
-      realism: packets that are lost, and noise.
-      seed: [...] uint32 of the episode; None where nothing is random.
+      heard: the neighbours within reach.
+      settings: number of neighbours to list.
+      realism: packet loss and noise.
+      seed: [...] uint32 of the episode; None without randomness.
       clock: [...] or [] control steps since the start.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [..., R, K W], nearest first: 1 for one that is there, distance (m), cosine and sine of the
-      bearing, message; 0 in place of those that are missing.
+      [..., R, K W], nearest first. Each neighbour has a presence flag of 1, distance (m), cosine
+      and sine of the bearing, and message. Missing neighbours are 0.
     """
     distance, bearing, message = heard
     robots = distance.shape[-1]
@@ -158,9 +158,9 @@ def _draw(
     robots: int,
     xp: Any,
 ) -> Array | None:
-    """Draws [..., R, R] numbers, those that hear first, if their factor is on.
+    """Draws numbers [..., R, R] if their factor is on; the first axis is the receiver.
 
-    What a pair gets does not depend on how many robots there are.
+    The numbers of a pair do not depend on the number of robots.
     """
     if size is None:
         return None
@@ -169,12 +169,12 @@ def _draw(
 
 
 def broadcast(action: Array, size: int, active: Array, xp: Any) -> Array:
-    """Takes what robots broadcast out of their actions.
+    """Extracts the broadcast numbers from actions.
 
     Args:
-      action: [..., R, 2 + M], or only the first two, of a robot that says nothing.
+      action: [..., R, 2 + M], or only the first two entries for a robot that broadcasts nothing.
       size: M.
-      active: [..., R] who may act; others are silent, and 0 is heard of them.
+      active: [..., R] whether the robot may act; others broadcast 0.
       xp: `numpy` or `jax.numpy`.
 
     Returns:

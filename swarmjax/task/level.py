@@ -1,6 +1,7 @@
-"""Levels: what an episode starts from, drawn at a fixed cost from an array of uniform numbers.
+"""Levels: the starting conditions of an episode, drawn at a fixed cost from uniform numbers.
 
-Code takes the array module, so that NumPy and JAX draw the same level from the same numbers.
+The code takes the array module as an argument. NumPy and JAX draw the same level from the same
+numbers.
 """
 
 import math
@@ -35,21 +36,21 @@ from swarmjax.task.stage_config import PASSAGE
 
 Array = Any
 
-PARKING = 5.0  # m; where absent robots and obstacles wait, outside the walls of any arena
+PARKING = 5.0  # m; parking place of absent robots and obstacles, outside the walls of any arena
 PARKING_SPACING = 0.5  # m
 
 
 class Level(NamedTuple):
-    """Everything that an episode starts from.
+    """Starting conditions of an episode.
 
     Attributes:
       side: [] of the arena, m.
-      present: [R] whether the robot takes part.
+      present: [R] whether the robot is present.
       start: [R, 3] x (m), y (m), yaw (rad).
       target: [R, 2] x (m), y (m).
-      obstacle_present: [M] whether the obstacle is there.
+      obstacle_present: [M] whether the obstacle is present.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
-      seed: [] uint32, from which everything else that is random about the episode follows.
+      seed: [] uint32; all other randomness of the episode follows from it.
     """
 
     side: Array
@@ -68,7 +69,7 @@ class Spacing(NamedTuple):
       robots: largest number of robots, R.
       obstacles: largest number of obstacles, M.
       hull_radius: m.
-      target_radius: within which a robot has arrived, m.
+      target_radius: distance at which a robot has arrived, m.
     """
 
     robots: int
@@ -78,7 +79,7 @@ class Spacing(NamedTuple):
 
 
 class _Uniforms(NamedTuple):
-    """The uniform numbers by their use: [2], [M] or [R] each; two for the seed."""
+    """The uniform numbers, grouped by use: [2], [M] or [R] each; two for the seed."""
 
     obstacle_shift: Array
     target_shift: Array
@@ -92,7 +93,7 @@ class _Uniforms(NamedTuple):
 
 
 class _Obstacles(NamedTuple):
-    """Obstacles already placed: centres [M, 2] (units), presence [M], outer radius [] (units)."""
+    """Placed obstacles: centres [M, 2] (units), presence [M], outer radius [] (units)."""
 
     centre: Array
     there: Array
@@ -100,21 +101,21 @@ class _Obstacles(NamedTuple):
 
 
 def uniform_count(spacing: Spacing) -> int:
-    """How many uniform numbers a level takes."""
+    """Returns how many uniform numbers a level takes."""
     return 8 + 2 * spacing.obstacles + 3 * spacing.robots
 
 
 def write_out(uniforms: Array, spacing: Spacing, layouts: int, xp: Any) -> Array:
-    """Adds to a level's uniform numbers those of its layout, which follow from its seed.
+    """Appends a layout's numbers, which follow from the seed, to a level's uniform numbers.
 
     Args:
       uniforms: [uniform_count(spacing)] float32 in [0, 1).
       spacing: sizes.
-      layouts: how many of them to add.
+      layouts: how many layout numbers to append.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [uniform_count(spacing) + layouts] numbers, of which `sample` draws the same level.
+      [uniform_count(spacing) + layouts] numbers; `sample` draws the same level from them.
     """
     seed = _seed(_split(uniforms, spacing), xp)
     added = noise.uniform(seed, 0, Stream.LAYOUT, (layouts,), xp)
@@ -124,24 +125,25 @@ def write_out(uniforms: Array, spacing: Spacing, layouts: int, xp: Any) -> Array
 def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     """Draws a level of a stage.
 
-    Random levels place obstacles, then targets, then starts. None overlap. Obstacles are
-    `PASSAGE` clear of each other and of the walls, and one that finds no such place is left out.
-    Targets are so far apart and so clear of obstacles, where the arena has room, that a robot
-    gets past any two that have arrived: every target stays reachable in any order of arrival.
+    A random level places obstacles, then targets, then starts, without overlap. Obstacles keep
+    `PASSAGE` clear between each other and to the walls. An obstacle that finds no such place is
+    left out. Where the arena has room, targets keep enough distance from each other and from
+    obstacles for a robot to pass between any two arrived robots. Every target then stays reachable,
+    whatever the order of arrival.
 
     Args:
-      uniforms: [uniform_count(spacing)] float32 in [0, 1), and after them those of the layout, if
-        they do not follow from the level's seed (`write_out`).
+      uniforms: [uniform_count(spacing)] float32 in [0, 1). The layout's numbers may follow; if they
+        do not, they are drawn from the level's seed (see `write_out`).
       stage: fields [].
       spacing: sizes.
       xp: `numpy` or `jax.numpy`; both draw the same level.
 
     Returns:
-      The level; what is absent is parked outside.
+      The level; absent robots and obstacles are parked outside.
     """
     drawn = _split(uniforms, spacing)
     level = _fixed(drawn, stage, spacing, xp)
-    if stage.laid_out is None:  # placing takes long, and is not for what a layout replaces
+    if stage.laid_out is None:  # skip the slow random placement if a layout replaces it
         random = _random(drawn, stage, spacing, xp)
         level = Level(*(xp.where(stage.fixed, f, r) for f, r in zip(level, random, strict=True)))
     if stage.map is not None:
@@ -157,7 +159,7 @@ def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
 
 
 def _split(uniforms: Array, spacing: Spacing) -> _Uniforms:
-    """Deals the uniform numbers out."""
+    """Splits the uniform numbers by use."""
     many, few = spacing.obstacles, spacing.robots
     ends = np.cumsum([2, 2, 2, many, many, few, few, few, 2])
     starts = [0, *ends[:-1]]
@@ -190,15 +192,15 @@ def _random(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
 
 
 def _seed(drawn: _Uniforms, xp: Any) -> Array:
-    """Makes 32 random bits of two uniform numbers, of which a float32 holds 16 for sure."""
+    """Makes 32 random bits from two uniform numbers; a float32 surely holds only 16."""
     high, low = (drawn.seed * np.float32(2**16)).astype(xp.uint32)
     return (high << 16) | low
 
 
 def _side(stage: Stage, seed: Array, xp: Any) -> Array:
-    """Draws the side of the arena, m, in whole units, where the stage leaves it open.
+    """Draws the side of the arena, m, in whole units, if the stage gives a range.
 
-    A hash of the level's seed, so that nothing else about a level depends on it.
+    The side is a hash of the level's seed, so nothing else in the level depends on it.
     """
     low = xp.ceil(stage.side * UNITS).astype(xp.int32)
     count = xp.floor(stage.largest_side * UNITS).astype(xp.int32) - low + 1
@@ -208,7 +210,7 @@ def _side(stage: Stage, seed: Array, xp: Any) -> Array:
 
 
 def _place_obstacles(drawn: _Uniforms, stage: Stage, side: Array, xp: Any) -> _Obstacles:
-    """Places boxes, turned at random, so that their outer circles leave a passage everywhere."""
+    """Places randomly turned boxes, with a passage between all of their outer circles."""
     radius = units(stage.obstacle_size * np.float32(math.sqrt(0.5)), xp) + 1
     gap = 2 * radius + round_up(PASSAGE)
     points = lattice(drawn.obstacle_shift, side, xp)
@@ -225,7 +227,7 @@ def _place_targets(
     hull, reach = spacing.hull_radius, spacing.target_radius
     beside = Gap(
         around.radius + clearance(hull),
-        # A robot parked on this side of its target, and another one passing behind it.
+        # One robot parks on this side of its target while another one passes behind it.
         around.radius + round_up(reach + 3.0 * hull),
     )
     apart = gaps_of(hull, reach).target
@@ -244,7 +246,7 @@ def _place_starts(
     side: Array,
     xp: Any,
 ) -> Array:
-    """Places starts clear of everything that is or may come to be there; returns [R, 2] units."""
+    """Places starts clear of obstacles, targets and robots parked there; returns [R, 2] units."""
     hull, reach = spacing.hull_radius, spacing.target_radius
     beside = clearance(hull) + around.radius
     _, from_target, apart = gaps_of(hull, reach)
@@ -257,7 +259,7 @@ def _place_starts(
 
 
 def _fixed(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
-    """Returns the paper's level, scaled with the arena; its seed alone is drawn."""
+    """Returns the paper's level, scaled with the arena; only its seed is random."""
     count = xp.where(stage.fence, xp.minimum(stage.obstacles, 1), stage.obstacles)
     return Level(
         side=stage.side,
@@ -299,7 +301,7 @@ def _mapped(drawn: _Uniforms, stage: Stage, arena: MapArrays, spacing: Spacing, 
 
 
 def _of_layout(kind: Kind, uniforms: Array, seed: Array, spacing: Spacing, xp: Any) -> Array:
-    """Returns the layout's own numbers: those written out, or else those that the seed gives."""
+    """Returns the layout's numbers: those in `uniforms`, or else those drawn from the seed."""
     before = uniform_count(spacing)
     if uniforms.shape[0] > before:
         return uniforms[before:]
@@ -316,7 +318,7 @@ def _laid_out(
     spacing: Spacing,
     xp: Any,
 ) -> Level:
-    """Lays an arena out; robots and walls beyond those of the layout are absent."""
+    """Lays an arena out; robots and walls beyond the layout's own are absent."""
     present = xp.arange(spacing.robots) < stage.robots
     sizes = RobotSizes(spacing.hull_radius, spacing.target_radius)
     arena = drawing.draw(kind, of, uniforms, present, sizes, xp)
@@ -337,7 +339,7 @@ def _laid_out(
 def _score_on_map(
     stage: Stage, arena: MapArrays, spacing: Spacing, xp: Any, points: Array, is_open: Array
 ) -> Array:
-    """Scores the points of an area by whether a robot has room there, [P]."""
+    """Scores the points [P] of an area by whether a robot fits there."""
     gap = clearance(spacing.hull_radius)
     there = xp.arange(arena.wall.shape[0]) < stage.obstacles
     rectangle = units(arena.wall[:, np.array([0, 1, 3, 4])], xp)
@@ -357,28 +359,28 @@ def _place_among(
     paired: Array,
     xp: Any,
 ) -> Array:
-    """Places what has no place of its own [R, 2] (units) yet, clear of what has."""
+    """Places starts or targets without a fixed place, clear of fixed ones; returns [R, 2] units."""
     score = xp.minimum(score, score_things(points, fixed, paired, gap, xp))
     placed, _ = place(points, score, picks, present & ~paired, gap, xp)
     return xp.where(paired[:, None], fixed, placed)
 
 
 def _rows(array: Array, count: int, xp: Any) -> Array:
-    """Cuts an array to so many rows, or adds rows of zeros."""
+    """Cuts an array to `count` rows, or appends rows of zeros."""
     lacking = max(0, count - array.shape[0])
     zeros = xp.zeros((lacking, *array.shape[1:]), array.dtype)
     return xp.concatenate([array[:count], zeros])
 
 
 def park(level: Level, xp: Any) -> Level:
-    """Moves what is absent outside, each thing to a place of its own.
+    """Moves absent robots and obstacles outside, each to its own parking place.
 
     Args:
-      level: of one arena; where absent things stand in it makes no difference.
+      level: of one arena; the places of absent robots and obstacles are ignored.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      The level, absent robots with heading 0; edges and angles of obstacles stay.
+      The level. Absent robots get heading 0. Obstacles keep their edges and angles.
     """
     robots, obstacles = level.present.shape[0], level.obstacle_present.shape[0]
     line = PARKING + PARKING_SPACING * np.arange(max(robots, obstacles), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Arenas drawn as text: where walls are, where robots start and where their targets may be.
+"""Arenas drawn as text: walls, starts and possible places of targets.
 
     ########
     #S..#..#
@@ -6,9 +6,9 @@
     #...#.T#
     ########
 
-`#` is wall, `.` floor, `S` and `T` the areas where robots start and have their targets. Any other
-letter is the start of one robot, and its capital the target of that robot. The text is the view
-from above: x to the right, y up.
+`#` is a wall, `.` is floor. `S` and `T` mark the areas for starts and targets. Any other lower-case
+letter is the start of one robot, and its capital is that robot's target. The text shows the arena
+from above, with x to the right and y up.
 """
 
 import math
@@ -24,20 +24,20 @@ Array = Any
 Cell = tuple[int, int]  # row and column of the text, from 0
 
 WALL, FLOOR, START, TARGET = "#.ST"
-MOST_CELLS = 48  # of a row, and rows
-# Points of an area that things may be placed on: at least so far apart (m), at most so many, unless
-# the area has more cells.
+MOST_CELLS = 48  # limit for the cells of a row, and for rows
+# Points that starts and targets may be placed on: their least distance (m), and their largest
+# number. An area with more cells than that gets one point per cell.
 _APART, _MOST_POINTS = 0.03, 1024
 
 
 class Map(NamedTuple):
-    """What a text says, in metres around the middle of the arena.
+    """A map, in metres around the middle of the arena.
 
     Attributes:
       side: of the square arena that holds the map, m.
       wall: [W, 5] x (m), y (m), yaw (0 rad), half edges (m) of rectangles.
-      start: [C, 2] points on which robots may start, m.
-      target: [D, 2] points on which targets may be, m.
+      start: [C, 2] possible starts, m.
+      target: [D, 2] possible targets, m.
       pair: [P, 2, 2] start and target of each robot that has a letter, m.
     """
 
@@ -49,7 +49,7 @@ class Map(NamedTuple):
 
 
 class MapArrays(NamedTuple):
-    """The maps of stages as arrays, [S, ...] or [...]; what a stage lacks is not open.
+    """The maps of stages as arrays, [S, ...] or [...]; missing points are marked as not open.
 
     Attributes:
       mapped: whether the stage has a map, bool.
@@ -59,7 +59,7 @@ class MapArrays(NamedTuple):
       target: [D, 2] in units, int32.
       target_open: [D] whether it is a point of this stage, bool.
       pair: [P, 2, 2] in units, int32.
-      pairs: how many of these there are, int32.
+      pairs: number of pairs that the stage has, int32.
     """
 
     mapped: Array
@@ -76,14 +76,14 @@ def read(rows: Sequence[str], cell: float) -> Map:
     """Reads a map.
 
     Args:
-      rows: of the text, from the top.
+      rows: rows of the text, from the top.
       cell: edge of a cell, m.
 
     Returns:
-      The map; where it is no square, wall is added on both sides.
+      The map; if it is not square, walls are added on both sides.
 
     Raises:
-      ConfigError: naming what is wrong with the text.
+      ConfigError: the text is invalid; the message says why.
     """
     _check_text(rows)
     areas = _areas(rows)
@@ -140,7 +140,7 @@ def _areas(rows: Sequence[str]) -> dict[str, list[Cell]]:
 
 
 def _pairs(areas: dict[str, list[Cell]]) -> list[tuple[Cell, Cell]]:
-    """Puts the starts and targets of letters together, in the order of the alphabet."""
+    """Pairs the start and the target of each letter, in alphabetical order."""
     letters = sorted({letter.lower() for letter in areas} - {"s", "t"})
     for letter in letters:
         for each in (letter, letter.upper()):
@@ -159,7 +159,7 @@ def _check_reach(
     targets: Sequence[Cell],
     pairs: Sequence[tuple[Cell, Cell]],
 ) -> None:
-    """Refuses a target that cannot be reached, by steps from cell to cell."""
+    """Refuses a target that no sequence of steps between adjacent cells can reach."""
     if bool(starts) != bool(targets) or not (starts or pairs):
         raise ConfigError(
             f"map has {len(starts)} cells of S and {len(targets)} of T: give both, or a letter for "
@@ -177,7 +177,7 @@ def _check_reach(
 
 
 def _reached(rows: Sequence[str], start: Cell) -> set[Cell]:
-    """Fills the floor from a cell on, over the edges of cells."""
+    """Flood-fills the floor from a cell, across the edges of cells."""
     found, edge = {start}, [start]
     while edge:
         r, c = edge.pop()
@@ -209,9 +209,9 @@ def _points(cells: Sequence[Cell], middle: np.ndarray, edge: float) -> np.ndarra
 
 
 def _walls(rows: Sequence[str], edge: float) -> np.ndarray:
-    """Covers the wall by rectangles that do not overlap, [W, 5]."""
+    """Covers the walls with rectangles that do not overlap, [W, 5]."""
     height, width = len(rows), len(rows[0])
-    margin = abs(height - width) / 2  # cells on either side of a map that is no square
+    margin = abs(height - width) / 2  # cells added on either side of a map that is not square
     found: list[tuple[float, float, float, float]] = [*_rectangles(rows)]
     if width > height:
         found += [(0, -margin, width, 0), (0, height, width, height + margin)]
@@ -231,7 +231,7 @@ def _walls(rows: Sequence[str], edge: float) -> np.ndarray:
 
 
 def _rectangles(rows: Sequence[str]) -> Iterator[tuple[int, int, int, int]]:
-    """Yields left, top, right and bottom of rectangles that cover the wall, largest first."""
+    """Yields left, top, right and bottom of rectangles that cover the walls, largest first."""
     left = np.array([[letter == WALL for letter in row] for row in rows])
     while left.any():
         yield (best := _largest(left))
@@ -241,7 +241,7 @@ def _rectangles(rows: Sequence[str]) -> Iterator[tuple[int, int, int, int]]:
 def _largest(wall: np.ndarray) -> tuple[int, int, int, int]:
     """Finds the largest rectangle of wall: left, top, right, bottom."""
     best, most = (0, 0, 0, 0), 0
-    runs = np.zeros(wall.shape[1], int)  # of wall above the bottom row, by column
+    runs = np.zeros(wall.shape[1], int)  # wall cells directly above the bottom row, by column
     for bottom, row in enumerate(wall, 1):
         runs = np.where(row, runs + 1, 0)
         for left in range(len(runs)):
@@ -283,7 +283,7 @@ def stack(maps: Sequence[Map | None]) -> MapArrays | None:
 
 
 def _pad(arrays: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Stacks arrays of different lengths, one row at least; returns them and where there is any."""
+    """Pads arrays to one length, at least 1, and stacks them; also returns which rows are real."""
     longest = max(1, *map(len, arrays))
     shape = (len(arrays), longest, *arrays[0].shape[1:])
     padded, there = np.zeros(shape), np.zeros(shape[:2], bool)

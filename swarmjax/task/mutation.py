@@ -1,7 +1,7 @@
-"""Which numbers of a level a mutation may change: those that place a thing, or size it.
+"""Selects the numbers of a level that a mutation may change: places and sizes.
 
-A mutated level is drawn like any other, from numbers of which one has moved. So it keeps every rule
-of placement: nothing overlaps, and what is reached in a drawn level is reached in it.
+A mutated level is drawn like any other, after one of its numbers has changed. It therefore keeps
+all rules of placement: nothing overlaps, and targets stay reachable as in any drawn level.
 """
 
 from collections.abc import Sequence
@@ -15,24 +15,24 @@ from swarmjax.task.layouts.site import NUMBERS
 from swarmjax.task.level import Spacing
 from swarmjax.task.stage_config import BUILT_IN, StageConfig
 
-# Parts of a layout's numbers that may move: all of the first, and of the second those of robots
-# that take part.
+# Parts of a layout's numbers that may change: the first group entirely, the second only for the
+# robots that are present.
 _WHOLE, _BY_ROBOT = ("wall", "room"), ("target", "start")
 
 
 def layout_count(stages: Sequence[StageConfig], robots: int) -> int:
-    """Returns how many numbers the layouts of stages take, of the one that takes most.
+    """Returns the largest count of layout numbers among stages.
 
     Args:
       stages: of a run.
-      robots: that are compiled in, R.
+      robots: largest number of robots, R.
     """
     kinds = [stage.kind for stage in stages if stage.kind is not None]
     return max((drawing.uniform_count(kind, robots) for kind in kinds), default=0)
 
 
 def number_count(stages: Sequence[StageConfig], spacing: Spacing) -> int:
-    """Returns how many numbers a level has that `level.write_out` writes out, V."""
+    """Returns how many numbers `level.write_out` writes for a level, V."""
     return level.uniform_count(spacing) + layout_count(stages, spacing.robots)
 
 
@@ -44,10 +44,10 @@ def movable(stages: Sequence[StageConfig], spacing: Spacing) -> np.ndarray:
       spacing: sizes.
 
     Returns:
-      [S, V] float32, 1 for each that may move, else 0.
+      [S, V] float32: 1 for each number that may change, else 0.
 
     Raises:
-      ConfigError: if a stage has none.
+      ConfigError: a stage has no such number.
     """
     found = np.zeros((len(stages), number_count(stages, spacing)), np.float32)
     for row, stage in zip(found, stages, strict=True):
@@ -57,10 +57,10 @@ def movable(stages: Sequence[StageConfig], spacing: Spacing) -> np.ndarray:
 
 
 def check(stage: StageConfig) -> None:
-    """Refuses a stage whose levels cannot be mutated.
+    """Refuses a stage with levels that cannot be mutated.
 
     Raises:
-      ConfigError: if it has nothing that may move.
+      ConfigError: nothing in its levels may change.
     """
     if stage.level == "fixed":
         why = "always the same"
@@ -77,7 +77,7 @@ def check(stage: StageConfig) -> None:
 
 
 def _places(stage: StageConfig, spacing: Spacing) -> np.ndarray:
-    """Lists which numbers of a stage may move."""
+    """Lists which numbers of a stage may change."""
     if stage.kind is not None:
         return level.uniform_count(spacing) + np.array(_of_layout(stage, spacing.robots))
     many, few = spacing.obstacles, spacing.robots
@@ -90,9 +90,9 @@ def _places(stage: StageConfig, spacing: Spacing) -> np.ndarray:
 
 
 def _of_layout(stage: StageConfig, robots: int) -> list[int]:
-    """Lists which numbers of a layout may move."""
+    """Lists which numbers of a layout may change."""
     layout = LAYOUTS[stage.level]
-    # Two extents come before the others; a mutation moves nothing where both ends are the same.
+    # The two extents come first. Numbers with equal ends do not vary, so a mutation skips them.
     lengths = ("side", "breadth", *NUMBERS)
     found = [i for i, key in enumerate(lengths) if isinstance(getattr(stage, key), tuple)]
     at = drawing.before_own(robots)

@@ -1,8 +1,8 @@
-"""What a robot observes: the one place that says which entries there are, in which order.
+"""Observations: the only place that defines which entries exist, and in which order.
 
-`INPUTS` is the table of them, `layout` describes them to everybody else: policy files, judges,
-exports and tests take names, units and sizes from there. A new input is one row of `INPUTS` and,
-where it needs something new, one field of `Readings`.
+`INPUTS` is the table of built-in entries. `layout` describes them to other modules. Policy files,
+evaluations, exports and tests take names, units and sizes from it. To add an input, add one row to
+`INPUTS` and, if the input is a new quantity, one field to `Readings`.
 """
 
 import math
@@ -22,14 +22,14 @@ SENSORS = epuck.SENSORS
 
 
 class Readings(NamedTuple):
-    """What there is to put into an observation, before it is scaled.
+    """Quantities that enter an observation, before scaling.
 
     Attributes:
-      infrared: [..., K] m or counts, as the encoding has it.
+      infrared: [..., K] m or counts, depending on the encoding.
       distance: [...] to the target, m.
       bearing: [...] of the target, rad.
-      own: [..., E] what observations of an extension return; None if there are none.
-      heard: [..., K W] of the nearest neighbours; None if robots do not hear.
+      own: [..., E] observations of an extension; None without any.
+      heard: [..., K W] nearest neighbours; None without neighbour messages.
     """
 
     infrared: Array
@@ -40,7 +40,7 @@ class Readings(NamedTuple):
 
 
 class Coding(NamedTuple):
-    """How an encoding writes a quantity: (quantity - offset) / scale, both in `unit`."""
+    """Scaling of a quantity in an encoding: (quantity - offset) / scale, both in `unit`."""
 
     unit: str
     offset: float = 0.0
@@ -51,9 +51,9 @@ class Input(NamedTuple):
     """Entries of an observation that belong together.
 
     Attributes:
-      names: of the entries.
-      read: takes them [..., len(names)] out of the readings.
-      codings: by encoding.
+      names: names of the entries.
+      read: extracts the entries [..., len(names)] from the readings.
+      codings: scaling for each encoding.
     """
 
     names: tuple[str, ...]
@@ -61,9 +61,9 @@ class Input(NamedTuple):
     codings: Mapping[Encoding, Coding]
 
 
-# The paper says ten and names nine; the tenth is the bearing, as in the published example that the
-# task comes from. `webots` scales as deepworlds does, find_and_avoid (commit 60b8fc4a): counts /
-# 1023, not clipped; distance / 1.5 m; (bearing + pi) / (2 pi), so that 0.5 is dead ahead.
+# The paper says ten inputs and names nine. The tenth is the bearing, as in the published example
+# that the task is based on. `webots` scales as find_and_avoid of deepworlds does (commit 60b8fc4a):
+# counts / 1023 without clipping; distance / 1.5 m; (bearing + pi) / (2 pi), so 0.5 is dead ahead.
 INPUTS = (
     Input(
         tuple(f"infrared_{i}" for i in range(SENSORS)),
@@ -84,7 +84,7 @@ INPUTS = (
 
 
 class Layout(NamedTuple):
-    """What the entries are: (quantity - offset) / scale.
+    """Description of an observation's entries: each is (quantity - offset) / scale.
 
     Attributes:
       names: [O] of the entries.
@@ -109,12 +109,12 @@ def layout(
     own: Sequence[Observation] = (),
     neighbours: NeighboursConfig | None = None,
 ) -> Layout:
-    """Lays an observation out: the built-in inputs, those of an extension, then neighbours.
+    """Lays out an observation: built-in inputs, observations of an extension, then neighbours.
 
     Args:
-      encoding: how built-in quantities are written.
-      own: observations of an extension, in the order in which they follow.
-      neighbours: what is heard; None if nothing.
+      encoding: encoding of the built-in quantities.
+      own: observations of an extension, in order.
+      neighbours: neighbour settings; None without neighbour messages.
 
     Returns:
       The layout.
@@ -126,7 +126,7 @@ def layout(
 
 
 def _neighbour_rows(neighbours: NeighboursConfig) -> list[tuple[str, str, float, float]]:
-    """Lists name, unit, offset and scale of what is heard, the nearest neighbour first."""
+    """Lists name, unit, offset and scale of all neighbour entries, the nearest neighbour first."""
     one = [("", "1", 1.0), ("_distance", "m", neighbours.range)]
     one += [(f"_bearing_{part}", "1", 1.0) for part in ("cos", "sin")]
     one += [(f"_message_{i}", "1", 1.0) for i in range(neighbours.message_size)]
@@ -138,26 +138,26 @@ def _neighbour_rows(neighbours: NeighboursConfig) -> list[tuple[str, str, float,
 
 
 def stacked_names(names: Sequence[str], history: int) -> tuple[str, ...]:
-    """Names the entries of a policy that takes several observations.
+    """Returns the input names of a policy that takes several observations.
 
     Args:
-      names: [O] of one observation.
-      history: k, how many it takes.
+      names: [O] names of one observation's entries.
+      history: number of observations, k.
 
     Returns:
-      [k O] the names as they are of what is seen now, then those of 1, 2, ... control steps before,
-      as `target_distance[-1]`.
+      [k O] names: first unchanged for the current observation, then for those 1, 2, ... control
+      steps ago, as in `target_distance[-1]`.
     """
     marks = ["", *(f"[-{age}]" for age in range(1, history))]
     return tuple(f"{name}{mark}" for mark in marks for name in names)
 
 
 def stack(fresh: Array, before: Array, xp: Any) -> Array:
-    """Puts an observation before those that were seen before it, of which the oldest goes.
+    """Prepends an observation to the stack of earlier ones and drops the oldest.
 
     Args:
-      fresh: [..., O] what is seen now.
-      before: [..., k O] the stack one control step before; zeros where an episode begins.
+      fresh: [..., O] current observation.
+      before: [..., k O] stack of the previous control step; zeros at the start of an episode.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
@@ -177,16 +177,16 @@ def describe(
     own: Sequence[Observation] = (),
     neighbours: NeighboursConfig | None = None,
 ) -> dict[str, Any]:
-    """Describes what a policy observes, as plain data for its file.
+    """Describes the observation of a policy as plain data for its file.
 
     Args:
-      encoding: how built-in quantities are written.
+      encoding: encoding of the built-in quantities.
       own: observations of an extension.
-      neighbours: what is heard; None if nothing.
+      neighbours: neighbour settings; None without neighbour messages.
 
     Returns:
-      `names`, `encoding`, and the layout's `units`, `offset` and `scale`; with hearing also
-      `neighbours`: `count`, `range` (m) and `message_size`.
+      `names`, `encoding`, and the layout's `units`, `offset` and `scale`. With neighbour messages
+      also `neighbours`: `count`, `range` (m) and `message_size`.
     """
     found = {key: list(value) for key, value in layout(encoding, own, neighbours)._asdict().items()}
     heard = {} if not neighbours or not neighbours.count else {"neighbours": to_dict(neighbours)}
@@ -194,7 +194,7 @@ def describe(
 
 
 def to_target(pose: Array, target: Array, xp: Any) -> tuple[Array, Array]:
-    """Distance and bearing of each robot's own target.
+    """Computes distance and bearing of each robot's own target.
 
     Args:
       pose: [..., 3] x (m), y (m), yaw (rad).
@@ -211,15 +211,15 @@ def to_target(pose: Array, target: Array, xp: Any) -> tuple[Array, Array]:
 
 
 def observe(readings: Readings, layout: Layout, xp: Any) -> Array:
-    """Puts an observation together in the order of the layout.
+    """Assembles an observation in the order of the layout.
 
     Args:
-      readings: what there is.
-      layout: what the entries are.
+      readings: the quantities.
+      layout: names, units and scaling of the entries.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [..., O] float32, scaled as the layout says.
+      [..., O] float32, scaled as in the layout.
     """
     parts = [each.read(readings) for each in INPUTS]
     parts += [] if readings.own is None else [readings.own]
@@ -232,7 +232,7 @@ def observe(readings: Readings, layout: Layout, xp: Any) -> Array:
 
 
 class View(NamedTuple):
-    """One arena as an observation of an extension may look at it: the truth, without noise.
+    """Exact, noise-free state of one arena, the input of an extension's observations.
 
     Attributes:
       pose: [R, 3] x (m), y (m), yaw (rad).
@@ -240,8 +240,9 @@ class View(NamedTuple):
       distance: [R] to the own target, m.
       bearing: [R] of the own target, rad.
       infrared: [R, K] length of each ray, m.
-      present: [R] whether the robot takes part, bool.
-      arrived: [R] whether it has arrived, bool; by `task.arrival=hold`, is within its target now.
+      present: [R] whether the robot is present, bool.
+      arrived: [R] whether the robot has arrived, bool; with `task.arrival=hold`, whether it is
+        within its target now.
       side: [] of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
       obstacle_present: [M] bool.

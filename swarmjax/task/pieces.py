@@ -1,4 +1,4 @@
-"""Which pieces of an extension a task uses. No JAX; what they compute is in `extended.py`."""
+"""Selects the extension pieces that a task uses, without JAX; `extended.py` runs them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,9 +16,9 @@ class Chosen(NamedTuple):
     """The pieces that a task uses.
 
     Attributes:
-      observations: in the order in which they follow the built-in inputs.
-      terms: of the reward, with their weights; none of weight 0.
-      drawings: ways of drawing levels.
+      observations: in order, placed after the built-in inputs.
+      terms: reward terms with non-zero weights.
+      drawings: level drawings.
     """
 
     observations: tuple[Observation, ...]
@@ -30,16 +30,16 @@ def choose(extensions: Extensions, task: TaskConfig, stages: Sequence[StageConfi
     """Finds the pieces that a task and its stages name.
 
     Args:
-      extensions: the pieces there are.
-      task: names observations and weights; where it does not, all observations are used and each
-        term has the weight that it was made with.
-      stages: name ways of drawing levels.
+      extensions: the available pieces.
+      task: names observations and weights. By default, all observations are used, and each term
+        has its own default weight.
+      stages: name level drawings.
 
     Returns:
       The pieces.
 
     Raises:
-      ConfigError: if one that is named is missing.
+      ConfigError: a named piece is missing.
     """
     observations = {piece.name: piece for piece in extensions.observations}
     wanted = tuple(observations) if task.observations is None else task.observations
@@ -49,7 +49,7 @@ def choose(extensions: Extensions, task: TaskConfig, stages: Sequence[StageConfi
     for name in task.reward.extra:
         _check_named("task.reward.extra", name, terms)
     weighted = [(each, task.reward.extra.get(name, each.weight)) for name, each in terms.items()]
-    stack(stages, extensions.levels)  # refuses one that is missing
+    stack(stages, extensions.levels)  # raises if one is missing
     return Chosen(
         observations=tuple(observations[name] for name in wanted),
         terms=tuple((piece, weight) for piece, weight in weighted if weight),
@@ -58,17 +58,17 @@ def choose(extensions: Extensions, task: TaskConfig, stages: Sequence[StageConfi
 
 
 def resolve(extensions: Extensions, task: TaskConfig) -> TaskConfig:
-    """Says in full which pieces a task uses, so that its config alone tells.
+    """Fills in the pieces that a task uses, so that its config names all of them.
 
     Args:
-      extensions: the pieces there are.
-      task: what was given.
+      extensions: the available pieces.
+      task: the task as given.
 
     Returns:
       The task with all its observations and weights named.
 
     Raises:
-      ConfigError: if one that is named is missing.
+      ConfigError: a named piece is missing.
     """
     names = tuple(piece.name for piece in choose(extensions, task, ()).observations)
     weights = ByName({piece.name: piece.weight for piece in extensions.rewards})

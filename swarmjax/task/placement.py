@@ -1,8 +1,8 @@
-"""Placing things one after the other on the points of a lattice, in whole numbers.
+"""Places objects one after the other on the points of a lattice, in integers.
 
-Integer arithmetic makes NumPy and JAX choose the same point from the same uniform number. The
-unit is 1/4096 m: a power of two, so that metres come out of it exactly, and so large that squared
-distances within the largest arena fit an int32.
+With integer arithmetic, NumPy and JAX choose the same point from the same uniform number. The unit
+is 1/4096 m. It is a power of two, so it converts to metres exactly. It is large enough that
+squared distances within the largest arena fit an int32.
 """
 
 import math
@@ -15,18 +15,18 @@ Array = Any
 
 UNITS = 4096  # per metre; (4 m * sqrt(2) * 4096)**2 = 5.4e8 < 2**30
 LATTICE = 24  # points along a side
-MARGIN = 0.02  # m; least free space beside anything at the start
-TARGET_SPACING = 0.25  # m; least distance of targets where the arena has room
-_UNROLLED = 5  # things that are placed without a loop: XLA takes a second to compile twenty
-_FORBIDDEN = -(2**30)  # scores at or below half of this break a hard distance
+MARGIN = 0.02  # m; least free space around anything at the start
+TARGET_SPACING = 0.25  # m; least distance between targets where the arena has room
+_UNROLLED = 5  # objects placed without a loop; XLA takes a second to compile twenty
+_FORBIDDEN = -(2**30)  # a score at or below half of this violates a hard distance
 
 
 class Gap(NamedTuple):
     """Least distance between two centres, in units.
 
     Attributes:
-      hard: never less than this, if any point is that far.
-      soft: at least this where the arena has room.
+      hard: kept always, if any point is that far away.
+      soft: kept where the arena has room.
     """
 
     hard: Array
@@ -34,7 +34,7 @@ class Gap(NamedTuple):
 
 
 class Gaps(NamedTuple):
-    """Distances between targets, from starts to targets, and between starts."""
+    """Least distances between targets, from starts to targets, and between starts."""
 
     target: Gap
     from_target: Gap
@@ -42,32 +42,32 @@ class Gaps(NamedTuple):
 
 
 def gaps_of(hull: float, reach: float) -> Gaps:
-    """Works out how far apart starts and targets are.
+    """Computes the least distances between starts and targets.
 
     Args:
       hull: radius of a robot, m.
-      reach: radius of the zone of arrival, m.
+      reach: radius of the arrival zone, m.
 
     Returns:
       Distances in units.
     """
-    # Two robots parked on the near sides of their targets let a third one through.
+    # A third robot must fit between two robots parked on the near sides of their targets.
     through = max(TARGET_SPACING, 2.0 * reach + 4.0 * hull)
     return Gaps(
         target=Gap(round_up(2.0 * hull + 2.0 * MARGIN), round_up(through)),
-        # No robot starts where it has arrived already; better, none starts where another may park.
+        # Hard: no robot starts within its arrival zone. Soft: none starts where one may park.
         from_target=Gap(round_up(reach + MARGIN), round_up(reach + 2.0 * hull + MARGIN)),
         start=Gap(round_up(2.0 * hull + MARGIN), round_up(2.0 * hull + 2.0 * MARGIN)),
     )
 
 
 def clearance(hull: float) -> int:
-    """Least distance of a robot's centre to a wall at the start, units."""
+    """Returns the least distance between a robot's centre and a wall at the start, units."""
     return round_up(hull + MARGIN)
 
 
 def round_up(metres: float) -> int:
-    """Rounds a length up to units, so that no distance comes out shorter than asked."""
+    """Rounds a length up to units, so that no distance falls below the requested one."""
     return math.ceil(metres * UNITS)
 
 
@@ -77,15 +77,15 @@ def units(metres: Array, xp: Any) -> Array:
 
 
 def metres(units: Array, xp: Any) -> Array:
-    """Turns units into metres (float32)."""
+    """Converts units to metres (float32)."""
     return units.astype(xp.float32) / UNITS
 
 
 def lattice(shift: Array, side: Array, xp: Any) -> Array:
-    """Points that cover a square around the origin, shifted by a part of their spacing.
+    """Returns points that cover a square around the origin, shifted by a part of their spacing.
 
     Args:
-      shift: [2] in [0, 1), of the spacing.
+      shift: [2] in [0, 1), as a share of the spacing.
       side: [] of the square, units.
       xp: `numpy` or `jax.numpy`.
 
@@ -101,7 +101,7 @@ def lattice(shift: Array, side: Array, xp: Any) -> Array:
 
 
 def score_walls(points: Array, side: Array, gap: Array, xp: Any) -> Array:
-    """Scores points by their distance to the walls, a hard one.
+    """Scores points by their distance to the walls, as a hard limit.
 
     Args:
       points: [P, 2] units.
@@ -110,25 +110,25 @@ def score_walls(points: Array, side: Array, gap: Array, xp: Any) -> Array:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [P] 0 where the distance is kept, far below where it is not.
+      [P] 0 where the distance is kept, very low where it is not.
     """
     spare = side // 2 - xp.max(xp.abs(points), axis=-1) - gap
     return xp.where(spare >= 0, 0, _FORBIDDEN + spare)
 
 
 def score_things(points: Array, centres: Array, there: Array, gap: Gap, xp: Any) -> Array:
-    """Scores points by their distances to things already placed.
+    """Scores points by their distances to objects already placed.
 
     Args:
       points: [P, 2] units.
-      centres: [N, 2] of the things, units.
-      there: [N] whether the thing counts.
+      centres: [N, 2] of the objects, units.
+      there: [N] whether the object is present.
       gap: distances to keep.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [P] 0 where all soft distances are kept; below, the lower the worse, where one is not; far
-      below where a hard one is not.
+      [P] 0 where all soft distances are kept, below 0 where one is violated, and very low where a
+      hard one is violated. Worse violations score lower.
     """
     apart = points[:, None, :] - centres[None, :, :]
     square = xp.sum(apart * apart, axis=-1)
@@ -146,23 +146,23 @@ def score_open(points: Array, is_open: Array, xp: Any) -> Array:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [P] 0 where a point is open, far below where it is not.
+      [P] 0 where a point is open, very low where it is not.
     """
     return xp.where(is_open, 0, _FORBIDDEN + 0 * points[:, 0])
 
 
 def score_rectangles(points: Array, rectangle: Array, there: Array, gap: int, xp: Any) -> Array:
-    """Scores points by their distances to rectangles that are not turned, a hard one.
+    """Scores points by their distances to axis-aligned rectangles, as a hard limit.
 
     Args:
       points: [P, 2] units.
       rectangle: [W, 4] x, y, half edges, units.
-      there: [W] whether the rectangle counts.
+      there: [W] whether the rectangle is present.
       gap: least distance, units.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [P] 0 where all distances are kept, far below where one is not.
+      [P] 0 where all distances are kept, very low where one is not.
     """
     apart = xp.abs(points[:, None, :] - rectangle[None, :, :2]) - rectangle[None, :, 2:]
     apart = xp.maximum(apart, 0)
@@ -174,18 +174,18 @@ def score_rectangles(points: Array, rectangle: Array, there: Array, gap: int, xp
 def place(
     points: Array, score: Array, picks: Array, there: Array, gap: Gap, xp: Any
 ) -> tuple[Array, Array]:
-    """Places things of one kind one after the other.
+    """Places objects of one kind one after the other.
 
     Args:
       points: [P, 2] candidates, units.
-      score: [P] of the candidates against everything else.
+      score: [P] scores of the candidates against everything else.
       picks: [N] uniform numbers in [0, 1).
-      there: [N] whether the thing is to be placed; it keeps others away only then.
-      gap: distances among these things.
+      there: [N] whether to place the object; only placed objects keep others away.
+      gap: least distances among these objects.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      Centres [N, 2] (units), and [N] whether the thing is there and keeps all hard distances.
+      Centres [N, 2] (units), and [N] whether the object is placed and keeps all hard distances.
     """
 
     def step(score: Array, one: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
@@ -199,12 +199,12 @@ def place(
 
 
 def _fold(step: Callable, state: Array, rows: tuple[Array, Array], xp: Any) -> tuple[Array, Array]:
-    """Calls `step` row by row, handing its state on; returns what it gave for each, stacked."""
+    """Calls `step` for each row, passing its state on, and stacks its results."""
     if xp is not np:
-        from jax import lax  # the judge draws levels without JAX
+        from jax import lax  # evaluations draw levels without JAX
 
-        # The score is a constant where all points are free. Without the barrier XLA searches it as
-        # it compiles, arena by arena: 105 s of two cores for 4,096 arenas that train on a trap.
+        # The score is a constant if all points are free. Without the barrier, XLA evaluates the
+        # search at compile time, arena by arena: 105 s on two cores for 4,096 arenas of a trap.
         state = lax.optimization_barrier(state)
         return lax.scan(step, state, rows, unroll=max(1, min(_UNROLLED, len(rows[0]))))[1]
     first, second = [], []
@@ -216,7 +216,7 @@ def _fold(step: Callable, state: Array, rows: tuple[Array, Array], xp: Any) -> t
 
 
 def _choose(score: Array, pick: Array, xp: Any) -> Array:
-    """Picks one of the points that score 0, each as likely as the next; else the best one."""
+    """Picks uniformly among the points that score 0; without any, picks the best point."""
     rank = xp.cumsum((score >= 0).astype(xp.int32))
     free = rank[-1]
     wanted = xp.floor(pick * free.astype(xp.float32)).astype(xp.int32)

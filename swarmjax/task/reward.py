@@ -1,8 +1,8 @@
-"""The reward: a table of small terms, each times its weight from the config.
+"""The reward: a sum of small terms, each multiplied by its weight from the config.
 
 Equation 3 of the paper is `progress` with weight 1 and `proximity` with weight -0.001.
-A new term is one function here, one row of `TERMS`, one weight in `RewardConfig`, one test. Terms
-of your own need no change here: `swarmjax.extension.reward_term`.
+To add a built-in term, add a function, a row of `TERMS`, a weight in `RewardConfig` and a test.
+Terms of an extension need no change here; see `swarmjax.extension.reward_term`.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,28 +19,28 @@ from swarmjax.task.config import RewardConfig
 
 
 class Step(NamedTuple):
-    """What a reward may look at: one control step of a swarm.
+    """One control step of a swarm, the input of reward terms.
 
     Attributes:
       distance_before: [R] to the target, m.
       distance: [R] to the target after the step, m.
       infrared: [R, K] ray lengths after the step, m.
       sensor_range: m.
-      arrives: [R] whether the robot arrived in this step; by `task.arrival=hold` whether all did,
-        which ends the episode.
+      arrives: [R] whether the robot arrived in this step; with `task.arrival=hold`, whether all
+        robots are within their targets, which ends the episode.
       contact_begins: [R, 3] whether a contact of each kind began in this step.
-      outside: [R] whether the robot had not arrived when the step began; None where that is so of
-        all that earn, as by `task.arrival=latch`.
+      outside: [R] whether the robot had not arrived when the step began; None if that holds for all
+        robots with a reward, as with `task.arrival=latch`.
       touching: [R, 3] whether the robot touches something of each kind after the step.
-      path_before: [R] along the shortest path to the target, m; None where the weights do not ask,
-        and in an extension.
+      path_before: [R] along the shortest path to the target, m; None without a path weight, and in
+        an extension.
       path: [R] after the step, m.
-      pose_before: [R, 3] x (m), y (m), yaw (rad); this and what follows for extensions alone, which
-        also find `outside` filled by both rules.
+      pose_before: [R, 3] x (m), y (m), yaw (rad). This field and those below are for extensions
+        only. For extensions, `outside` is set under both arrival rules.
       pose: [R, 3] after the step.
       action: [R, 2] clipped to -1..1, which spans the commands.
-      present: [R] whether the robot takes part, bool.
-      clock: [] control steps since the start, this one included, int32.
+      present: [R] whether the robot is present, bool.
+      clock: [] control steps since the start, including this one, int32.
     """
 
     distance_before: Array
@@ -61,52 +61,52 @@ class Step(NamedTuple):
 
 
 def progress(step: Step) -> Array:
-    """Metres nearer to the target: previous distance - current distance (equation 3)."""
+    """Returns metres nearer to the target: previous minus current distance (equation 3)."""
     return step.distance_before - step.distance
 
 
 def path_progress(step: Step) -> Array:
-    """Metres nearer to the target along the shortest path around walls and boxes."""
+    """Returns metres nearer to the target on the shortest path around walls and boxes."""
     return step.path_before - step.path
 
 
 def proximity(step: Step) -> Array:
-    """1 where any ray is shorter than the sensor's range, once a step (equation 3)."""
+    """Returns 1 if any ray is shorter than the sensor's range, at most once a step (equation 3)."""
     rays = step.infrared.shape[-1]
     nearest = least((step.infrared[..., i] for i in pieces(rays, jnp)), step.sensor_range, jnp)
     return _before_arrival(step, (nearest < step.sensor_range).astype(jnp.float32))
 
 
 def arrival(step: Step) -> Array:
-    """1 in the step in which the robot arrives; by hold, in which all have."""
+    """Returns 1 in the step in which the robot arrives; with hold, in which all have arrived."""
     return step.arrives.astype(jnp.float32)
 
 
 def contact(step: Step) -> Array:
-    """How many contacts began in this step, of whatever kind."""
+    """Returns how many contacts of any kind began in this step."""
     return jnp.sum(step.contact_begins, axis=-1).astype(jnp.float32)
 
 
 def robot_contact(step: Step) -> Array:
-    """1 where a contact with another robot began in this step."""
+    """Returns 1 if a contact with another robot began in this step."""
     return step.contact_begins[..., KINDS.index("robot")].astype(jnp.float32)
 
 
 def touching(step: Step) -> Array:
-    """1 where the robot touches something of any kind after the step.
+    """Returns 1 if the robot touches something of any kind after the step.
 
-    `contact` alone is paid once however long a robot then leans against a wall.
+    `contact` counts a contact only once, however long a robot then leans against a wall.
     """
     return jnp.any(step.touching, axis=-1).astype(jnp.float32)
 
 
 def step_penalty(step: Step) -> Array:
-    """1 for every control step that begins before arrival."""
+    """Returns 1 for every control step that begins before arrival."""
     return _before_arrival(step, jnp.ones_like(step.distance))
 
 
 def _before_arrival(step: Step, price: Array) -> Array:
-    """Charges a price [R] to the robots that had not arrived."""
+    """Returns the price [R] for robots that had not arrived, and 0 for others."""
     return price if step.outside is None else jnp.where(step.outside, price, 0.0)
 
 
@@ -123,7 +123,7 @@ TERMS: dict[str, Callable[[Step], Array]] = {
 
 
 def total(step: Step, weights: RewardConfig, own: Sequence[tuple[RewardTerm, float]] = ()) -> Array:
-    """Adds the weighted terms up.
+    """Sums the weighted terms.
 
     Args:
       step: one control step.

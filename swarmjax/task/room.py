@@ -1,4 +1,4 @@
-"""Whether the map or the layout of a stage has room for its robots."""
+"""Checks that the map or the layout of a stage has room for its robots."""
 
 from collections.abc import Sequence
 
@@ -12,23 +12,23 @@ from swarmjax.task.level import Level, Spacing
 from swarmjax.task.placement import MARGIN
 from swarmjax.task.stage_config import StageConfig
 
-_TRIED = 16  # levels of a map that are looked at
-_ROUNDING = 1.0 / 1024  # m; points are rounded to units of 1/4096 m, each way
-_BESIDE = 0.003  # m, between a hull and either jamb of the narrowest door
+_TRIED = 16  # levels of a map to check
+_ROUNDING = 1.0 / 1024  # m; points are rounded to units of 1/4096 m, in each direction
+_BESIDE = 0.003  # m, between the hull and each side of the narrowest door
 
 
 def check(
     stages: Sequence[StageConfig], spacing: Spacing, drawings: Sequence[LevelDrawing] = ()
 ) -> None:
-    """Refuses maps and layouts in which robots or targets would be on top of each other.
+    """Refuses maps and layouts in which robots or targets would overlap.
 
     Args:
-      stages: those that will be run.
+      stages: stages to run.
       spacing: sizes.
-      drawings: an extension's ways of drawing levels.
+      drawings: level drawings of an extension.
 
     Raises:
-      ConfigError: naming the stage, what has no room, and what would help.
+      ConfigError: a stage has too little room; the message says for what, and how to fix it.
     """
     for stage in stages:
         if stage.map:

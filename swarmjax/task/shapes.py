@@ -1,7 +1,7 @@
-"""Obstacles of other shapes than the trained box, put together of boxes within its outer circle.
+"""Obstacles of other shapes than the trained box, composed of boxes within its outer circle.
 
-A level keeps its distances from an obstacle's outer circle, so that all of them hold for anything
-inside it; and boxes are what both engines and the analytic sensors know. NumPy.
+A level keeps distances from an obstacle's outer circle, so they hold for any shape inside it. The
+shapes consist of boxes because both engines and the analytic sensors support boxes. NumPy only.
 """
 
 import math
@@ -11,12 +11,12 @@ import numpy as np
 
 from swarmjax.task.level import Level
 
-# What obstacles of a random level may look like where a policy is judged; training knows boxes.
+# Shapes of a random level's obstacles in an evaluation; training uses boxes only.
 Shape = Literal["box", "bar", "cross", "ell", "pillar"]
 
-HALF_THICKNESS = 0.005  # m, of plates; chosen: a board that stands upright
-# Places in whole parts of a metre, which float32 holds exactly, so that a level is the same to the
-# last bit wherever sine and cosine round otherwise.
+HALF_THICKNESS = 0.005  # m, of plates; our choice: a board that stands upright
+# Coordinates are rounded to binary fractions of a metre, which float32 holds exactly. A level is
+# then identical to the last bit even where sine and cosine round differently.
 _GRID = 2.0**20
 
 
@@ -31,7 +31,7 @@ class _Part(NamedTuple):
 
 
 def _parts(shape: Shape, half: float) -> list[_Part]:
-    """Boxes of a shape within the circle about a square of half edge `half`, m."""
+    """Returns the boxes of a shape, within the outer circle of a square of half edge `half`, m."""
     outer, thin = half * math.sqrt(2.0), min(HALF_THICKNESS, 0.5 * half)
     bar = _Part(0.0, 0.0, 0.0, math.sqrt(outer**2 - thin**2), thin)
     quarter = 0.5 * math.pi
@@ -42,27 +42,27 @@ def _parts(shape: Shape, half: float) -> list[_Part]:
     if shape == "ell":  # two sides of the square
         aside = half - thin
         return [_Part(0.0, -aside, 0.0, half, thin), _Part(-aside, 0.0, quarter, half, thin)]
-    if shape == "pillar":  # a regular octagon is the union of four boxes, an edge at either end
+    if shape == "pillar":  # four boxes form a regular octagon, whose edges are their ends
         length, width = outer * math.cos(math.pi / 8), outer * math.sin(math.pi / 8)
         return [_Part(0.0, 0.0, 0.25 * math.pi * i, length, width) for i in range(4)]
     return [_Part(0.0, 0.0, 0.0, half, half)]
 
 
 def boxes_of(shape: Shape) -> int:
-    """How many boxes an obstacle of a shape is put together of."""
+    """Returns how many boxes an obstacle of a shape consists of."""
     return len(_parts(shape, 1.0))
 
 
 def expand(level: Level, shape: Shape) -> Level:
-    """Puts obstacles of a shape in the place of a random level's boxes.
+    """Replaces the boxes of a random level with obstacles of another shape.
 
     Args:
-      level: as drawn, one arena's; NumPy.
-      shape: `box` leaves it as it is.
+      level: of one arena, as drawn; NumPy.
+      shape: shape of the obstacles; `box` changes nothing.
 
     Returns:
-      The level with P boxes for each of its M obstacles, [M * P, 5]; an obstacle's boxes stand one
-      after the other.
+      The level with P boxes for each of its M obstacles, [M * P, 5]. The boxes of an obstacle are
+      consecutive.
     """
     if shape == "box":
         return level
@@ -74,7 +74,7 @@ def expand(level: Level, shape: Shape) -> Level:
 
 
 def _place(box: np.ndarray, part: _Part) -> list[float]:
-    """Puts a part where the obstacle [5] stands."""
+    """Places a part at the obstacle [5]."""
     x, y, yaw = (float(value) for value in box[:3])
     cos, sin = math.cos(yaw), math.sin(yaw)
     place = (x + cos * part.x - sin * part.y, y + sin * part.x + cos * part.y)

@@ -1,4 +1,4 @@
-"""Stages of the curriculum as arrays: a stage is values, never shapes."""
+"""Stages of the curriculum as arrays; a stage changes their values, never their shapes."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -22,18 +22,18 @@ class Stage(NamedTuple):
     """One stage ([]) or all of them ([S]).
 
     Attributes:
-      robots: how many are there, int32.
-      obstacles: how many are there, int32.
-      side: of the arena, or the smallest that it may have, m.
-      largest_side: the largest that it may have, m; where it is larger, each level draws its own.
+      robots: number of robots, int32.
+      obstacles: number of obstacles, int32.
+      side: of the arena, or the smallest side it may have, m.
+      largest_side: largest side, m; if it exceeds `side`, each level draws its own.
       obstacle_size: edge of the boxes of a random level, m.
-      fixed: the paper's fixed level instead of a random one, bool.
-      fence: the obstacle of a fixed level is the fence instead of boxes, bool.
-      drawing: 1 + index of the extension's way of drawing its levels, 0 for none, int32.
+      fixed: whether the level is the paper's fixed one instead of a random one, bool.
+      fence: whether a fixed level has the fence instead of boxes, bool.
+      drawing: 1 + index of the extension drawing of its levels, 0 for none, int32.
       map: the maps; None if no stage has one.
-      layouts: numbers of those that stages are laid out by, by kind; None if none is.
-      laid_out: whether the stage is laid out, if all are; None if any is not, so that its level is
-        placed at random, or fixed.
+      layouts: numbers of the stages' layouts, by kind; None if no stage has one.
+      laid_out: whether the stage has a layout, if all stages do; None if any stage does not, and
+        its levels are random or fixed.
     """
 
     robots: Array
@@ -54,10 +54,10 @@ def stack(stages: Sequence[StageConfig], drawings: Sequence[LevelDrawing] = ()) 
 
     Args:
       stages: the stages.
-      drawings: an extension's ways of drawing levels.
+      drawings: level drawings of an extension.
 
     Raises:
-      ConfigError: if a fixed level has no room for its robots, or a way of drawing is missing.
+      ConfigError: a fixed level has no room for its robots, or a level drawing is missing.
     """
     names = [piece.name for piece in drawings]
     for stage in stages:
@@ -78,7 +78,7 @@ def stack(stages: Sequence[StageConfig], drawings: Sequence[LevelDrawing] = ()) 
 
 
 def single(stage: StageConfig, drawings: Sequence[LevelDrawing] = ()) -> Stage:
-    """Returns one configured stage, fields [] of NumPy, with the same checks as `stack`."""
+    """Returns one configured stage, with NumPy fields [], after the same checks as `stack`."""
     return select(stack([stage], drawings), np.intp(0))
 
 
@@ -97,12 +97,12 @@ def select(stages: Stage, index: Array) -> Stage:
 
 
 def largest_half(stages: Sequence[StageConfig]) -> float:
-    """Half the longest edge of any obstacle of these stages, m: what the model is compiled for."""
+    """Returns half the longest obstacle edge in these stages, m; the model is compiled for it."""
     return max(_half(stage) for stage in stages)
 
 
 def _check_fixed(stage: StageConfig) -> None:
-    """Refuses a fixed level whose row of starts is too short, or that runs out of boxes."""
+    """Refuses a fixed level with more robots or obstacles than it has room for."""
     side = stage.sides[0]  # a fixed level has one
     most = {"robots": fixed_level.most_robots(side), "obstacles": len(fixed_level.BOXES)}
     for key, limit in most.items():
@@ -114,7 +114,7 @@ def _check_fixed(stage: StageConfig) -> None:
 
 
 def _drawing(stage: StageConfig, drawings: Sequence[str]) -> int:
-    """1 + index of the way in which a stage's levels are drawn; 0 if it is built in."""
+    """Returns 1 + index of the extension drawing of a stage's levels; 0 without one."""
     if stage.level in BUILT_IN:
         return 0
     if stage.level not in drawings:
@@ -127,7 +127,7 @@ def _drawing(stage: StageConfig, drawings: Sequence[str]) -> int:
 
 
 def _half(stage: StageConfig) -> float:
-    """Half the longest edge of the obstacles of a stage, m."""
+    """Returns half the longest edge of a stage's obstacles, m."""
     if stage.laid_out is not None:
         return 0.5 * stage.sides[1] + THICKNESS / UNITS  # no wall is longer than the arena
     if (drawn := stage.drawn_map) is not None:

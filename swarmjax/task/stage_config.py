@@ -1,4 +1,4 @@
-"""A stage: its settings, the room that a level needs, and grids of stages."""
+"""Settings of a stage, the arena size that a level needs, and grids of stages."""
 
 import functools
 import itertools
@@ -17,38 +17,38 @@ from swarmjax.task.layouts.drawing import Kind
 from swarmjax.task.layouts.site import NUMBERS, ArenaLayout, Demand
 from swarmjax.task.placement import UNITS
 
-# The room that a random level asks for. A start and a target each take a square of 0.15 m (two
-# hulls of 0.074 m side by side); an obstacle takes the square about its circumscribed circle,
-# widened by a passage through which one robot fits with 13 mm to spare on either side; along the
-# walls a border of half a passage stays free.
-DISC = 0.15  # m, edge of the square about the disc of a start or a target
+# Area that a random level needs. A start and a target each take a square of 0.15 m (two hulls of
+# 0.074 m side by side). An obstacle takes the square around its circumscribed circle, widened by a
+# passage in which one robot has 13 mm to spare on either side. Along the walls, a border of half a
+# passage stays free.
+DISC = 0.15  # m, edge of the square around the disc of a start or a target
 
 
 PASSAGE = 0.10  # m; between obstacles, and between an obstacle and a wall
 
 
-FILLING = 0.4  # boxes per square of a grid that random placing surely reaches
+FILLING = 0.4  # share of a square grid's boxes that random placement is sure to place
 
 
-BUILT_IN = ("random", "fixed", "map", *LAYOUTS)  # ways of drawing levels
-_OR = "or the name of a drawing of extensions"
+BUILT_IN = ("random", "fixed", "map", *LAYOUTS)  # built-in kinds of levels
+_OR = "or the name of an extension's level drawing"
 
 
 _MOST_OBSTACLES = 64
-_SMALLEST_CELL = 0.08  # m; a robot of 0.074 m and 3 mm on either side
+_SMALLEST_CELL = 0.08  # m; a robot of 0.074 m with 3 mm on either side
 
 
 def complete(stage: dict[str, Any]) -> dict[str, Any]:
-    """Adds to a stage with a map what the map says.
+    """Fills in the settings of a stage that follow from its map or layout.
 
     Args:
-        stage: plain data; `map` is a text, or its rows.
+        stage: plain data; `map` is a text or a list of its rows.
 
     Returns:
         The data, with `side`, `obstacles` and `level` if there is a map.
 
     Raises:
-        ConfigError: the map is unsound.
+        ConfigError: the map is invalid.
     """
     text = stage.get("map")
     if not text:
@@ -65,7 +65,7 @@ def complete(stage: dict[str, Any]) -> dict[str, Any]:
 
 
 def _with_walls(stage: dict[str, Any]) -> dict[str, Any]:
-    """Adds to a stage with a layout how many walls it has, unless it says so itself."""
+    """Fills in the number of walls of a stage with a layout, unless it is given."""
     if stage.get("level") not in LAYOUTS or "obstacles" in stage:
         return stage
     cells = section.convert(int | None, stage.get("cells"), "stage.cells")
@@ -90,12 +90,12 @@ _Cell = tuple[int, int, float | tuple[float, float]]  # robots, obstacles, side
 
 @dataclass(frozen=True, kw_only=True)
 class StageConfig(Section):
-    """One stage: how many robots, how large an arena, which obstacles."""
+    """One stage: number of robots, arena size and obstacles."""
 
-    name: str = field(metadata=about("name of the stage, that of its file"))
+    name: str = field(metadata=about("name of the stage: the name of its file"))
     robots: int = field(metadata=about("active robots", 1, 100))
     side: float | tuple[float, float] = field(
-        metadata=about("side of the square arena, m; a range: drawn anew for each level", 0.4, 4.0)
+        metadata=about("side of the square arena, m; a range: each level draws a side", 0.4, 4.0)
     )
     obstacles: int = field(default=0, metadata=about("obstacles", 0, _MOST_OBSTACLES))
     obstacle_size: float = field(
@@ -104,9 +104,9 @@ class StageConfig(Section):
     level: str = field(
         default="random",
         metadata=about(
-            "random: a new one every episode; fixed: always the same; map: the walls of map, with "
-            f"new starts and targets; {', '.join(LAYOUTS)}: new walls, laid out so; or a drawing "
-            "of extensions"
+            "random: new in every episode; fixed: always the same; map: the walls of map, with "
+            f"new starts and targets; {', '.join(LAYOUTS)}: new walls of this layout; or the name "
+            "of an extension's level drawing"
         ),
     )
     layout: Literal["boxes", "fence"] = field(
@@ -116,17 +116,15 @@ class StageConfig(Section):
         default=(),
         metadata=about(
             "rows of the arena as text: # wall, . floor, S start area, T target area, a letter and "
-            "its capital for one robot; it says side, obstacles and level"
+            "its capital for one robot; sets side, obstacles and level"
         ),
     )
-    cell: float = field(
-        default=0.12, metadata=about("edge of a letter of map, m", _SMALLEST_CELL, 1.0)
-    )
+    cell: float = field(default=0.12, metadata=about("edge of a map cell, m", _SMALLEST_CELL, 1.0))
 
     breadth: _Length = field(
         default=None,
         metadata=about(
-            "extent across side of a layout's arena, m, or a range; null: as long as side", 0.2, 4.0
+            "breadth of a layout's arena, m, or a range; null: as long as side", 0.2, 4.0
         ),
     )
     gap: _Length = field(
@@ -139,20 +137,22 @@ class StageConfig(Section):
             "free width of a trap, or of a corridor at its bay, m, or a range", 0.1, 2.0
         ),
     )
-    depth: _Length = field(default=None, metadata=about("of a trap, m, or a range", 0.05, 2.0))
+    depth: _Length = field(
+        default=None, metadata=about("depth of a trap, m, or a range", 0.05, 2.0)
+    )
     length: _Length = field(
-        default=None, metadata=about("of a fence, or of a bay, m, or a range", 0.1, 4.0)
+        default=None, metadata=about("length of a fence or a bay, m, or a range", 0.1, 4.0)
     )
     radius: _Length = field(
-        default=None, metadata=about("of the circle of starts, m, or a range", 0.1, 1.9)
+        default=None, metadata=about("radius of the circle of starts, m, or a range", 0.1, 1.9)
     )
     apart: _Length = field(
         default=None,
         metadata=about(
-            "distance between targets, or of targets from a door, m, or a range", 0.05, 1
+            "distance between targets, or from targets to a door, m, or a range", 0.05, 1
         ),
     )
-    cells: int | None = field(default=None, metadata=about("of a maze, along its side", 2, 6))
+    cells: int | None = field(default=None, metadata=about("cells along a maze's side", 2, 6))
 
     def _check(self) -> None:
         if not re.fullmatch(r"[a-z][a-z0-9_]{0,39}", self.level):
@@ -253,20 +253,20 @@ class StageConfig(Section):
         return " ".join(f"{key}={show(getattr(self, key))}" for key in keys)
 
     def smallest(self, key: str) -> float | None:
-        """Returns the smaller end of one of the numbers of a layout, m; None without it."""
+        """Returns the smaller end of a layout's number, m; None if it is not set."""
         given = getattr(self, key)
         return None if given is None else _ends(given)[0]
 
     @property
     def kind(self) -> Kind | None:
-        """What of its layout is compiled in; None without one."""
+        """The part of the layout that is compiled in; None without a layout."""
         if self.level not in LAYOUTS:
             return None
         return Kind(self.level, self.cells or 0, self.breadth is not None)
 
     @property
     def laid_out(self) -> tuple[Kind, dict[str, Any]] | None:
-        """The layout with its numbers in units, as `drawing.stack` takes them; None without one."""
+        """The layout and its numbers in units, as `drawing.stack` takes them; None without one."""
         if self.kind is None:
             return None
         ends = [_ends(getattr(self, key) or 0.0) for key in NUMBERS]
@@ -289,13 +289,15 @@ class StageConfig(Section):
 
 
 def smallest_side(stage: StageConfig) -> float:
-    """Side of the smallest arena in which a level of the stage can be laid out.
+    """Returns the smallest side of an arena that has room for a level of the stage.
 
     The free square (side - 0.10)^2 must hold two squares of 0.15^2 for each robot and one of
-    (obstacle_size * sqrt(2) + 0.10)^2 for each obstacle, which leaves more than a passage on
-    either side of any one obstacle. Those of a random level, placed one after the other, may fill
-    FILLING of it: discs that are placed so jam at 0.547 of the area (Feder 1980), which is 0.70 of
-    a square grid of them, and the walls cut some off.
+    (obstacle_size * sqrt(2) + 0.10)^2 for each obstacle. This leaves more than a passage on either
+    side of any single obstacle.
+
+    A random level places its obstacles one after the other. They may take at most the share
+    FILLING of the free square. Discs placed this way jam at 0.547 of the area (Feder 1980), which
+    is 0.70 of a square grid of discs. The walls reduce this further.
 
     Args:
         stage: the stage; its `side` is not read.
@@ -303,19 +305,19 @@ def smallest_side(stage: StageConfig) -> float:
     Returns:
         The side, m.
     """
-    random = stage.level != "fixed"  # a drawing of an extension changes a random level
+    random = stage.level != "fixed"  # an extension's drawing starts from a random level
     return _smallest_side(stage.robots, stage.obstacles, stage.obstacle_size, random=random)
 
 
 def make_room(sim: SimConfig, stages: Sequence[StageConfig]) -> SimConfig:
-    """Say how many robots and obstacles are compiled in, where the settings leave it open.
+    """Sets the numbers of robots and obstacles to compile for, unless the settings give them.
 
     Args:
         sim: the settings.
-        stages: that must fit.
+        stages: stages that must fit.
 
     Returns:
-        The settings with numbers for both: 5 and 4 at least, so that a curriculum's stages share a
+        The settings with both numbers: at least 5 and 4, so that a curriculum's stages share a
         program and its checkpoints.
     """
     robots = max([sim.robots, *(stage.robots for stage in stages)])
@@ -336,7 +338,7 @@ def _smallest_side(robots: int, obstacles: int, obstacle_size: float, *, random:
 
 
 def _whole(length: float | tuple[float, float]) -> list[int]:
-    """Rounds an extent to an even number of units, so that its half is a whole one."""
+    """Rounds an extent to an even number of units, so that its half is a whole number of units."""
     return [2 * round(end * UNITS / 2) for end in _ends(length)]
 
 
@@ -350,14 +352,14 @@ def _ends(side: float | tuple[float, float]) -> tuple[float, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class GridConfig(Section):
-    """Stages: every number of robots with every number of obstacles in every arena."""
+    """A grid of stages: all combinations of numbers of robots, numbers of obstacles and sides."""
 
     robots: tuple[int, ...] = field(metadata=about("active robots", 1, 100))
     obstacles: tuple[int, ...] = field(
         default=(0,), metadata=about("obstacles", 0, _MOST_OBSTACLES)
     )
     side: tuple[float | tuple[float, float], ...] = field(
-        metadata=about("sides of the square arena, m, or ranges that they are drawn from", 0.4, 4.0)
+        metadata=about("sides of the square arena, m; a range: each level draws a side", 0.4, 4.0)
     )
     obstacle_size: float = field(
         default=0.10, metadata=about("edge of the square boxes, m", 0.02, 0.3)
@@ -370,14 +372,14 @@ class GridConfig(Section):
         if not self.stages():
             least = min(self._least(cell) for cell in self._cells())
             raise ConfigError(
-                f"side is {show(self.side)}, which leaves no cell: the smallest swarm with the "
-                f"fewest obstacles needs {math.ceil(100 * least) / 100}."
+                f"side is {show(self.side)}, too small for every cell of the grid: the fewest "
+                f"robots and obstacles need {math.ceil(100 * least) / 100}."
             )
 
     def stages(self) -> tuple[StageConfig, ...]:
-        """Make the stages, the side changing fastest and the robots slowest.
+        """Creates the stages, with sides varying fastest and robots slowest.
 
-        Cells whose arena is too small for what is in them are left out.
+        Combinations that do not fit into their arena are left out.
         """
         cells = [cell for cell in self._cells() if _ends(cell[2])[0] >= self._least(cell)]
         return tuple(
@@ -399,7 +401,7 @@ class GridConfig(Section):
 
 
 def _cell_name(robots: int, obstacles: int, side: float | tuple[float, float]) -> str:
-    """Name a cell of a grid by its numbers, lengths in cm, as r5-o3-s120 or r5-o3-s50-120."""
+    """Names a cell of a grid by its numbers, lengths in cm, as r5-o3-s120 or r5-o3-s50-120."""
     ends = side if isinstance(side, tuple) else (side,)
     lengths = "-".join(f"{100 * length:.6g}".replace(".", "_") for length in ends)
     return f"r{robots}-o{obstacles}-s{lengths}"

@@ -1,4 +1,4 @@
-"""Which stages a choice of configs/stage/ stands for: one, a sequence of others, or a grid."""
+"""Finds the stages that a choice of configs/stage/ names: one stage, a sequence or a grid."""
 
 import typing
 from collections.abc import Sequence
@@ -11,14 +11,14 @@ from swarmjax.task.stage_config import GridConfig, complete
 
 
 def expand(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
-    """Return all stages that a choice of the group `stage` stands for, as plain data.
+    """Returns all stages that a choice of the group `stage` names, as plain data.
 
     Args:
-        stage: what `files.compose` made of the group.
+        stage: data of the group, from `files.compose`.
         choice: the name of its file.
 
     Raises:
-        ConfigError: the file, its sequence or its grid is unsound, or takes no such keys.
+        ConfigError: the file, its sequence or its grid is invalid, or it does not take these keys.
     """
     if not _is_grid(choice):
         return _listed(stage, choice)
@@ -27,14 +27,14 @@ def expand(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
 
 
 def pick_one(stage: dict[str, Any], choice: str) -> dict[str, Any]:
-    """Return the stage that a choice of the group `stage` stands for, if it is one alone.
+    """Returns the stage that a choice of the group `stage` names, if it is a single one.
 
     Args:
-        stage: what `files.compose` made of the group.
+        stage: data of the group, from `files.compose`.
         choice: the name of its file.
 
     Raises:
-        ConfigError: it stands for several, or is unsound.
+        ConfigError: the choice names several stages, or is invalid.
     """
     if _is_grid(choice):
         raise ConfigError(f"stage is {choice}, a grid: give one stage, as in stage=s6.")
@@ -47,29 +47,29 @@ def pick_one(stage: dict[str, Any], choice: str) -> dict[str, Any]:
 
 
 def read_stage(choice: str) -> dict[str, Any]:
-    """Read a file of configs/stage/ that is a single stage.
+    """Reads a file of configs/stage/ that is a single stage.
 
     Raises:
-        ConfigError: there is none of this name, or it stands for several.
+        ConfigError: there is no file of this name, or it names several stages.
     """
     files.check_choice("stage", choice, "stage")
     if _is_sequence(choice) or _is_grid(choice):
-        raise ConfigError(f"stage is {choice}, which stands for several: give single stages.")
+        raise ConfigError(f"stage is {choice}, which names several stages: give single stages.")
     return _named(files.read_choice("stage", choice), choice)
 
 
 def load_levels[C: Section](
     cls: type[C], overrides: Sequence[str], stage: dict[str, Any] | None = None
 ) -> C:
-    """Make the settings of a command that plays levels of one stage, or of a suite instead.
+    """Creates the settings of a command that plays the levels of one stage or of a suite.
 
     Args:
         cls: the command's dataclass, with `stage` and `suite`.
         overrides: `key=value` words.
-        stage: plain data of the stage where no word names one; None: that of the command's file.
+        stage: plain data of the default stage; None for that of the command's file.
 
     Raises:
-        ConfigError: a word is unsound, or a suite is given beside what it says itself.
+        ConfigError: a word is invalid, or a suite is given together with a key that it sets itself.
     """
 
     def fill_in(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:
@@ -85,19 +85,19 @@ def load_levels[C: Section](
 
 
 def _check_suite_alone(cls: type[Section], suite: object, overrides: Sequence[str]) -> None:
-    """Refuse what a suite's file says itself."""
+    """Refuses keys that the suite's file sets itself."""
     if suite is None:
         return
     for key in files.split_words(cls, overrides):
         if key.partition(".")[0] in ("stage", "shape", "episodes", "seed"):
             raise ConfigError(
-                f"{key} cannot be given with suite={called(str(suite))}, which says what its "
-                f"levels are: leave {key} or suite out."
+                f"{key} cannot be given with suite={called(str(suite))}, which sets its own "
+                f"levels: leave {key} or suite out."
             )
 
 
 def _listed(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
-    """Return the stage that a file stands for, or its sequence."""
+    """Returns the stage of a file, or the stages of its sequence."""
     if not _is_sequence(choice):
         return [_named(stage, choice)]
     names = section.convert(tuple[str, ...], stage["sequence"], "stage.sequence")
@@ -112,29 +112,29 @@ def _listed(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
 
 
 def _grid(stage: dict[str, Any], choice: str) -> dict[str, Any]:
-    """Return the axes of a grid."""
+    """Returns the axes of a grid."""
     _refuse_others(stage, choice, "grid", "a grid: give its axes, as in stage.grid.side=[0.7,1.0]")
     return stage["grid"]
 
 
 def _is_sequence(choice: str) -> bool:
-    """Tell whether a file of configs/stage/ names a sequence of others."""
+    """Returns whether a file of configs/stage/ is a sequence of other stages."""
     return "sequence" in files.read_choice("stage", choice)
 
 
 def _is_grid(choice: str) -> bool:
-    """Tell whether a file of configs/stage/ is a grid of stages."""
+    """Returns whether a file of configs/stage/ is a grid of stages."""
     return "grid" in files.read_choice("stage", choice)
 
 
 def _refuse_others(stage: dict[str, Any], choice: str, only: str, advice: str) -> None:
-    """Refuse keys of a single stage where a file stands for several."""
+    """Refuses keys of a single stage in a file that names several stages."""
     for key in stage.keys() - {only}:
         raise ConfigError(f"stage.{key} cannot be given for {choice}, {advice}.")
 
 
 def _member(name: str) -> dict[str, Any]:
-    """Read one stage of a curriculum."""
+    """Reads one stage of a curriculum."""
     files.check_choice("stage", name, "stage.sequence")
     if _is_sequence(name):
         raise ConfigError(f"stage.sequence names {name}, a curriculum itself: give single stages.")
@@ -144,12 +144,12 @@ def _member(name: str) -> dict[str, Any]:
 
 
 def name_of(choice: str) -> str:
-    """Return what a choice of the group `stage` is called: its name, or that of its file."""
+    """Returns the name of a choice of the group `stage`: its own, or that of its file."""
     return Path(choice).stem if files.is_path(choice) else choice
 
 
 def _named(stage: dict[str, Any], choice: str) -> dict[str, Any]:
-    """Return the stage under the name of its file, and refuse another name."""
+    """Returns the stage named after its file, and refuses any other name."""
     name = name_of(choice)
     found = stage.get("name", name)
     if found != name:

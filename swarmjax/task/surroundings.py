@@ -1,8 +1,8 @@
-"""What is around each robot, in its own frame: the truth, for a critic in training alone.
+"""Surroundings of each robot in its own frame: exact, and only for a critic in training.
 
-Pinto et al. 2017, "Asymmetric Actor Critic for Image-Based Robot Learning": the critic may see the
-state, since only the actor is deployed. The nearest robots and walls are listed, nearest first. The
-list is as long in every arena, so that a critic can go on learning in another one.
+The critic may see the full state, since only the actor is deployed (Pinto et al. 2017, "Asymmetric
+Actor Critic for Image-Based Robot Learning"). The nearest robots and walls are listed, nearest
+first. The list has the same length in every arena, so a critic can continue in another one.
 """
 
 from typing import Any
@@ -16,20 +16,20 @@ from swarmjax.task.level import Level
 
 NEAREST_ROBOTS = 8
 NEAREST_RECTANGLES = 12  # boxes, and walls inside and around the arena
-# m; what is farther is shown in its direction at this distance. Arenas of the stage files are up to
-# as wide. Nothing here is normalised: a running deviation of rows that are mostly 0 would magnify
-# what first fills them.
+# m; anything farther away is shown at this distance, in its direction. The stage files have arenas
+# up to this wide. The numbers are not normalised: most rows are 0, so a running deviation would be
+# small and would magnify the first entries.
 REACH = 2.0
 
 _OWN = 3  # target x, y; arrived
-_ROBOT = 8  # there, x, y, heading x, y, target x, y, arrived
-_RECTANGLE = 8  # there, nearest x, y, right end x, y, left end x, y, half the short edge
+_ROBOT = 8  # presence; x, y, heading x, y, target x, y, arrived
+_RECTANGLE = 8  # presence; nearest x, y, right end x, y, left end x, y, half the short edge
 
 SIZE = _OWN + NEAREST_ROBOTS * _ROBOT + NEAREST_RECTANGLES * _RECTANGLE  # entries, P
 
 
 def look(pose: Array, level: Level, arrived: Array) -> Array:
-    """Lists what is around each robot of one arena.
+    """Lists the surroundings of each robot of one arena.
 
     Args:
       pose: [R, 3] x (m), y (m), yaw (rad).
@@ -37,19 +37,19 @@ def look(pose: Array, level: Level, arrived: Array) -> Array:
       arrived: [R] whether the robot has arrived.
 
     Returns:
-      [R, P] in the robots' frames, x forward: m, within +-2; directions, within +-1; and marks, 0
-      or 1. Rows of absent things are 0.
+      [R, P] in the robots' frames, x forward. Lengths are in m, within +-2. Directions are within
+      +-1. Flags are 0 or 1. Rows of absent objects are 0.
     """
     target = _shown(*into_frame(pose, level.target))
     own = [*target, arrived.astype(jnp.float32)]
     parts = [jnp.stack(own, axis=-1), _robots(pose, level, arrived), _rectangles(pose, level)]
     found = jnp.concatenate(parts, axis=-1)
-    # An arena whose physics broke is not learned from; its critic sees numbers all the same.
+    # Learning skips an arena with broken physics, but its critic still needs finite numbers.
     return jnp.where(jnp.isfinite(found), found, 0.0)
 
 
 def _shown(x: Array, y: Array) -> tuple[Array, Array]:
-    """Puts what is farther than `REACH` at that distance."""
+    """Moves points farther away than `REACH` to that distance."""
     scale = jnp.minimum(1.0, REACH / jnp.maximum(jnp.hypot(x, y), REACH))
     return scale * x, scale * y
 
@@ -80,7 +80,7 @@ def _rectangles(pose: Array, level: Level) -> Array:
     middle, viewer = jnp.stack([x, y], axis=-1), pose[:, None]
     end = jnp.stack([reach * jnp.cos(along), reach * jnp.sin(along)], axis=-1)
     one, other = (into_frame(viewer, middle + sign * end) for sign in (-1.0, 1.0))
-    is_left = one[0] * other[1] - one[1] * other[0] >= 0.0  # the other, seen from the robot
+    is_left = one[0] * other[1] - one[1] * other[0] >= 0.0  # `other`, seen from the robot
     right = _shown(*(jnp.where(is_left, a, b) for a, b in zip(one, other, strict=True)))
     left = _shown(*(jnp.where(is_left, b, a) for a, b in zip(one, other, strict=True)))
     nearest = _shown(*into_frame(viewer, _to_rectangle(pose, found)[0]))
@@ -89,9 +89,9 @@ def _rectangles(pose: Array, level: Level) -> Array:
 
 
 def _to_rectangle(pose: Array, rectangle: Array) -> tuple[Array, Array]:
-    """Finds the point [R, N, 2] of rectangles [N or R, N, 5] nearest to robots, and how far it is.
+    """Finds the nearest points [R, N, 2] of rectangles [N or R, N, 5], and their distances.
 
-    It is the robot's place in the rectangle's frame, pushed into it.
+    A nearest point is the robot's place, clipped to the rectangle in the rectangle's frame.
     """
     x, y, yaw, half_x, half_y = jnp.moveaxis(rectangle, -1, 0)
     centre = jnp.stack([x, y, yaw], axis=-1)
@@ -101,10 +101,10 @@ def _to_rectangle(pose: Array, rectangle: Array) -> tuple[Array, Array]:
 
 
 def _nearest(distance: Array, is_there: Array, count: int) -> tuple[Array, Array]:
-    """Chooses the nearest `count` of N things at a distance [R, N], or all, nearest first.
+    """Chooses the nearest `count` of N objects at distances [R, N], or all, nearest first.
 
     Returns:
-      [R, n] their numbers, and whether they are there.
+      [R, n] their indices, and whether they are present.
     """
     ranked = jnp.where(is_there, distance, jnp.inf)
     _, chosen = jax.lax.top_k(-ranked, min(count, distance.shape[1]))
@@ -113,23 +113,23 @@ def _nearest(distance: Array, is_there: Array, count: int) -> tuple[Array, Array
 
 
 def _listed(rows: tuple[Any, ...], is_there: Array, count: int) -> Array:
-    """Puts rows of F numbers, [R, n] each, one after the other: [R, count * F], absent ones 0."""
+    """Interleaves rows of F numbers, [R, n] each, into [R, count * F]; absent ones are 0."""
     every = tuple(jnp.where(is_there, row, 0.0) for row in rows)
-    # Each number is computed before they are interleaved: threads of a GPU that compute different
-    # ones side by side wait for each other.
+    # Compute each number before interleaving. Neighbouring GPU threads that compute different
+    # numbers would wait for each other.
     found = jnp.stack(jax.lax.optimization_barrier(every), axis=-1)
     found = jnp.pad(found, ((0, 0), (0, count - found.shape[1]), (0, 0)))
     return found.reshape(len(found), -1)
 
 
 def into_frame(frame: Array, point: Array) -> tuple[Array, Array]:
-    """Turns points [..., 2] of the arena into coordinates in frames [..., 3]."""
+    """Converts points [..., 2] of the arena to coordinates in frames [..., 3]."""
     x, y = point[..., 0] - frame[..., 0], point[..., 1] - frame[..., 1]
     cos, sin = jnp.cos(frame[..., 2]), jnp.sin(frame[..., 2])
     return cos * x + sin * y, cos * y - sin * x
 
 
 def _out_of_frame(frame: Array, x: Array, y: Array) -> Array:
-    """Turns coordinates in frames [..., 3] into points [..., 2] of the arena."""
+    """Converts coordinates in frames [..., 3] to points [..., 2] of the arena."""
     cos, sin = jnp.cos(frame[..., 2]), jnp.sin(frame[..., 2])
     return jnp.stack([frame[..., 0] + cos * x - sin * y, frame[..., 1] + sin * x + cos * y], -1)

@@ -295,7 +295,7 @@ def test_swarms_are_as_dense_as_the_last_stage() -> None:
     [
         ("name: x\n", "cells is missing and has no default: give it."),
         (_text("name: a, stage: s9, seed: 1000000"), "stage is 's9': give one of "),
-        (_text("name: a, stage: grid, seed: 1000000"), "stage is grid, which stands for several"),
+        (_text("name: a, stage: grid, seed: 1000000"), "stage is grid, which names several stages"),
         (_text("name: a, stage: s1, seed: 5"), "seed is 5: give 1000000 to 2147483647."),
         (_text("name: a, stage: s1, seed: 1000000, shape: ball"), "shape is 'ball': give box, "),
         (_text("name: a, stage: s1, seed: 1000000, levels: 2, episodes: [1]"), "levels is 2, but"),

@@ -237,7 +237,7 @@ def test_import_needs_neither_jax_nor_hydra():
          "each stage once."),
         # 0.10 + sqrt(5 * 2 * 0.15**2) = 0.10 + 0.4743.
         (["stage=grid", "stage.grid.side=[0.4,0.5]", "stage.grid.robots=[5]"], "stage.grid.side "
-         "is [0.4,0.5], which leaves no cell: the smallest swarm with the fewest obstacles needs "
+         "is [0.4,0.5], too small for every cell of the grid: the fewest robots and obstacles need "
          "0.58."),
         (["stage.sequence=[s1,grid]"], "stage.sequence names grid, a grid: give single stages."),
         (["task.history=0"], "task.history is 0: give 1 to 64."),
@@ -245,11 +245,12 @@ def test_import_needs_neither_jax_nor_hydra():
         # Checks across keys.
         (["task.history=4", "algo.memory=gru"], "task.history is 4, but algo.memory is gru: "
          "choose one, task.history=1 or algo.memory=none."),
-        (["task.neighbours.message_size=2"], "task.neighbours.message_size is 2, but count is 0 "
-         "and nobody hears: give a count of 1 or more, or message_size=0."),
+        (["task.neighbours.message_size=2"], "task.neighbours.message_size is 2, but count is "
+         "0, so no robot receives messages: give a count of 1 or more, or message_size=0."),
         (["task.neighbours.count=33"], "task.neighbours.count is 33: give 0 to 32."),
         (["task.neighbours.count=2", "task.history=3"], "task.history is 3, but neighbours.count "
-         "is 2: choose one, history=1 or neighbours.count=0; algo.memory=gru goes with hearing."),
+         "is 2: choose one, history=1 or neighbours.count=0; neighbours work with "
+         "algo.memory=gru."),
         (["task.neighbours.count=2", "algo.update_backend=fused"], "algo.update_backend is fused, "
          "but task.neighbours.count is 2: give auto or autodiff, or task.neighbours.count=0."),
         (["task.neighbours.count=2", "algo.network=mine"], "algo.network is mine, but "
@@ -286,10 +287,10 @@ def test_train_refuses(words, sentence):
         (["stage=curriculum"], "stage is curriculum, a curriculum: give one stage, as in "
          "stage=s6."),
         (["stage=grid"], "stage is grid, a grid: give one stage, as in stage=s6."),
-        (["suite=all", "stage=s6"], "stage cannot be given with suite=all, which says what its "
-         "levels are: leave stage or suite out."),
-        (["suite=all", "seed=2"], "seed cannot be given with suite=all, which says what its "
-         "levels are: leave seed or suite out."),
+        (["suite=all", "stage=s6"], "stage cannot be given with suite=all, which sets its own "
+         "levels: leave stage or suite out."),
+        (["suite=all", "seed=2"], "seed cannot be given with suite=all, which sets its own "
+         "levels: leave seed or suite out."),
         (["compare=a,b"], "policy is 'p' and compare is 'a,b': give one of them, policy=FILE or "
          "compare=FILE,FILE."),
         (["policy=null"], "policy is null and compare is null: give one of them, policy=FILE or "
@@ -573,7 +574,7 @@ def test_help_gives_default_meaning_and_allowed_values():
         "(a whole number 1 to 2147483647, all or auto)" in lines
     )
     assert (
-        "sim.impl=auto who steps the physics; auto: warp on an NVIDIA GPU (auto, jax or warp)"
+        "sim.impl=auto physics implementation; auto: warp on an NVIDIA GPU (auto, jax or warp)"
         in lines
     )
 

@@ -123,7 +123,7 @@ def test_observations_may_be_left_out() -> None:
         ("@level_drawing\ndef ring(level, key): return level._replace(target=level.target + 9)",
          "level ring, drawn for stage ring, robot 0 has its target at ("),
         ("@level_drawing\ndef ring(level, key): return level._replace(start=0 * level.start)",
-         "level ring, drawn for stage ring, robots 0 and 1 start within each other: keep two hulls "
+         "level ring, drawn for stage ring, robots 0 and 1 overlap at the start: keep two hulls "
          "apart."),
         ("@level_drawing\ndef ring(level, key): return level._replace(start=level.start + jnp.nan)",
          "level ring, drawn for stage ring, holds a number that is not finite: return numbers."),

@@ -356,16 +356,16 @@ def test_help_gives_range_unit_and_choices(cls, command, robot, realism, mass):
     assert f"robot={robot} (paper, planar, planar_v2, wheeled, wheeled_v2)" in overview
     lines = [" ".join(line.split()) for line in help_text(cls, command, ["realism"]).splitlines()]
     assert (
-        f"realism.mass={mass} kg; a robot and episode "
+        f"realism.mass={mass} kg; per robot and episode "
         "(a range [low,high] of numbers more than 0.01, at most 100 or null)" in lines
     )
     assert (
-        f"realism.action_latency={mass} control steps; a robot and episode "
+        f"realism.action_latency={mass} control steps; per robot and episode "
         "(a range [low,high] of whole numbers 0 to 1000 or null)" in lines
     )
     stall = "[0.1,0.3]" if mass == "null" else mass
     assert (
-        f"realism.stall_time={stall} for how long, s; a stall "
+        f"realism.stall_time={stall} duration, s; per stall "
         "(a range [low,high] of numbers more than 0, at most 3600)" in lines
     )
     assert not any(line.startswith("realism.name") for line in lines)

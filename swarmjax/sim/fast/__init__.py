@@ -1,7 +1,8 @@
-"""Faster ways to the same physics, which nothing needs: only `sim/dispatch.py` calls them.
+"""Faster, optional code for the same physics; only `sim/dispatch.py` calls it.
 
-`discs.py` steps planar robots, with contacts by `planar_jax.py` or `planar_warp.py`; `warp_step.py`
-lets MJX-Warp solve those of wheeled ones by `wheeled_warp.py` (`wheeled_problem.py`,
-`wheeled_pairs.py`); `unroll.py` cuts short axes up for XLA. The tests hold each that steps to
-MuJoCo C.
+`discs.py` steps planar robots; `planar_jax.py` or `planar_warp.py` solves their contacts. With
+friction, `rubbing_jax.py` or `rubbing_warp.py` does. For wheeled robots, `warp_step.py` makes
+MJX-Warp use the solver of `wheeled_warp.py` (with `wheeled_problem.py` and `wheeled_pairs.py`).
+`paths_warp.py` finds shortest paths. `unroll.py` splits short axes for XLA. Tests compare each
+physics step with MuJoCo C.
 """

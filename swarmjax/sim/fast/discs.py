@@ -1,20 +1,20 @@
 """Planar robots as discs: a physics step without bodies in space.
 
-A hull is a sphere between upright faces, so in the plane it is a disc, and its contacts (condim 1)
-push through its centre: they move it along x and y and never turn it. MJX's own step builds every
-contact in space and factorises one matrix for all robots at every iteration of Newton's method;
-that is nine tenths of it. What robots push with is MuJoCo's convex problem in its dual form
-(MuJoCo's documentation, Computation, "Dual problem"),
+A hull is a sphere between upright faces, so in the plane it is a disc. Its contacts (condim 1) push
+through its centre, so they move it along x and y and never turn it. MJX's own step builds every
+contact in space, and factorises one matrix for all robots at every iteration of Newton's method.
+That takes nine tenths of its time. The contact forces are the solution of MuJoCo's convex problem
+in its dual form (MuJoCo's documentation, Computation, "Dual problem"),
 
-    minimise over f >= 0:  1/2 f' (J M^-1 J' + R) f + f' (J a0 - aref),
+    minimise over f >= 0:  1/2 f' (J M^-1 J' + R) f + f' (J a0 - aref).
 
-which has as many unknowns as there are contacts, mostly none. Projected Gauss-Seidel, MuJoCo's own
-second solver, PGS, goes through them one by one,
+It has one unknown per contact, and most states have no contact. Projected Gauss-Seidel (MuJoCo's
+second solver, PGS) updates the forces one by one,
 
     f_i <- max(0, f_i + (aref_i - J_i a - R_i f_i) / (J_i M^-1 J_i' + R_i)),
 
-a always being the acceleration that the forces of now bring about, and ends where Newton's method
-does: there is one minimum. `planar_jax` does so by JAX, `planar_warp` by Warp. A sweep
+where a is the acceleration under the current forces. The problem has a single minimum, so this ends
+where Newton's method does. `planar_jax` implements it in JAX, `planar_warp` in Warp. A sweep
 goes through the fixtures one by one, for all robots, and then through the pairs of robots.
 """
 
@@ -33,26 +33,26 @@ from swarmjax.sim import model as sim_model
 from swarmjax.sim.engine import Engine
 from swarmjax.sim.geometry import CONTACT_HEIGHT
 
-# Share of the largest force by which any may still change; float32 rounds at 1e-7.
+# Sweeps stop when no force changes by more than this share of the largest; float32 rounds at 1e-7.
 TOLERANCE = 1e-6
-# A centre that is deeper within a box than it is below its top or above its bottom, m, is pushed
-# up or down by MuJoCo, where no joint gives way.
+# m; MuJoCo pushes a centre up or down if it is deeper within a box than this, which is its distance
+# to the box's top or bottom. No joint moves that way.
 DEEPEST = min(CONTACT_HEIGHT, 2.0 * sim_model.HALF_HEIGHT - CONTACT_HEIGHT)
 
 
 class Discs(NamedTuple):
-    """What is fixed for a program.
+    """Constants of a program.
 
     Attributes:
       radius: of the hulls, m.
       timestep: one physics step, s.
-      sweeps: at most.
+      sweeps: largest number of sweeps.
       body: [R] rows of the hulls among the model's bodies.
-      opponent: [N, R] whom a robot meets in a round; itself: nobody.
+      opponent: [N, R] the robot that each robot meets in a round; itself for none.
       solref: time constant (s) and damping ratio of all contacts.
-      solimp: their impedance: smallest, largest, width (m), midpoint, power.
-      solve: how robots accelerate with their contacts: `push_apart` of a solver, of these, the
-        robots of an arena, its side [] (m) and obstacles [M, 5] (x, y, yaw, half edges).
+      solimp: impedance of all contacts: smallest, largest, width (m), midpoint, power.
+      solve: `push_apart` of a solver. It takes these constants, the robots of an arena, its side []
+        (m) and obstacles [M, 5] (x, y, yaw, half edges), and returns accelerations with contacts.
     """
 
     radius: float
@@ -67,14 +67,14 @@ class Discs(NamedTuple):
 
 @struct.dataclass
 class Model:
-    """What is read of a model, by MuJoCo's names.
+    """Fields that a step reads from a model, with MuJoCo's names.
 
     Attributes:
       body_mass: [B] kg.
       body_inertia: [B, 3] kg m^2.
       body_invweight0: [B, 2] 1 / kg, 1 / (kg m^2).
-      pair_friction: [P, 5] all alike, of which the first two are along the face; None where hulls
-        have none.
+      pair_friction: [P, 5] the same for all pairs; the first two are along the face. None for hulls
+        without friction.
     """
 
     body_mass: Array
@@ -85,13 +85,13 @@ class Model:
 
 @struct.dataclass
 class Data:
-    """What changes in an arena, by MuJoCo's names.
+    """Fields that change in an arena, with MuJoCo's names.
 
     Attributes:
       qpos: [Q] x (m), y (m), yaw (rad) of each robot in turn.
-      qvel: [V] their rates.
-      qacc_warmstart: [V] the rates' rates in the step before.
-      qfrc_applied: [V] N, N, N m, all that acts but contacts.
+      qvel: [V] velocities of these.
+      qacc_warmstart: [V] accelerations of the previous step.
+      qfrc_applied: [V] N, N, N m, all forces except those of contacts.
     """
 
     qpos: Array
@@ -101,11 +101,11 @@ class Data:
 
 
 class Rubbing(NamedTuple):
-    """What friction needs to know besides, of an arena, or of many with a leading axis.
+    """Additional quantities for friction, of an arena, or of many with a leading axis.
 
     Attributes:
       agility: [R] 1 / moment of inertia, 1 / (kg m^2).
-      friction: [] of hulls on what they touch.
+      friction: [] between hulls and everything that they touch.
     """
 
     agility: Array
@@ -117,12 +117,12 @@ class DiscRobots(NamedTuple):
 
     Attributes:
       place: [R, 3] x (m), y (m), yaw (rad).
-      rate: [R, 3] of it, 1/s.
-      free: [R, 3] of the rate, 1/s^2, without contacts.
-      before: [R, 3] of the rate, 1/s^2, in the step before.
+      rate: [R, 3] velocity of `place`, 1/s.
+      free: [R, 3] acceleration of `place` without contacts, 1/s^2.
+      before: [R, 3] acceleration of `place` in the previous step, 1/s^2.
       mobility: [R] 1 / mass, 1 / kg.
       weight: [R] MuJoCo's inverse weight, 1 / kg.
-      rubbing: None where hulls have no friction.
+      rubbing: quantities for friction; None for hulls without friction.
     """
 
     place: Array
@@ -138,20 +138,20 @@ Solve = Callable[[Discs, DiscRobots, Array, Array], Array]
 
 
 def load(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve: Solve) -> Discs:
-    """Takes what a step needs from a model of planar robots.
+    """Extracts the constants of a step from a model of planar robots.
 
     Args:
       model: compiled, one arena.
-      ids: where things lie in it.
+      ids: rows of objects in the model.
       radius: of the hulls, m.
       solve: `push_apart` of the solver for these hulls.
 
     Returns:
-      What is fixed for a program.
+      The constants of a program.
     """
     solref, solimp = np.unique(model.pair_solref, axis=0), np.unique(model.pair_solimp, axis=0)
     assert len(solref) == len(solimp) == 1
-    assert solref.min() > 0.0  # otherwise it means stiffness and damping
+    assert solref.min() > 0.0  # negative values mean stiffness and damping
     rounds = _rounds(len(ids.hull_body))
     of_model = model.opt.timestep, model.opt.iterations, ids.hull_body
     assert model.opt.impratio == 1.0  # contacts are as soft along the face as along the normal
@@ -159,18 +159,18 @@ def load(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve: Solve)
 
 
 def rubs(model: mujoco.MjModel) -> bool:
-    """Tells whether the model's hulls have friction."""
+    """Returns whether the model's hulls have friction."""
     return bool((model.pair_dim > 1).any())
 
 
 def put(model: mujoco.MjModel) -> tuple[Model, Data]:
-    """Puts what a step reads on the device.
+    """Puts the fields that a step reads on the device.
 
     Args:
       model: compiled, one arena.
 
     Returns:
-      The model, and an arena at 0 to fill in.
+      The model, and an arena of zeros to fill in.
     """
     fields = model.body_mass, model.body_inertia, model.body_invweight0
     still = jnp.zeros(model.nv)
@@ -180,11 +180,11 @@ def put(model: mujoco.MjModel) -> tuple[Model, Data]:
 
 
 def load_engine(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve: Solve) -> Engine:
-    """Loads the discs as what takes a program's physics steps.
+    """Creates the engine for discs.
 
     Args:
       model: compiled, one arena.
-      ids: where things lie in it.
+      ids: rows of objects in the model.
       radius: of the hulls, m.
       solve: `push_apart` of the solver for these hulls.
 
@@ -192,19 +192,19 @@ def load_engine(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve:
       The engine.
     """
     discs = load(model, ids, radius, solve)
-    # Speeds of the environment: README.md, "What steps the robots".
+    # Speeds of the whole environment, not of the physics alone.
     label = (
-        "discs, swarmjax's own step of the MJX model in the plane (2.4 times as fast as "
+        "discs, swarmjax's own planar step of the MJX model (2.4 times as fast as "
         "sim.solver=mjx on two cores, 3.9 times on an H200)"
     )
     return Engine(label, *put(model), functools.partial(step, discs), is_mjx=False)
 
 
 def _rounds(robots: int) -> np.ndarray:
-    """Draws a tournament: whom each robot meets in each round, [N, R]; itself: nobody.
+    """Builds a tournament: the robot that each robot meets in each round, [N, R]; itself for none.
 
-    Of an odd number N of players, two meet in the round that is their sum modulo N (the circle
-    method); the one that is left over rests, or meets the last of an even number.
+    With an odd number N of robots, two robots meet in the round that equals their sum modulo N (the
+    circle method). The robot left over rests. With an even number, it meets the last robot instead.
     """
     rounds = robots - 1 + robots % 2
     player = np.arange(rounds)
@@ -217,12 +217,12 @@ def _rounds(robots: int) -> np.ndarray:
 
 
 def step(discs: Discs, model: Model, data: Data, side: Array, obstacle: Array) -> Data:
-    """Moves one arena on by one physics step (MuJoCo's semi-implicit Euler).
+    """Advances one arena by one physics step (MuJoCo's semi-implicit Euler).
 
     Args:
-      discs: what is fixed.
-      model: of which masses and inverse weights are read.
-      data: the arena; `qfrc_applied` is all that acts on it but contacts.
+      discs: constants.
+      model: provides masses and inverse weights.
+      data: the arena; `qfrc_applied` holds all forces except those of contacts.
       side: [] of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
@@ -241,7 +241,7 @@ def step(discs: Discs, model: Model, data: Data, side: Array, obstacle: Array) -
 
 
 def _robots(discs: Discs, model: Model, data: Data) -> DiscRobots:
-    """The robots of an arena."""
+    """Returns the robots of an arena."""
     mass, turn = model.body_mass[discs.body], model.body_inertia[discs.body, 2]
     fields = data.qpos, data.qvel, data.qfrc_applied, data.qacc_warmstart
     place, rate, force, before = (field.reshape(-1, 3) for field in fields)
@@ -253,13 +253,13 @@ def _robots(discs: Discs, model: Model, data: Data) -> DiscRobots:
 
 
 def spring(discs: Discs) -> tuple[float, float]:
-    """How contacts pull back, all alike.
+    """Returns stiffness and damping, which are the same for all contacts.
 
-    MuJoCo's documentation, Modeling, "Solver parameters": k and b of `solref`, which is at least
+    MuJoCo's documentation, Modeling, "Solver parameters": k and b from `solref`, which is at least
     two physics steps (`refsafe`).
 
     Args:
-      discs: what is fixed.
+      discs: constants.
 
     Returns:
       Stiffness, 1/s^2, and damping, 1/s.

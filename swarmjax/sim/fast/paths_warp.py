@@ -1,9 +1,9 @@
-"""Shortest paths around obstacles by Warp: what `task/geodesic.py` does, without pairs that wait.
+"""Shortest paths around obstacles in Warp; replaces the JAX code of `task/geodesic.py`.
 
-A thread a pair of corners finds whether they see each other, a thread a robot settles the corners
-from its target on (Dijkstra 1959, "A Note on Two Problems in Connexion with Graphs"), and a thread
-a robot looks for the corner by which its path leads, at obstacles only where that might be shorter.
-XLA compiles the same for minutes on a GPU.
+For each pair of corners, a thread checks whether they see each other. For each robot, a thread
+settles the corners outwards from its target (Dijkstra 1959, "A Note on Two Problems in Connexion
+with Graphs"). Another thread per robot finds the first corner of its path. It checks obstacles
+only for corners that could shorten the path. XLA would take minutes to compile this for a GPU.
 """
 
 from functools import partial
@@ -19,19 +19,19 @@ _OPEN, _SETTLED = wp.constant(0), wp.constant(1)
 
 
 def find_legs(corner: Array, side: Array, frame: Array, widened: float) -> Array:
-    """Measures the straight ways between the corners of an arena.
+    """Measures the straight lines between the corners of an arena.
 
-    Axes that `vmap` adds are arenas of one kernel.
+    `vmap` adds arenas to the same kernel.
 
     Args:
       corner: [K, 2] x and y, m.
       side: [] of the arena, m.
       frame: [M, 6] of obstacles: x (m), y (m), cosine and sine of yaw, half edges (m).
-      widened: by how much obstacles are, m.
+      widened: width added around obstacles, m.
 
     Returns:
-      [K, K] m; inf where an obstacle is in between, or a corner lies in one or outside. A corner
-      is 0 m from itself, unless it lies outside.
+      [K, K] m; inf if an obstacle is in between, or a corner lies in an obstacle or outside the
+      arena. A corner is 0 m from itself, unless it lies outside.
     """
     many = of_arenas(partial(_find_legs, widened))
     return many(corner[None], jnp.asarray(side)[None], frame[None])[0]
@@ -40,18 +40,18 @@ def find_legs(corner: Array, side: Array, frame: Array, widened: float) -> Array
 def settle(
     target: Array, side: Array, corner: Array, frame: Array, legs: Array, widened: float
 ) -> Array:
-    """Finds how far it is from each corner to each target.
+    """Finds the distance from each corner to each target.
 
     Args:
       target: [R, 2] x and y, m.
       side: [] of the arena, m.
       corner: [K, 2] x and y, m.
-      frame: [M, 6] as of `find_legs`.
-      legs: [K, K] as `find_legs` gives them.
-      widened: by how much obstacles are, m.
+      frame: [M, 6] as for `find_legs`.
+      legs: [K, K] from `find_legs`.
+      widened: width added around obstacles, m.
 
     Returns:
-      [R, K] m; inf where no path leads.
+      [R, K] m; inf without a path.
     """
     many = of_arenas(partial(_settle, widened))
     given = (target, jnp.asarray(side), corner, frame, legs)
@@ -75,11 +75,11 @@ def measure(
       target: [R, 2] x and y, m.
       corner: [K, 2] x and y, m.
       to_go: [R, K] from each corner to each target, m.
-      frame: [M, 6] as of `find_legs`.
-      widened: by how much obstacles are, m.
+      frame: [M, 6] as for `find_legs`.
+      widened: width added around obstacles, m.
 
     Returns:
-      [R] m; inf where no path leads.
+      [R] m; inf without a path.
     """
     many = of_arenas(partial(_measure, widened))
     given = (place, jnp.asarray(side), target, corner, to_go, frame)
@@ -87,7 +87,7 @@ def measure(
 
 
 def _find_legs(widened: float, corner: Array, side: Array, frame: Array) -> Array:
-    """The ways [A, K, K] of arenas."""
+    """Measures the straight lines [A, K, K] of many arenas."""
     arenas, corners = corner.shape[:2]
     call = wp.jax_kernel(_leg, num_outputs=1)
     size = (arenas, corners, corners)
@@ -95,12 +95,12 @@ def _find_legs(widened: float, corner: Array, side: Array, frame: Array) -> Arra
 
 
 def _settle(widened: float, target: Array, side: Array, *given: Array) -> Array:
-    """The distances [A, R, K] of arenas."""
+    """Finds the distances [A, R, K] of many arenas."""
     arenas, robots = target.shape[:2]
     corner, frame, legs = given
     size = (arenas, robots, corner.shape[1])
     call = wp.jax_kernel(_settle_corners, num_outputs=2)
-    del side  # `of_arenas` counts arenas by it
+    del side  # an argument only because `of_arenas` counts arenas by it
     shapes = {"state": size, "to_go": size}
     found = call(
         target, corner, frame, legs, widened, launch_dims=(arenas, robots), output_dims=shapes
@@ -109,7 +109,7 @@ def _settle(widened: float, target: Array, side: Array, *given: Array) -> Array:
 
 
 def _measure(widened: float, place: Array, side: Array, *given: Array) -> Array:
-    """The distances [A, R] of arenas."""
+    """Measures the shortest paths [A, R] of many arenas."""
     size = place.shape[:2]
     del side
     call = wp.jax_kernel(_path, num_outputs=1)
@@ -124,7 +124,7 @@ def _from_far(found: Array) -> Array:
 def _is_barred(
     frame: wp.array3d[float], arena: int, widened: float, begin: wp.vec2, end: wp.vec2
 ) -> bool:
-    """Whether a segment meets a widened obstacle: by separating axes, as in `task/geodesic.py`."""
+    """Returns whether a segment meets a widened obstacle: separating axes, as in `geodesic.py`."""
     barred = wp.bool(False)
     m = wp.int32(0)
     while m < frame.shape[1] and not barred:
@@ -155,7 +155,7 @@ def _leg(
     widened: float,
     found: wp.array3d[float],
 ) -> None:
-    """Measures the way from one corner to another."""
+    """Measures the straight line from one corner to another."""
     arena, i, j = wp.tid()
     begin, end = corner[arena, i], corner[arena, j]
     reach = wp.max(
@@ -177,7 +177,7 @@ def _settle_corners(
     state: wp.array3d[int],
     to_go: wp.array3d[float],
 ) -> None:
-    """Settles the corners of an arena, from those that the target sees on."""
+    """Settles the corners of an arena, starting with those that the target sees."""
     arena, robot = wp.tid()
     goal, corners = target[arena, robot], corner.shape[1]
     for k in range(corners):
@@ -199,7 +199,7 @@ def _settle_corners(
 
 @wp.func
 def _nearest(state: wp.array3d[int], to_go: wp.array3d[float], arena: int, robot: int) -> int:
-    """The open corner nearest to the target; -1: no other has a path."""
+    """Returns the open corner nearest to the target; -1 if no open corner has a path."""
     nearest, least = wp.int32(-1), wp.float32(_FAR)
     for k in range(to_go.shape[2]):
         if state[arena, robot, k] == _OPEN and to_go[arena, robot, k] < least:
@@ -217,7 +217,7 @@ def _path(
     widened: float,
     found: wp.array2d[float],
 ) -> None:
-    """Measures the path of a robot."""
+    """Measures the shortest path of a robot."""
     arena, robot = wp.tid()
     here, goal = place[arena, robot], target[arena, robot]
     least = float(_FAR)

@@ -1,7 +1,7 @@
-"""Contacts of planar robots by JAX: all robots of an arena at once, sweep by sweep.
+"""Contacts of planar robots in JAX: all robots of an arena at once, sweep by sweep.
 
-What is solved, and in which order, says `discs`. A fixture is one row for all robots, and so is a
-round of the tournament, in which each robot meets one other.
+`discs` describes the problem and the order of a sweep. Each fixture is one row for all robots. So
+is each round of the tournament, in which each robot meets one other robot.
 """
 
 import operator
@@ -19,12 +19,12 @@ from swarmjax.sim.infrared import Box, to_box_frame, turned
 
 
 class DiscGap(NamedTuple):
-    """What lies between a robot and what it may touch.
+    """Gap between a robot and an object that it may touch.
 
     Attributes:
       x: of the unit vector along which the robot is pushed.
-      y: likewise.
-      distance: between the surfaces, m; below 0 they touch.
+      y: of the same unit vector.
+      distance: between the surfaces, m; negative for contact.
     """
 
     x: Array
@@ -33,13 +33,13 @@ class DiscGap(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """A gap, and what the contact asks for where it is closed.
+    """A gap, and the contact's parameters if it is closed.
 
     Attributes:
       gap: between the two.
-      give: R, what a unit of force leaves of the demand, 1 / kg.
-      demand: aref, the acceleration along the gap that is asked for, m/s^2.
-      stiffness: what a unit of force brings about, J M^-1 J' + R, 1 / kg.
+      give: R, softness: acceleration by which a unit of force misses the demand, 1 / kg.
+      demand: aref, requested acceleration along the gap, m/s^2.
+      stiffness: J M^-1 J' + R, effect of a unit of force, 1 / kg.
     """
 
     gap: DiscGap
@@ -49,23 +49,23 @@ class Contact(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Along x and y: speeds or accelerations of robots, or of one against another."""
+    """Velocities or accelerations along x and y, of robots or of one relative to another."""
 
     x: Array
     y: Array
 
 
 def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Array:
-    """Finds how the robots of one arena accelerate with their contacts.
+    """Computes the accelerations of one arena's robots, including contacts.
 
     Args:
-      discs: what is fixed.
-      robots: as they are and would move.
+      discs: constants.
+      robots: their state, and their accelerations without contacts.
       side: [] of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
-      [R, 3] of x and y, m/s^2, and of yaw, rad/s^2, which is `robots.free`'s.
+      [R, 3] of x and y, m/s^2, and of yaw, rad/s^2; the latter is that of `robots.free`.
     """
     one = contacts(discs, robots, sim_model.fixture_rectangles(side, obstacle, jnp))
     free, before = (Motion(m[:, 0], m[:, 1]) for m in (robots.free, robots.before))
@@ -84,13 +84,13 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
     touching = jnp.any(one.gap.distance < 0.0)
     first = (jnp.int32(0), force, _pushed(one.gap, robots.mobility, free, force), touching)
     force = jax.lax.while_loop(goes_on, sweep, first)[1]
-    # Once more from the forces, without the sweeps' rounding.
+    # Recompute the accelerations from the forces, without the rounding of the sweeps.
     moved = _pushed(one.gap, robots.mobility, free, force)
     return jnp.stack([moved.x, moved.y, robots.free[:, 2]], axis=-1)
 
 
 def contacts(discs: Discs, robots: DiscRobots, fixture: Array) -> Contact:
-    """All contacts [K, R] of robots: with each fixture [F, 5], then those of each round."""
+    """Returns all contacts [K, R] of robots: with each fixture [F, 5], then in each round."""
     x, y, other = robots.place[:, 0], robots.place[:, 1], discs.opponent
     to_fixture = _from_box(x, y, turned(fixture[:, None], jnp), discs.radius)
     meets = other - np.arange(len(x))
@@ -108,13 +108,13 @@ def contacts(discs: Discs, robots: DiscRobots, fixture: Array) -> Contact:
 
 
 def _against(discs: Discs, motion: Motion, contacts: int) -> Motion:
-    """How robots [R] move against what they may touch, [K, R]; fixtures stand."""
+    """Returns the motion [K, R] of robots [R] relative to their opponents; fixtures stand still."""
     still = jnp.zeros((contacts - len(discs.opponent), len(motion.x)))
     return Motion(*(a - jnp.concatenate([still, a[discs.opponent]]) for a in motion))
 
 
 def _pushed(gap: DiscGap, mobility: Array, free: Motion, force: Array) -> Motion:
-    """Adds what forces [K, R] bring about."""
+    """Adds the accelerations due to forces [K, R]."""
     x, y = (jnp.sum(way * force, axis=0) for way in (gap.x, gap.y))
     return Motion(free.x + mobility * x, free.y + mobility * y)
 
@@ -122,7 +122,7 @@ def _pushed(gap: DiscGap, mobility: Array, free: Motion, force: Array) -> Motion
 def _sweep(
     discs: Discs, contacts: Contact, mobility: Array, motion: Motion, force: Array
 ) -> tuple[Array, Motion]:
-    """Sets the forces [K, R] one after the other, those of all robots at once, to their best."""
+    """Sets the forces [K, R] to their best values, row by row, for all robots of a row at once."""
     found, fixtures = [], len(force) - len(discs.opponent)
     for k in range(len(force)):
         one = jax.tree.map(operator.itemgetter(k), contacts)
@@ -137,10 +137,10 @@ def _sweep(
 
 
 def _from_box(x: Array, y: Array, box: Box, radius: float) -> DiscGap:
-    """Gap between boxes and robots at x and y, m.
+    """Returns the gap between boxes and robots at x and y, m.
 
-    From the nearest point of the box; of a centre within it, from the nearest face, unless that is
-    the top or the bottom.
+    The gap is measured from the box's nearest point. If the centre is within the box, it is
+    measured from the nearest face instead, unless that is the top or the bottom.
     """
     x, y = to_box_frame(x - box.x, y - box.y, box)
     over_x, over_y = jnp.abs(x) - box.half_x, jnp.abs(y) - box.half_y
@@ -148,7 +148,7 @@ def _from_box(x: Array, y: Array, box: Box, radius: float) -> DiscGap:
     along_x = jnp.where(within, jnp.where(over_x > over_y, 1.0, 0.0), jnp.maximum(over_x, 0.0))
     along_y = jnp.where(within, jnp.where(over_x > over_y, 0.0, 1.0), jnp.maximum(over_y, 0.0))
     length = jnp.sqrt(along_x * along_x + along_y * along_y)
-    # In the middle between two faces a centre is pushed out of the one at the negative end.
+    # A centre midway between two faces is pushed out of the face at the negative end.
     along_x = jnp.where(x > 0.0, along_x, -along_x) / length
     along_y = jnp.where(y > 0.0, along_y, -along_y) / length
     depth = -jnp.maximum(over_x, over_y)
@@ -158,10 +158,10 @@ def _from_box(x: Array, y: Array, box: Box, radius: float) -> DiscGap:
 
 
 def _from_disc(x: Array, y: Array, ahead: Array, radius: float) -> DiscGap:
-    """Gap between robots that are x and y away, m, from others.
+    """Returns the gap between robots that are x and y, m, away from others.
 
-    Two hulls in one place push each other along x, as MuJoCo's do: the one that is `ahead` of the
-    other in its row, 1 or -1, towards the negative end.
+    Two hulls at the same place push each other along x, as in MuJoCo. Of each pair, one robot has
+    `ahead` 1 and the other -1; the former is pushed towards the negative end.
     """
     apart = jnp.sqrt(x * x + y * y)
     along_x = jnp.where(apart > 0.0, x / apart, -ahead)
@@ -169,14 +169,14 @@ def _from_disc(x: Array, y: Array, ahead: Array, radius: float) -> DiscGap:
 
 
 def _contact(discs: Discs, gap: DiscGap, rate: Motion, weight: Array, mobility: Array) -> Contact:
-    """What contacts ask for.
+    """Computes the parameters of contacts.
 
     Args:
-      discs: what is fixed.
+      discs: constants.
       gap: between robots and others.
-      rate: of the robots against the others, m/s.
-      weight: the inverse weights of both together, 1 / kg.
-      mobility: 1 / mass of both together, 1 / kg.
+      rate: velocity of the robots relative to the others, m/s.
+      weight: sum of both inverse weights, 1 / kg.
+      mobility: sum of both 1 / mass, 1 / kg.
 
     Returns:
       The contacts.
@@ -188,25 +188,25 @@ def _contact(discs: Discs, gap: DiscGap, rate: Motion, weight: Array, mobility: 
 
 
 def along(gap: DiscGap, motion: Motion) -> Array:
-    """J a: how fast robots move away, by how they move against what they may touch."""
+    """Returns J a: how fast robots move away from the others, given their relative motion."""
     return gap.x * motion.x + gap.y * motion.y
 
 
 def _first_force(one: Contact, motion: Motion) -> Array:
-    """The force, N, that a contact would have if robots moved like this against the other."""
+    """Returns the force, N, of a contact at this relative motion."""
     force = jnp.maximum((one.demand - along(one.gap, motion)) / one.give, 0.0)
     return jnp.where(one.gap.distance < 0.0, force, 0.0)
 
 
 def _best_force(one: Contact, motion: Motion, force: Array) -> Array:
-    """The force, N, that suits a contact best if the others push as they do."""
+    """Returns the best force, N, of a contact while all other forces stay the same."""
     short = one.demand - along(one.gap, motion) - one.give * force
     best = jnp.maximum(force + short / one.stiffness, 0.0)
     return jnp.where(one.gap.distance < 0.0, best, 0.0)
 
 
 def _impedance(discs: Discs, distance: Array) -> Array:
-    """Impedance of contacts at distances (m): MuJoCo, "Solver parameters", d(r) of `solimp`."""
+    """Returns the impedance at distances (m): MuJoCo, "Solver parameters", d(r) of `solimp`."""
     least, most, width, middle, power = (float(x) for x in discs.solimp)
     share = jnp.minimum(jnp.abs(distance) / width, 1.0)
     before = share**power / middle ** (power - 1.0)

@@ -1,10 +1,10 @@
-"""Contacts of planar robots by Warp: one kernel, one thread an arena.
+"""Contacts of planar robots in Warp: one kernel, with one thread per arena.
 
-What is solved, says `discs`. A thread looks for the contacts of its arena, writes down those that
-there are, and sweeps through these until no force changes any more. In one kernel that XLA unrolls
-for all contacts that there might be, most of a sweep is for those that there are not.
+`discs` describes the problem. A thread finds the contacts of its arena, stores them, and sweeps
+through them until no force changes. In a kernel that XLA unrolls over all possible contacts,
+most of a sweep would go to contacts that do not exist.
 
-JAX calls the kernel by `warp.jax_kernel`, of which XLA may make part of a CUDA graph.
+JAX calls the kernel through `warp.jax_kernel`, so XLA can include it in a CUDA graph.
 """
 
 import functools
@@ -22,7 +22,7 @@ from swarmjax.sim.engine import ROWS_PER_ROBOT
 from swarmjax.sim.fast import discs as sim_discs
 from swarmjax.sim.fast.discs import DiscRobots, Discs
 
-BLOCK = 64  # threads of a block: with few arenas, the blocks of 256 would leave most of a card idle
+BLOCK = 64  # threads per block; with few arenas, blocks of 256 would leave most of a GPU idle
 _TOLERANCE = wp.constant(sim_discs.TOLERANCE)
 _DEEPEST = wp.constant(sim_discs.DEEPEST)
 _WALLS = wp.constant(sim_model.WALLS)
@@ -31,25 +31,25 @@ _LENGTH = wp.constant(sim_model.WALL_HALF_LENGTH)
 
 
 def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Array:
-    """Finds how the robots of one arena accelerate with their contacts.
+    """Computes the accelerations of one arena's robots, including contacts.
 
-    Axes that `vmap` adds are arenas of one kernel, whichever they are.
+    `vmap` adds arenas to the same kernel, for any axes.
 
     Args:
-      discs: what is fixed.
-      robots: as they are and would move.
+      discs: constants.
+      robots: their state, and their accelerations without contacts.
       side: [] of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
-      [R, 3] of x and y, m/s^2, and of yaw, rad/s^2, which is `robots.free`'s.
+      [R, 3] of x and y, m/s^2, and of yaw, rad/s^2; the latter is that of `robots.free`.
     """
     many = of_arenas(functools.partial(_solve, discs))
     return many(*jax.tree.map(lambda x: x[None], (robots, side, obstacle)))[0]
 
 
 def of_arenas(solve: Any) -> Any:
-    """Lets a function of arrays with a leading axis of arenas take further ones as more arenas."""
+    """Makes a function of arrays with an arena axis treat each `vmap` axis as more arenas."""
     many = custom_vmap(solve)
 
     @many.def_vmap
@@ -59,7 +59,7 @@ def of_arenas(solve: Any) -> Any:
 
         whole = jax.tree.map(widen, given, tuple(batched))
         shape = whole[1].shape  # of the sides: [size, arenas]
-        arenas = shape[0] * shape[1]  # not -1: obstacles may be none
+        arenas = shape[0] * shape[1]  # reshape cannot infer it, as there may be no obstacles
         found = many(*jax.tree.map(lambda x: x.reshape(arenas, *x.shape[2:]), whole))
         return found.reshape(*shape, *found.shape[1:]), True
 
@@ -67,7 +67,7 @@ def of_arenas(solve: Any) -> Any:
 
 
 def _solve(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Array:
-    """The accelerations [A, R, 3] of arenas."""
+    """Computes the accelerations [A, R, 3] of many arenas."""
     arenas, count = robots.mobility.shape
     fixtures = obstacle.shape[1] + sim_model.WALLS
     pairs = count * fixtures + count * (count - 1) // 2
@@ -81,19 +81,19 @@ def _solve(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Ar
 
 @wp.struct
 class WarpArena:
-    """What a thread reads and writes.
+    """Arrays that a thread reads and writes.
 
     Attributes:
       place: [A, R] x, y (m), yaw (rad).
-      rate: [A, R] of it, 1/s.
-      before: [A, R] of the rate, 1/s^2, in the step before.
+      rate: [A, R] velocity of `place`, 1/s.
+      before: [A, R] acceleration of `place` in the previous step, 1/s^2.
       mobility: [A, R] 1 / mass.
       weight: [A, R] inverse weight.
       numbers: radius (m), stiffness (1/s^2), damping (1/s), and `solimp`.
-      row: [K, A] of each contact x and y of the unit vector along which it pushes, aref, and
+      row: [K, A] of each contact: x and y of the unit vector along which it pushes, aref, and
         J M^-1 J' + R.
       soft: [K, A] R, and the force, N.
-      between: [K, A] the robot that is pushed along, and the one that is pushed back; -1: none.
+      between: [K, A] the robot pushed along the vector, and the one pushed back; -1 for none.
       found: [A, R] acceleration of x, y and yaw.
       index: of the thread, [A].
     """
@@ -112,7 +112,7 @@ class WarpArena:
 
 
 @wp.kernel(enable_backward=False)
-def _push_apart(  # noqa: PLR0913  # JAX hands arrays over one by one
+def _push_apart(  # noqa: PLR0913  # JAX passes arrays one by one
     place: wp.array2d[wp.vec3],
     rate: wp.array2d[wp.vec3],
     free: wp.array2d[wp.vec3],
@@ -128,7 +128,7 @@ def _push_apart(  # noqa: PLR0913  # JAX hands arrays over one by one
     between: wp.array2d[wp.vec2i],
     found: wp.array2d[wp.vec3],
 ) -> None:
-    """Finds the forces of an arena's contacts and what comes of them."""
+    """Finds the forces of an arena's contacts, and the accelerations that they cause."""
     arena = WarpArena()
     arena.place = place
     arena.rate = rate
@@ -179,7 +179,7 @@ class WarpBox:
 
 @wp.func
 def obstacle_box(obstacle: wp.array3d[float], arena: int, m: int) -> WarpBox:
-    """An obstacle of an arena."""
+    """Returns an obstacle of an arena."""
     box = WarpBox()
     box.x = obstacle[arena, m, 0]
     box.y = obstacle[arena, m, 1]
@@ -192,7 +192,7 @@ def obstacle_box(obstacle: wp.array3d[float], arena: int, m: int) -> WarpBox:
 
 @wp.func
 def wall_box(side: float, k: int) -> WarpBox:
-    """The wall east, north, west or south, as `model.fixture_rectangles` has it."""
+    """Returns the wall east, north, west or south, as in `model.fixture_rectangles`."""
     box = WarpBox()
     box.cos = wp.where(k % 2 == 1, 0.0, wp.where(k == 0, 1.0, -1.0))
     box.sin = wp.where(k % 2 == 0, 0.0, wp.where(k == 1, 1.0, -1.0))
@@ -206,7 +206,7 @@ def wall_box(side: float, k: int) -> WarpBox:
 
 @wp.func
 def _touch_box(arena: WarpArena, count: int, box: WarpBox) -> int:
-    """Writes the contacts of all robots with a box down; returns how many there are by then."""
+    """Stores the contacts of all robots with a box; returns the new number of contacts."""
     known = count
     for i in range(arena.place.shape[1]):
         gap = from_box(arena.place[arena.index, i], box, arena.numbers[0])
@@ -216,7 +216,7 @@ def _touch_box(arena: WarpArena, count: int, box: WarpBox) -> int:
 
 @wp.func
 def _touch_robots(arena: WarpArena, count: int, i: int) -> int:
-    """Writes the contacts of a robot with those after it down; likewise."""
+    """Stores the contacts of a robot with later robots; returns the new number of contacts."""
     known = count
     for j in range(i + 1, arena.place.shape[1]):
         apart = arena.place[arena.index, i] - arena.place[arena.index, j]
@@ -226,10 +226,10 @@ def _touch_robots(arena: WarpArena, count: int, i: int) -> int:
 
 @wp.func
 def from_box(place: wp.vec3, box: WarpBox, radius: float) -> wp.vec3:
-    """The unit vector from a box to a robot, x and y, and the gap between them, m.
+    """Returns x and y of the unit vector from a box to a robot, and the gap between them, m.
 
-    From the nearest point of the box; of a centre within it, from the nearest face, unless that is
-    the top or the bottom (`discs.DEEPEST`).
+    The gap is measured from the box's nearest point. If the centre is within the box, it is
+    measured from the nearest face, unless that is the top or the bottom (`discs.DEEPEST`).
     """
     away_x, away_y = place[0] - box.x, place[1] - box.y
     x = box.cos * away_x + box.sin * away_y
@@ -242,7 +242,7 @@ def from_box(place: wp.vec3, box: WarpBox, radius: float) -> wp.vec3:
         along = wp.where(over_x > over_y, wp.vec2(1.0, 0.0), wp.vec2(0.0, 1.0))
         distance = wp.where(depth > _DEEPEST, radius, -depth)
     along = wp.normalize(along)
-    # In the middle between two faces a centre is pushed out of the one at the negative end.
+    # A centre midway between two faces is pushed out of the face at the negative end.
     along_x = wp.where(x > 0.0, along[0], -along[0])
     along_y = wp.where(y > 0.0, along[1], -along[1])
     world_x = box.cos * along_x - box.sin * along_y
@@ -252,9 +252,10 @@ def from_box(place: wp.vec3, box: WarpBox, radius: float) -> wp.vec3:
 
 @wp.func
 def from_disc(x: float, y: float, radius: float) -> wp.vec3:
-    """The unit vector from the second robot to the first, x and y away, m, and their gap, m.
+    """Returns the unit vector from the second robot to the first, x and y m away, and their gap, m.
 
-    Two hulls in one place push each other along x, as MuJoCo's do, the first to the negative end.
+    Two hulls at the same place push each other along x, as in MuJoCo; the first is pushed towards
+    the negative end.
     """
     apart = wp.length(wp.vec2(x, y))
     along = wp.vec2(-1.0, 0.0)
@@ -265,7 +266,7 @@ def from_disc(x: float, y: float, radius: float) -> wp.vec3:
 
 @wp.func
 def _touch(arena: WarpArena, count: int, gap: wp.vec3, first: int, second: int) -> int:
-    """Writes a contact down, if it is one, with a first force; returns how many there are then."""
+    """Stores a closed gap as a contact with an initial force; returns the number of contacts."""
     if not (gap[2] < 0.0) or count >= arena.row.shape[0]:
         return count
     arena.between[count, arena.index] = wp.vec2i(first, second)
@@ -279,7 +280,7 @@ def _touch(arena: WarpArena, count: int, gap: wp.vec3, first: int, second: int) 
     speed = _along(arena, arena.rate, gap[0], gap[1], first, second)
     demand = -arena.numbers[2] * speed - arena.numbers[1] * impedance * gap[2]
     arena.row[count, arena.index] = wp.vec4(gap[0], gap[1], demand, mobility + give)
-    # The force that the contact would have at the acceleration of the step before.
+    # Start with the force that the contact would have at the previous step's acceleration.
     short = demand - _along(arena, arena.before, gap[0], gap[1], first, second)
     force = wp.max(short / give, 0.0)
     arena.soft[count, arena.index] = wp.vec2(give, force)
@@ -289,7 +290,7 @@ def _touch(arena: WarpArena, count: int, gap: wp.vec3, first: int, second: int) 
 
 @wp.func
 def impedance_at(numbers: wp.array[float], depth: float) -> float:
-    """Impedance at a depth, m: MuJoCo's documentation, "Solver parameters", d(r) of `solimp`."""
+    """Returns the impedance at a depth, m: MuJoCo, "Solver parameters", d(r) of `solimp`."""
     least, most, middle, power = numbers[3], numbers[4], numbers[6], numbers[7]
     share = wp.min(depth / numbers[5], 1.0)
     rise = wp.pow(share, power) / wp.pow(middle, power - 1.0)
@@ -302,7 +303,7 @@ def impedance_at(numbers: wp.array[float], depth: float) -> float:
 def _along(
     arena: WarpArena, motion: wp.array2d[wp.vec3], x: float, y: float, first: int, second: int
 ) -> float:
-    """J a: how fast the two sides of a contact move apart."""
+    """Returns J a: how fast the two sides of a contact move apart."""
     apart = motion[arena.index, first]
     if second >= 0:
         apart = apart - motion[arena.index, second]
@@ -311,7 +312,7 @@ def _along(
 
 @wp.func
 def _push(arena: WarpArena, contact: int, force: float) -> None:
-    """Adds what a force brings about, a += M^-1 J' f."""
+    """Adds the accelerations due to a force, a += M^-1 J' f."""
     row = arena.row[contact, arena.index]
     between = arena.between[contact, arena.index]
     push = wp.vec3(force * row[0], force * row[1], 0.0)
@@ -322,14 +323,14 @@ def _push(arena: WarpArena, contact: int, force: float) -> None:
 
 @wp.func
 def _push_robot(arena: WarpArena, robot: int, push: wp.vec3) -> None:
-    """Adds what a push brings about."""
+    """Adds a robot's acceleration due to a push."""
     kick = arena.mobility[arena.index, robot] * push
     arena.found[arena.index, robot] = arena.found[arena.index, robot] + kick
 
 
 @wp.func
 def _sweep(arena: WarpArena, count: int) -> bool:
-    """Sets every force to its best, the others given; says whether that changed any."""
+    """Sets each force to its best value, given the others; returns whether any force changed."""
     largest = wp.float32(0.0)
     change = wp.float32(0.0)
     for k in range(count):
@@ -347,7 +348,7 @@ def _sweep(arena: WarpArena, count: int) -> bool:
 
 @wp.func
 def _finish(arena: WarpArena, free: wp.array2d[wp.vec3], count: int) -> None:
-    """Works everything out once more from the forces, without the sweeps' rounding."""
+    """Recomputes the accelerations from the forces, without the rounding of the sweeps."""
     _let_go(arena, free)
     for k in range(count):
         _push(arena, k, arena.soft[k, arena.index][1])

@@ -1,20 +1,21 @@
-"""Contacts of planar robots that rub, by JAX: what `planar_jax` does, with friction.
+"""Contacts of planar robots with friction, in JAX; `planar_jax` is the version without friction.
 
-A contact has two forces, which hold the cone |rub| <= friction * push: MuJoCo's elliptic cone of
-condim 3, whose third force is vertical, where no joint gives way, and stays 0. Through the centre
-acts the push, and with an arm the rub, so that neither moves the robot as the other does, and
+A contact has two forces within the cone |rub| <= friction * push: a push along the normal and a
+rub along the face. This is MuJoCo's elliptic cone of condim 3. The third force is vertical, where
+no joint moves, and stays 0. The push acts through the centre, the rub with an arm. Neither moves
+the robot in the way that the other does, so for one contact
 
     minimise over the cone:  1/2 f' (J M^-1 J' + R) f + f' (J a0 - aref)
 
-is, for one contact, two parabolas. Its least point is worked out at once (`project`), and
-projected Gauss-Seidel goes through contacts instead of forces: one after the other, each the best
-that it can do while the others push and rub as they do.
+is two separate parabolas. Their least point in the cone has a closed form (`project`). Projected
+Gauss-Seidel then goes through contacts instead of forces. It sets each contact to its best forces
+while the other forces stay the same.
 
-Robots that are wedged hand a force to and fro, a little less of it in each sweep, and an arena
-takes up to 200 of these; all arenas of a call wait for it. So between sweeps forces leap to where
-the last three sweeps are going (`_leap`): Anderson's acceleration (D. G. Anderson, Iterative
-Procedures for Nonlinear Integral Equations, J. ACM 12, 1965) with two sweeps of memory. What it
-saves, beside what else was tried, says docs/performance.md, "Sweeps of hulls that rub".
+Wedged robots pass a force back and forth, a little less of it in each sweep. An arena may take up
+to 200 sweeps, and all arenas of a call wait for it. So between sweeps, forces leap to where the
+last three sweeps are heading (`_leap`). This is Anderson acceleration (D. G. Anderson, Iterative
+Procedures for Nonlinear Integral Equations, J. ACM 12, 1965) with a memory of two sweeps.
+docs/performance.md compares it with alternatives.
 """
 
 import functools
@@ -30,21 +31,22 @@ from swarmjax.sim.fast import planar_jax
 from swarmjax.sim.fast.discs import TOLERANCE, DiscRobots, Discs, Rubbing, spring
 from swarmjax.sim.fast.planar_jax import Contact, DiscGap
 
-KEPT = 3  # sweeps that a leap is found by; one more saves 3 % in s6 (docs/performance.md)
-# Added to a sum of squares, as a share of it, that rounding may leave at 0: ten times float32's.
+KEPT = 3  # sweeps that a leap uses; a fourth saves 3 % in s6 (docs/performance.md)
+# Relative increase of a sum of squares that rounding may leave at 0: ten times float32's rounding.
 ROUNDING = 1e-6
-# Share of an acceleration that two roundings in float32 may leave. Without it 3 of 20,000 random
-# crowds never came to rest, of hulls that are grazed at speed, and all arenas wait for these.
+# Relative error of an acceleration after two roundings in float32. Without this limit, 3 of 20,000
+# random crowds never came to rest. They had hulls that were grazed at speed. All arenas wait for
+# such a crowd.
 FLOOR = 2.4e-7
 
 
 class Rub(NamedTuple):
-    """What a contact asks for along its face, counter-clockwise about the robot.
+    """Parameters of a contact along its face, counter-clockwise around the robot.
 
     Attributes:
-      arm: from the robot's centre to the contact, m; 0 where there is none.
-      demand: aref, the acceleration along the face that is asked for, m/s^2.
-      stiffness: what a unit of force brings about, J M^-1 J' + R, 1 / kg.
+      arm: from the robot's centre to the contact, m; 0 without contact.
+      demand: aref, requested acceleration along the face, m/s^2.
+      stiffness: J M^-1 J' + R, effect of a unit of force, 1 / kg.
     """
 
     arm: Array
@@ -53,14 +55,14 @@ class Rub(NamedTuple):
 
 
 class Touch(NamedTuple):
-    """A contact: how it pushes, and how it rubs."""
+    """A contact: its normal part and its friction part."""
 
     push: Contact
     rub: Rub
 
 
 class Force(NamedTuple):
-    """Of a contact, N: along its normal, and along its face."""
+    """Forces of a contact, N: along its normal, and along its face."""
 
     push: Array
     rub: Array
@@ -70,8 +72,8 @@ class Swept(NamedTuple):
     """The result of a sweep.
 
     Attributes:
-      force: of all contacts after it.
-      change: by how much it changed them.
+      force: forces of all contacts after the sweep.
+      change: change of the forces in the sweep.
     """
 
     force: Force
@@ -79,14 +81,14 @@ class Swept(NamedTuple):
 
 
 class Search(NamedTuple):
-    """How far sweeps have come.
+    """Progress of the sweeps.
 
     Attributes:
       done: [] sweeps.
-      force: to go on from.
-      motion: what comes of it.
+      force: forces to continue from.
+      motion: accelerations under these forces.
       last: result of the last sweep.
-      before: result of the one before it.
+      before: result of the sweep before it.
       moves: [] whether the last sweep changed a force.
     """
 
@@ -99,7 +101,7 @@ class Search(NamedTuple):
 
 
 class PlaneMotion(NamedTuple):
-    """Speeds or accelerations of robots, or of one against another (`turn`: both together)."""
+    """Velocities or accelerations of robots, or relative to others (`turn`: sum of both)."""
 
     x: Array
     y: Array
@@ -107,11 +109,11 @@ class PlaneMotion(NamedTuple):
 
 
 def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Array:
-    """Finds how the robots of one arena accelerate with their contacts.
+    """Computes the accelerations of one arena's robots, including contacts.
 
     Args:
-      discs: what is fixed.
-      robots: as they are and would move, with their `rubbing`.
+      discs: constants.
+      robots: their state, accelerations without contacts, and `rubbing`.
       side: [] of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
@@ -122,11 +124,11 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
 
 
 def solve(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> tuple[Array, Array]:
-    """Does what `push_apart` does, and tells how many sweeps that took.
+    """Does the same as `push_apart`, and also returns how many sweeps it took.
 
     Args:
-      discs: what is fixed.
-      robots: as they are and would move, with their `rubbing`.
+      discs: constants.
+      robots: their state, accelerations without contacts, and `rubbing`.
       side: [] of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
@@ -147,26 +149,26 @@ def solve(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> tup
     least = _least_change(touch, _against(discs, free, len(touch.rub.arm)))
     go_on = functools.partial(_go_on, discs, touch, robots, least)
     found = jax.lax.while_loop(goes_on, go_on, first)
-    # Once more from the forces, without the sweeps' rounding.
+    # Recompute the accelerations from the forces, without the rounding of the sweeps.
     return jnp.stack(_moved(touch, robots, free, found.force), axis=-1), found.done
 
 
 def _least_change(touch: Touch, motion: PlaneMotion) -> Array:
-    """The force, N, that rounding of such accelerations may ask for: less is no change."""
+    """Returns the force, N, that rounding of such accelerations can cause; ignore less than it."""
     size = jnp.abs(motion.x) + jnp.abs(motion.y) + touch.rub.arm * jnp.abs(motion.turn)
     closed = touch.push.gap.distance < 0.0
     return FLOOR * jnp.max(jnp.where(closed, size / touch.push.stiffness, 0.0))
 
 
 def _go_on(discs: Discs, touch: Touch, robots: DiscRobots, least: Array, now: Search) -> Search:
-    """Sweeps once, and leaps if that is allowed."""
+    """Sweeps once, and leaps if allowed."""
     force, motion = _sweep(discs, touch, robots, now.motion, now.force)
     swept = Swept(force, _minus(force, now.force))
     largest = jnp.max(jnp.stack([jnp.abs(each) for each in swept.change]))
     moves = largest > jnp.maximum(TOLERANCE * jnp.max(force.push), least)
     done = now.done + 1
-    # Only where changes shrink, or leaps may go round in circles; nor in the second half of the
-    # sweeps, since plain ones always come to rest.
+    # Leap only while changes shrink; otherwise leaps could go around in circles. Do not leap in the
+    # second half of the sweeps, since plain sweeps always come to rest.
     leaps = moves & (done >= KEPT) & (2 * done <= discs.sweeps)
     leaps &= _dot(swept.change, swept.change) <= _dot(now.last.change, now.last.change)
     leapt = _leap(touch, robots, swept, now, leaps)
@@ -175,10 +177,10 @@ def _go_on(discs: Discs, touch: Touch, robots: DiscRobots, least: Array, now: Se
 
 
 def _leap(touch: Touch, robots: DiscRobots, swept: Swept, now: Search, leaps: Array) -> Force:
-    """The mix of the last three sweeps' forces that would change least in the next.
+    """Returns the mix of the last three sweeps' forces that should change least in the next sweep.
 
-    It would if a sweep were a linear map, which it is as long as no contact begins or ends to
-    press, stick or slip.
+    This assumes that a sweep is a linear map. That holds as long as no contact starts or stops
+    pushing, sticking or slipping.
     """
     newer, older = _minus(swept.change, now.last.change), _minus(now.last.change, now.before.change)
     by_newer, by_older = (jnp.where(leaps, x, 0.0) for x in _weights(swept.change, newer, older))
@@ -189,7 +191,7 @@ def _leap(touch: Touch, robots: DiscRobots, swept: Swept, now: Search, leaps: Ar
 
 
 def _weights(change: Force, newer: Force, older: Force) -> tuple[Array, Array]:
-    """Weights x and y for which |change - x newer - y older| is least; 0 if none are told apart."""
+    """Returns weights x and y that minimise |change - x newer - y older|; 0 if undetermined."""
     size = _dot(older, older)
     share = _dot(newer, older) / size
     left = _dot(newer, newer) * (1.0 + ROUNDING) - share * _dot(newer, older)
@@ -208,7 +210,7 @@ def _minus(one: Force, other: Force) -> Force:
 
 
 def _rubbing(robots: DiscRobots) -> Rubbing:
-    """What is needed for friction, which the model has."""
+    """Returns the quantities for friction, which must be present."""
     assert robots.rubbing is not None
     return robots.rubbing
 
@@ -218,15 +220,15 @@ def _friction(robots: DiscRobots) -> Array:
 
 
 def touches(discs: Discs, robots: DiscRobots, fixture: Array) -> Touch:
-    """Lists all contacts that there might be, in the order of `planar_jax.contacts`.
+    """Lists all possible contacts, in the order of `planar_jax.contacts`.
 
     Args:
-      discs: what is fixed.
-      robots: as they are and would move, with their `rubbing`.
+      discs: constants.
+      robots: their state, accelerations without contacts, and `rubbing`.
       fixture: [F, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
-      [K, R] each robot with each fixture, then with whom it meets in each round.
+      [K, R] each robot with each fixture, then with its opponent in each round.
     """
     push = planar_jax.contacts(discs, robots, fixture)
     distance, count = push.gap.distance, len(fixture)
@@ -241,9 +243,9 @@ def touches(discs: Discs, robots: DiscRobots, fixture: Array) -> Touch:
 
 
 def _against(discs: Discs, motion: PlaneMotion, contacts: int) -> PlaneMotion:
-    """How robots [R] move against what they may touch, [K, R]; fixtures stand.
+    """Returns the motion [K, R] of robots [R] relative to their opponents; fixtures stand still.
 
-    Two that turn alike slide on each other at twice the speed: turns add up.
+    Two robots that turn the same way slide on each other at twice the speed, so turns are added.
     """
     still = jnp.zeros((contacts - len(discs.opponent), len(motion.x)))
     x, y, turn = (jnp.concatenate([still, a[discs.opponent]]) for a in motion)
@@ -251,12 +253,12 @@ def _against(discs: Discs, motion: PlaneMotion, contacts: int) -> PlaneMotion:
 
 
 def _slide(gap: DiscGap, arm: Array, motion: PlaneMotion) -> Array:
-    """J a along the face: how fast the robot's rim slides on what it touches."""
+    """Returns J a along the face: how fast the robot's rim slides on the object it touches."""
     return gap.x * motion.y - gap.y * motion.x - arm * motion.turn
 
 
 def _kick(touch: Touch, robots: DiscRobots, force: Force) -> PlaneMotion:
-    """What forces of contacts bring about, each alone."""
+    """Returns the accelerations due to each contact's forces alone."""
     gap, mobility = touch.push.gap, robots.mobility
     return PlaneMotion(
         mobility * (gap.x * force.push - gap.y * force.rub),
@@ -266,7 +268,7 @@ def _kick(touch: Touch, robots: DiscRobots, force: Force) -> PlaneMotion:
 
 
 def _moved(touch: Touch, robots: DiscRobots, free: PlaneMotion, force: Force) -> PlaneMotion:
-    """Adds what forces [K, R] bring about."""
+    """Adds the accelerations due to forces [K, R]."""
     kick = _kick(touch, robots, force)
     return PlaneMotion(*(a + jnp.sum(b, axis=0) for a, b in zip(free, kick, strict=True)))
 
@@ -274,7 +276,7 @@ def _moved(touch: Touch, robots: DiscRobots, free: PlaneMotion, force: Force) ->
 def _sweep(
     discs: Discs, touch: Touch, robots: DiscRobots, motion: PlaneMotion, force: Force
 ) -> tuple[Force, PlaneMotion]:
-    """Sets the forces [K, R] one contact after the other, those of all robots at once."""
+    """Sets the forces [K, R] to their best values, row by row, for all robots of a row at once."""
     found: list[Force] = []
     fixtures, friction = len(force.push) - len(discs.opponent), _friction(robots)
     for k in range(len(force.push)):
@@ -287,14 +289,14 @@ def _sweep(
         best = _best_force(one, apart, now, friction)
         kick = _kick(one, robots, _minus(best, now))
         motion = PlaneMotion(*(a + b for a, b in zip(motion, kick, strict=True)))
-        # Or XLA works what both forces come from out anew for each number that they change.
+        # Without the barrier, XLA recomputes the inputs of both forces for every result.
         best, motion = jax.lax.optimization_barrier((best, motion))
         found.append(best)
     return Force(*map(jnp.stack, zip(*found, strict=True))), motion
 
 
 def _first_force(touch: Touch, motion: PlaneMotion, friction: Array) -> Force:
-    """The forces that contacts would have if robots moved like this against the other."""
+    """Returns the forces of contacts at this relative motion."""
     push, rub = _short(touch, motion)
     give = touch.push.give
     force = project(Force(push / give, rub / give), give, give, friction)
@@ -302,7 +304,7 @@ def _first_force(touch: Touch, motion: PlaneMotion, friction: Array) -> Force:
 
 
 def _best_force(touch: Touch, motion: PlaneMotion, force: Force, friction: Array) -> Force:
-    """The forces that suit a contact best if the others push and rub as they do."""
+    """Returns the best forces of a contact while all other forces stay the same."""
     push, rub = _short(touch, motion)
     give, stiffness = touch.push.give, (touch.push.stiffness, touch.rub.stiffness)
     push = force.push + (push - give * force.push) / stiffness[0]
@@ -311,30 +313,30 @@ def _best_force(touch: Touch, motion: PlaneMotion, force: Force, friction: Array
 
 
 def _short(touch: Touch, motion: PlaneMotion) -> tuple[Array, Array]:
-    """By how much accelerations fall short of what contacts ask for, m/s^2."""
+    """Returns how far accelerations fall short of the contacts' demands, m/s^2."""
     gap = touch.push.gap
     push = touch.push.demand - planar_jax.along(gap, planar_jax.Motion(motion.x, motion.y))
     return push, touch.rub.demand - _slide(gap, touch.rub.arm, motion)
 
 
 def _where_closed(touch: Touch, force: Force) -> Force:
-    """Keeps the forces of contacts that there are."""
+    """Sets the forces of open gaps to 0."""
     closed = touch.push.gap.distance < 0.0
     return Force(*(jnp.where(closed, each, 0.0) for each in force))
 
 
 def project(force: Force, push: Array, rub: Array, friction: Array) -> Force:
-    """The point of the cone |rub| <= friction * push that is nearest to these forces.
+    """Returns the point of the cone |rub| <= friction * push that is nearest to these forces.
 
     Args:
-      force: without the cone.
-      push: what a deviation of the push costs, squared; above 0.
-      rub: likewise of the rub.
+      force: forces that may lie outside the cone.
+      push: weight of the squared deviation of the push; above 0.
+      rub: weight of the squared deviation of the rub; above 0.
       friction: [] 0 or above.
 
     Returns:
-      The forces themselves, if they are in the cone; else the nearest point of its edge on their
-      side, which is where the parabola along (1, friction) is least, or its tip.
+      The forces themselves, if they lie in the cone. Otherwise the nearest point of the cone's edge
+      on their side, where the parabola along (1, friction) is least, or the cone's tip.
     """
     size = jnp.abs(force.rub)
     edge = push * force.push + friction * rub * size

@@ -1,6 +1,7 @@
-"""Contacts of planar robots that rub, by Warp: what `planar_warp` does, with friction.
+"""Contacts of planar robots with friction, in Warp; `planar_warp` is the version without friction.
 
-What is solved, says `rubbing_jax`; who lists the contacts, and how JAX calls it, `planar_warp`.
+`rubbing_jax` describes the problem. `planar_warp` describes how contacts are listed and how JAX
+calls the kernel.
 """
 
 import functools
@@ -26,13 +27,13 @@ _WALLS = wp.constant(sim_model.WALLS)
 
 
 def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Array:
-    """Finds how the robots of one arena accelerate with their contacts.
+    """Computes the accelerations of one arena's robots, including contacts.
 
-    Axes that `vmap` adds are arenas of one kernel, whichever they are.
+    `vmap` adds arenas to the same kernel, for any axes.
 
     Args:
-      discs: what is fixed.
-      robots: as they are and would move, with their `rubbing`.
+      discs: constants.
+      robots: their state, accelerations without contacts, and `rubbing`.
       side: [] of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
@@ -44,7 +45,7 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
 
 
 def _solve(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Array:
-    """The accelerations [A, R, 3] of arenas."""
+    """Computes the accelerations [A, R, 3] of many arenas."""
     assert robots.rubbing is not None
     arenas, count = robots.mobility.shape
     fixtures = obstacle.shape[1] + sim_model.WALLS
@@ -60,24 +61,24 @@ def _solve(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Ar
 
 @wp.struct
 class WarpRubbingArena:
-    """What a thread reads and writes.
+    """Arrays that a thread reads and writes.
 
     Attributes:
       place: [A, R] x, y (m), yaw (rad).
-      rate: [A, R] of it, 1/s.
-      free: [A, R] of the rate, 1/s^2, without contacts.
-      before: [A, R] of the rate, 1/s^2, in the step before.
+      rate: [A, R] velocity of `place`, 1/s.
+      free: [A, R] acceleration of `place` without contacts, 1/s^2.
+      before: [A, R] acceleration of `place` in the previous step, 1/s^2.
       mobility: [A, R] 1 / mass.
       weight: [A, R] inverse weight.
       agility: [A, R] 1 / moment of inertia.
-      friction: of hulls on what they touch.
+      friction: between hulls and everything that they touch.
       numbers: radius (m), stiffness (1/s^2), damping (1/s), and `solimp`.
-      row: [K, A] of each contact x and y of the unit vector along which it pushes, its arm (m), R.
-      asked: [K, A] aref of its push and of its rub, and J M^-1 J' + R of both.
-      force: [K, A] its push and its rub, N.
-      between: [K, A] the robot that is pushed along, and the one that is pushed back; -1: none.
-      past: [KEPT, K, A] push and rub after a sweep, N, and by how much it changed them;
-        sweep i is in row i modulo KEPT.
+      row: [K, A] of each contact: x and y of the unit vector along which it pushes, its arm (m), R.
+      asked: [K, A] aref of push and rub, and J M^-1 J' + R of both.
+      force: [K, A] push and rub, N.
+      between: [K, A] the robot pushed along the vector, and the one pushed back; -1 for none.
+      past: [KEPT, K, A] push and rub after a sweep, and their changes in that sweep, N; sweep i is
+        in row i modulo KEPT.
       found: [A, R] acceleration of x, y and yaw.
       index: of the thread, [A].
     """
@@ -102,10 +103,10 @@ class WarpRubbingArena:
 
 @wp.struct
 class WarpSwept:
-    """The result of a sweep, with sums over contacts that the next leap is found by.
+    """The result of a sweep, with the sums over contacts that the next leap needs.
 
-    With r the changes of this sweep, a what they differ by from those of the last one, and b what
-    those differ by from the ones before:
+    Let r be the changes of this sweep. Let a be r minus the changes of the last sweep, and b the
+    changes of the last sweep minus those of the sweep before it.
 
     Attributes:
       moves: whether a force changed.
@@ -127,7 +128,7 @@ class WarpSwept:
 
 
 @wp.kernel(enable_backward=False)
-def _push_apart(  # noqa: PLR0913  # JAX hands arrays over one by one
+def _push_apart(  # noqa: PLR0913  # JAX passes arrays one by one
     place: wp.array2d[wp.vec3],
     rate: wp.array2d[wp.vec3],
     free: wp.array2d[wp.vec3],
@@ -147,7 +148,7 @@ def _push_apart(  # noqa: PLR0913  # JAX hands arrays over one by one
     past: wp.array3d[wp.vec4],
     found: wp.array2d[wp.vec3],
 ) -> None:
-    """Finds the forces of an arena's contacts and what comes of them."""
+    """Finds the forces of an arena's contacts, and the accelerations that they cause."""
     arena = WarpRubbingArena()
     arena.place = place
     arena.rate = rate
@@ -187,7 +188,7 @@ def _let_go(arena: WarpRubbingArena) -> None:
 
 @wp.func
 def _touch_box(arena: WarpRubbingArena, count: int, box: planar_warp.WarpBox) -> int:
-    """Writes the contacts of all robots with a box down; returns how many there are by then."""
+    """Stores the contacts of all robots with a box; returns the new number of contacts."""
     known = count
     for i in range(arena.place.shape[1]):
         gap = planar_warp.from_box(arena.place[arena.index, i], box, arena.numbers[0])
@@ -197,7 +198,7 @@ def _touch_box(arena: WarpRubbingArena, count: int, box: planar_warp.WarpBox) ->
 
 @wp.func
 def _touch_robots(arena: WarpRubbingArena, count: int, i: int) -> int:
-    """Writes the contacts of a robot with those after it down; likewise."""
+    """Stores the contacts of a robot with later robots; returns the new number of contacts."""
     known = count
     for j in range(i + 1, arena.place.shape[1]):
         apart = arena.place[arena.index, i] - arena.place[arena.index, j]
@@ -208,7 +209,7 @@ def _touch_robots(arena: WarpRubbingArena, count: int, i: int) -> int:
 
 @wp.func
 def _touch(arena: WarpRubbingArena, count: int, gap: wp.vec3, first: int, second: int) -> int:
-    """Writes a contact down, if it is one, with first forces; returns how many there are then."""
+    """Stores a closed gap as a contact with initial forces; returns the number of contacts."""
     if not (gap[2] < 0.0) or count >= arena.row.shape[0]:
         return count
     between = wp.vec2i(first, second)
@@ -225,7 +226,7 @@ def _touch(arena: WarpRubbingArena, count: int, gap: wp.vec3, first: int, second
     arena.row[count, arena.index] = row
     arena.asked[count, arena.index] = wp.vec4(push, rub, mobility + give, mobility + turns + give)
     arena.between[count, arena.index] = between
-    # The forces that the contact would have at the acceleration of the step before.
+    # Start with the forces that the contact would have at the previous step's acceleration.
     speed = _slide(arena, arena.before, row, between)
     short = wp.vec2((push - speed[0]) / give, (rub - speed[1]) / give)
     force = _project(short, give, give, arena.friction)
@@ -236,7 +237,7 @@ def _touch(arena: WarpRubbingArena, count: int, gap: wp.vec3, first: int, second
 
 @wp.func
 def _both(arena: WarpRubbingArena, of_robots: wp.array2d[float], between: wp.vec2i) -> float:
-    """Adds a number of both sides of a contact up."""
+    """Returns the sum of a number over both sides of a contact."""
     total = of_robots[arena.index, between[0]]
     if between[1] >= 0:
         total += of_robots[arena.index, between[1]]
@@ -247,7 +248,7 @@ def _both(arena: WarpRubbingArena, of_robots: wp.array2d[float], between: wp.vec
 def _slide(
     arena: WarpRubbingArena, motion: wp.array2d[wp.vec3], row: wp.vec4, between: wp.vec2i
 ) -> wp.vec2:
-    """J a: how fast the two sides of a contact move apart, and along each other."""
+    """Returns J a: how fast the two sides of a contact move apart, and along each other."""
     apart = _apart(arena, motion, between)
     along = row[0] * apart[1] - row[1] * apart[0] - row[2] * apart[2]
     return wp.vec2(row[0] * apart[0] + row[1] * apart[1], along)
@@ -255,7 +256,7 @@ def _slide(
 
 @wp.func
 def _apart(arena: WarpRubbingArena, motion: wp.array2d[wp.vec3], between: wp.vec2i) -> wp.vec3:
-    """How one side of a contact moves against the other."""
+    """Returns the motion of one side of a contact relative to the other."""
     apart = motion[arena.index, between[0]]
     if between[1] >= 0:
         other = motion[arena.index, between[1]]
@@ -265,7 +266,7 @@ def _apart(arena: WarpRubbingArena, motion: wp.array2d[wp.vec3], between: wp.vec
 
 @wp.func
 def _push(arena: WarpRubbingArena, row: wp.vec4, between: wp.vec2i, force: wp.vec2) -> None:
-    """Adds what forces bring about, a += M^-1 J' f."""
+    """Adds the accelerations due to forces, a += M^-1 J' f."""
     x = row[0] * force[0] - row[1] * force[1]
     y = row[1] * force[0] + row[0] * force[1]
     turn = -row[2] * force[1]
@@ -276,7 +277,7 @@ def _push(arena: WarpRubbingArena, row: wp.vec4, between: wp.vec2i, force: wp.ve
 
 @wp.func
 def _push_robot(arena: WarpRubbingArena, robot: int, push: wp.vec3) -> None:
-    """Adds what a push and a torque bring about."""
+    """Adds a robot's acceleration due to a push and a torque."""
     mobility = arena.mobility[arena.index, robot]
     turn = arena.agility[arena.index, robot] * push[2]
     kick = wp.vec3(mobility * push[0], mobility * push[1], turn)
@@ -285,7 +286,7 @@ def _push_robot(arena: WarpRubbingArena, robot: int, push: wp.vec3) -> None:
 
 @wp.func
 def _project(force: wp.vec2, push: float, rub: float, friction: float) -> wp.vec2:
-    """The point of the friction cone that is nearest to these forces (`rubbing_jax.project`)."""
+    """Returns the point of the friction cone nearest to these forces (`rubbing_jax.project`)."""
     size = wp.abs(force[1])
     if size <= friction * force[0]:
         return force
@@ -296,7 +297,7 @@ def _project(force: wp.vec2, push: float, rub: float, friction: float) -> wp.vec
 
 @wp.func
 def _solve_contacts(arena: WarpRubbingArena, count: int, sweeps: int) -> None:
-    """Sweeps until no force changes, and leaps in between (`rubbing_jax.solve`)."""
+    """Sweeps until no force changes, with leaps in between (`rubbing_jax.solve`)."""
     done = wp.int32(0)
     size = wp.float32(0.0)
     moves = done < sweeps
@@ -312,7 +313,7 @@ def _solve_contacts(arena: WarpRubbingArena, count: int, sweeps: int) -> None:
 
 @wp.func
 def _least_change(arena: WarpRubbingArena, count: int) -> float:
-    """The force, N, that rounding may ask for (`rubbing_jax`): less is no change."""
+    """Returns the force, N, that rounding can cause (`rubbing_jax`); ignore less than it."""
     largest = wp.float32(0.0)
     for k in range(count):
         apart = _apart(arena, arena.free, arena.between[k, arena.index])
@@ -324,7 +325,7 @@ def _least_change(arena: WarpRubbingArena, count: int) -> float:
 
 @wp.func
 def _sweep(arena: WarpRubbingArena, count: int, index: int, least: float) -> WarpSwept:
-    """Sets all forces to their best, the others given."""
+    """Sets all forces to their best values, contact by contact."""
     swept = WarpSwept()
     largest = wp.float32(0.0)
     change = wp.float32(0.0)
@@ -370,7 +371,7 @@ def _remember(
 
 @wp.func
 def _weights(swept: WarpSwept) -> wp.vec2:
-    """How far to go back on the newer and the older step (`rubbing_jax`)."""
+    """Returns the weights of the newer and the older step in a leap (`rubbing_jax`)."""
     if not (swept.older > 0.0):
         return wp.vec2(0.0, 0.0)
     both = swept.both / swept.older
@@ -383,7 +384,7 @@ def _weights(swept: WarpSwept) -> wp.vec2:
 
 @wp.func
 def _leap(arena: WarpRubbingArena, count: int, index: int, weights: wp.vec2) -> None:
-    """Goes on from the mix of the last three sweeps' forces that would change least."""
+    """Continues from the mix of the last three sweeps' forces that should change least."""
     for k in range(count):
         row = arena.row[k, arena.index]
         asked = arena.asked[k, arena.index]
@@ -401,7 +402,7 @@ def _leap(arena: WarpRubbingArena, count: int, index: int, weights: wp.vec2) -> 
 
 @wp.func
 def _finish(arena: WarpRubbingArena, count: int) -> None:
-    """Works everything out once more from the forces, without the sweeps' rounding."""
+    """Recomputes the accelerations from the forces, without the rounding of the sweeps."""
     _let_go(arena)
     for k in range(count):
         between = arena.between[k, arena.index]

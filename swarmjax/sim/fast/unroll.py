@@ -1,7 +1,7 @@
-"""Going through a short axis of things, so that XLA makes one kernel of what follows.
+"""Processes a short axis of objects in slices, so that XLA makes one kernel of the computation.
 
-On a GPU the minimum over four obstacles is a kernel of its own, which reads what leads to it from
-memory. Taken one thing after the other all is elementwise, and XLA keeps it in registers.
+On a GPU, a minimum over four obstacles becomes its own kernel, which reads its inputs from memory.
+One object at a time, all operations are elementwise, and XLA keeps the values in registers.
 """
 
 from typing import Any
@@ -9,19 +9,19 @@ from typing import Any
 import numpy as np
 
 Array = Any
-MOST = 16  # things that are taken one by one; a program grows with their number
+MOST = 16  # objects processed one by one; the program grows with their number
 
 
 def pieces(count: int, xp: Any) -> list[slice]:
-    """Cuts an axis of things up.
+    """Splits an axis of objects into slices.
 
     Args:
-      count: how many things there are.
+      count: number of objects.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      Slices that cover the axis: of one thing each, or one of all where there are many or none,
-      and for NumPy, which pays for every call.
+      Slices that cover the axis, one per object. A single slice for many objects, for none, and for
+      NumPy, where every call costs time.
     """
     if xp is np or not 0 < count <= MOST:
         return [slice(None)]

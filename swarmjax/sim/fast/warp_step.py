@@ -1,7 +1,7 @@
-"""How MJX-Warp takes a physics step: by Newton's method, its own, or by one made for a body.
+"""Replaces the physics step of MJX-Warp with one made for a body. Needs Warp.
 
-MJX calls Warp's `step` by its name, and there it is replaced; a model says by its `opt.solver`
-which step is meant, and one that names none of ours is stepped as ever. Needs Warp.
+MJX calls Warp's `step` by name, and this module replaces that function. The model's `opt.solver`
+selects the step. All other values of `opt.solver` select MJX-Warp's own step.
 """
 
 import copy
@@ -20,36 +20,36 @@ _newton = mjw.step
 
 
 def load_engine(model: mujoco.MjModel, robots: int, arenas: int) -> Engine:
-    """Loads MJX-Warp with the contact solver that is made for wheeled robots.
+    """Loads MJX-Warp with the contact solver made for wheeled robots.
 
     Args:
       model: compiled, one arena.
       robots: R.
-      arenas: how many arenas will be stepped together.
+      arenas: number of arenas stepped together.
 
     Returns:
       The engine.
     """
     model = copy.copy(model)
-    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE  # as `wheeled_warp` reads it
+    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE  # the format that `wheeled_warp` reads
     plain = engine.load_mjx(model, robots, "warp", arenas)
     install()
     chosen = plain.model.tree_replace({"opt.solver": wheeled_warp.NUMBER})
-    # Speeds of the environment: README.md, "What steps the robots".
+    # Speed of the whole environment, not of the physics alone.
     label = "MJX with swarmjax's contact solver (3.2 times as fast as sim.solver=mjx on an H200)"
     return replace(plain, label=label, model=chosen)
 
 
 def install() -> None:
-    """Lets MJX step models as their `opt.solver` says; does nothing the second time."""
+    """Makes MJX step models as their `opt.solver` selects; does nothing the second time."""
     forward.mjwarp.step = step
 
 
 def step(m: Any, d: Any) -> None:
-    """Moves all arenas on by one physics step.
+    """Advances all arenas by one physics step.
 
     Args:
       m: Warp's model.
-      d: Warp's data of all arenas, written to.
+      d: Warp's data of all arenas, modified in place.
     """
     (wheeled_warp.step if m.opt.solver == wheeled_warp.NUMBER else _newton)(m, d)

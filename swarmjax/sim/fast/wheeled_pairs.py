@@ -1,6 +1,6 @@
-"""Contacts between wheeled robots: Newton's method for those that touch each other, together.
+"""Contacts between wheeled robots: Newton's method for robots that touch each other, jointly.
 
-`wheeled_warp` says what is solved, and solves it first robot by robot.
+`wheeled_warp` describes the problem, and first solves it for single robots.
 """
 
 import warp as wp
@@ -27,7 +27,8 @@ from swarmjax.sim.fast.wheeled_problem import (
     times,
 )
 
-# Threads of which one takes an arena: what 32 read each from its own place takes 32 turns.
+# Only one of SPREAD threads takes an arena. If all 32 threads of a warp read different places,
+# their reads take 32 turns.
 SPREAD = wp.constant(4)
 
 
@@ -35,7 +36,7 @@ SPREAD = wp.constant(4)
 def relax_pairs(
     problem: Problem, together: Together, robots: int, iterations: int, niter: wp.array[int]
 ) -> None:
-    """Newton's method for the robots of an arena that touch each other."""
+    """Runs Newton's method for the robots of an arena that touch each other."""
     turn = wp.tid() / SPREAD
     if wp.tid() % SPREAD == 0 and turn < together.crowded[0]:
         arena = together.arena[turn]
@@ -68,7 +69,7 @@ def _collect(problem: Problem, together: Together, arena: int, robots: int) -> N
 
 @wp.func
 def _along(problem: Problem, arena: int, row: int, of_joints: wp.array2d[float]) -> float:
-    """A row of J between two robots times what their joints have."""
+    """Multiplies a row of J between two robots by values of their joints."""
     first, second = problem.first[arena, row], problem.second[arena, row]
     found = wp.dot(entries_of(problem, arena, first), of_robot(of_joints, arena, first[0]))
     return found + wp.dot(entries_of(problem, arena, second), of_robot(of_joints, arena, second[0]))
@@ -76,7 +77,7 @@ def _along(problem: Problem, arena: int, row: int, of_joints: wp.array2d[float])
 
 @wp.func
 def _pick(problem: Problem, together: Together, arena: int) -> None:
-    """Finds out which rows between robots act, and which of those become terms of their own."""
+    """Finds the active rows between robots, and selects those that become separate terms."""
     taken = wp.int32(0)
     for k in range(together.count[arena]):
         row = together.row[arena, k]
@@ -92,7 +93,7 @@ def _pick(problem: Problem, together: Together, arena: int) -> None:
 
 @wp.func
 def _descend(problem: Problem, together: Together, arena: int, robot: int) -> None:
-    """Works out a robot's step as if its pairs' terms were not there, and its block's factor."""
+    """Computes a robot's step without the separate terms, and the factor of its block."""
     put_robot(together.step, arena, robot, Vector())
     if problem.touches[arena, robot]:
         hessian = inertia_of(problem, arena, robot)
@@ -117,7 +118,7 @@ def _descend(problem: Problem, together: Together, arena: int, robot: int) -> No
 
 @wp.func
 def _couple(problem: Problem, together: Together, arena: int) -> None:
-    """Takes the pairs' terms into the step: Woodbury's identity."""
+    """Adds the separate terms to the step, by the Woodbury identity."""
     taken = together.taken[arena]
     matrix = wp.identity(n=8, dtype=wp.float32) + Matrix()
     right = Vector()
@@ -146,13 +147,13 @@ def _couple(problem: Problem, together: Together, arena: int) -> None:
 
 @wp.func
 def _side(problem: Problem, arena: int, row: int, side: int) -> wp.vec3i:
-    """The first or the second robot of a row, and its `entries_of` there."""
+    """Returns the `side` of the first or the second robot of a row, as for `entries_of`."""
     return wp.where(side == 0, problem.first[arena, row], problem.second[arena, row])
 
 
 @wp.func
 def _overlap(problem: Problem, together: Together, arena: int, i: int, j: int, sides: int) -> float:
-    """What pair j brings about along pair i in the robot that is on these sides of both."""
+    """Returns the effect of pair j along pair i, in the robot on these sides of both pairs."""
     row = together.pair[arena, i]
     mine = _side(problem, arena, row, sides % 2)
     theirs = _side(problem, arena, together.pair[arena, j], sides // 2)
@@ -163,7 +164,7 @@ def _overlap(problem: Problem, together: Together, arena: int, i: int, j: int, s
 
 @wp.func
 def _take(problem: Problem, together: Together, arena: int, robots: int) -> bool:
-    """Takes the step; says whether another is needed."""
+    """Takes the step; returns whether another is needed."""
     switches = wp.bool(False)
     for k in range(together.count[arena]):
         row = together.row[arena, k]
@@ -189,7 +190,7 @@ def _take(problem: Problem, together: Together, arena: int, robots: int) -> bool
 
 @wp.func
 def _slopes(problem: Problem, together: Together, arena: int, robot: int) -> bool:
-    """Works out J times the step for the rows of a robot alone; says whether any switches."""
+    """Computes J times the step for a robot's own rows; returns whether any of them switches."""
     switches = wp.bool(False)
     step = of_robot(together.step, arena, robot)
     for k in range(problem.own[arena, robot]):
@@ -203,7 +204,7 @@ def _slopes(problem: Problem, together: Together, arena: int, robot: int) -> boo
 
 @wp.func
 def _length_together(problem: Problem, together: Together, arena: int, robots: int) -> float:
-    """How far to go along the step of all, as `_length` says of one."""
+    """Returns the best length of the joint step, as `_length` does for a single robot."""
     first, curve = wp.float32(0.0), wp.float32(0.0)
     for robot in range(robots):
         if problem.touches[arena, robot]:
@@ -228,7 +229,7 @@ def _length_together(problem: Problem, together: Together, arena: int, robots: i
 def _tilt_together(
     problem: Problem, together: Together, arena: int, robots: int, length: float
 ) -> wp.vec2:
-    """First and second derivative of those robots' rows' cost along the step."""
+    """Returns first and second derivative of the cost of these robots' rows along the step."""
     tilt = wp.vec2()
     for k in range(together.count[arena]):
         tilt = tilt + _tilt_of(problem, together, arena, together.row[arena, k], length)
@@ -243,7 +244,7 @@ def _tilt_together(
 
 @wp.func
 def _tilt_of(problem: Problem, together: Together, arena: int, row: int, length: float) -> wp.vec2:
-    """First and second derivative of a row's cost along the step."""
+    """Returns first and second derivative of a row's cost along the step."""
     slope = together.slope[arena, row]
     push = wp.min(0.0, together.gap[arena, row] + length * slope)
     weight = wp.where(push < 0.0, problem.D[arena, row] * slope, 0.0)

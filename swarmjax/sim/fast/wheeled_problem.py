@@ -1,41 +1,42 @@
-"""The convex problem of wheeled robots' contacts, as `wheeled_warp` and `wheeled_pairs` solve it.
+"""The convex problem of wheeled robots' contacts, for `wheeled_warp` and `wheeled_pairs`.
 
-Loops over joints are unrolled, which Warp does if their ends are constants or the count of a loop
-around them: only then does a matrix stay in registers. Functions get copies of their arguments.
+Loops over joints are unrolled, because a matrix stays in registers only then. Warp unrolls a loop
+if its bounds are constants or the counter of an enclosing loop. Functions get copies of arguments.
 """
 
 from typing import Any
 
 import warp as wp
 
-JOINTS = wp.constant(8)  # of a robot: free in space, and two wheels
-FREE = wp.constant(6)  # of these, free in space
-_INERTIA = wp.constant(35)  # entries of a robot's M, without that of both wheels, which is 0
-SHARED = wp.constant(-2)  # instead of a wheel, in a row of two robots
-# What `Problem.scaled` has after a row's entries.
+JOINTS = wp.constant(8)  # of a robot: six of a free body, and two wheels
+FREE = wp.constant(6)  # of these, the joints of the free body
+_INERTIA = wp.constant(35)  # entries of a robot's M, without the zero between both wheels
+SHARED = wp.constant(-2)  # in place of a wheel, in a row between two robots
+# Entries of `Problem.scaled` that follow a row's entries.
 AREF = wp.constant(8)
 GAP = wp.constant(9)
 SLOPE = wp.constant(10)
 _GEOMS = 5  # of a robot: hull, two wheels, two skids
-SEARCHES = wp.constant(12)  # of a step's length
-# Share of the slope at a step's beginning that counts for nothing: float32 rounds at 1e-7, and the
-# grips of a robot are 1e3 times as stiff as its mass.
+SEARCHES = wp.constant(12)  # largest number of trials for a step's length
+# Slopes below this share of the initial slope count as zero. float32 rounds at 1e-7, and the grips
+# of a robot are 1e3 times as stiff as its mass.
 FLAT = wp.constant(1e-4)
-# Shares of the acceleration: a step that may be the last, and one that is nothing but rounding.
+# Shares of the acceleration. A step below the first may be the last; one below the second is only
+# rounding.
 _SHORT = wp.constant(1e-2)
 _ROUNDING = wp.constant(1e-5)
-# Contacts between robots that are taken as terms of their own. More go into the robots' blocks,
-# which makes for more and shorter steps: five robots have ten pairs, swarms of more get Newton's
-# method (`dispatch.MOST_WHEELED`). As many as a robot's joints: one size of matrix serves both.
+# Contacts between robots that become separate terms. Further ones are added to the robots' blocks,
+# which takes more and shorter steps. Five robots have ten pairs; larger swarms use Newton's method
+# (`dispatch.MOST_WHEELED`). The number equals JOINTS, so one size of matrix serves both.
 PAIRS = wp.constant(8)
 
 
 class Vector(wp.types.vector(length=JOINTS, dtype=wp.float32)):
-    """A number for each joint of a robot."""
+    """One number for each joint of a robot."""
 
 
 class Matrix(wp.types.matrix(shape=(JOINTS, JOINTS), dtype=wp.float32)):
-    """A number for each two of them."""
+    """One number for each pair of joints of a robot."""
 
 
 @wp.struct
@@ -43,23 +44,25 @@ class Problem:
     """The problem of all arenas.
 
     Attributes:
-      force: [A, V] what acts on the joints but contacts, M a0.
+      force: [A, V] forces on the joints without contacts, M a0.
       qacc: [A, V] accelerations.
-      M: [A, C] inertia matrices, `_INERTIA` entries a robot.
+      M: [A, C] inertia matrices, `_INERTIA` entries per robot.
       count: [A] rows of the Jacobian.
-      J: [A, 1, E] Jacobians; a row has `J_count` entries from `J_first` on, of joints that go down.
+      J: [A, 1, E] Jacobians; a row has `J_count` entries from `J_first` on, with descending joints.
       J_first: [A, N].
       J_count: [A, N].
       J_column: [A, 1, E].
       D: [A, N] weight of a row.
-      aref: [A, N] acceleration that it asks for.
-      first: [A, N] of a row of two robots, the one with the higher number, and its `entries_of`.
-      second: [A, N] the other.
-      own: [A, R] rows of a robot.
-      row: [A, R, K] which they are, and its `entries_of` in them.
-      touches: [A, R] whether any is of another robot too.
-      scaled: [K, 11, A R] times the root of D: its `entries_of` in them and aref, and, as `_relax`
-        goes, J a - aref and J times the step. What threads read at once lies side by side.
+      aref: [A, N] acceleration that a row demands.
+      first: [A, N] for a row between two robots, the `side` (as for `entries_of`) of the robot with
+        the higher number.
+      second: [A, N] the `side` of the other robot.
+      own: [A, R] number of rows of a robot.
+      row: [A, R, K] indices of these rows, and where the robot's entries are in them.
+      touches: [A, R] whether any row also involves another robot.
+      scaled: [K, 11, A R] for each row, times the root of D: the robot's entries and aref, and
+        during `_relax` also J a - aref and J times the step. Values that threads read at the same
+        time are adjacent.
     """
 
     force: wp.array2d[float]
@@ -82,21 +85,21 @@ class Problem:
 
 @wp.struct
 class Together:
-    """What is worked out for robots that touch each other.
+    """Work arrays for robots that touch each other.
 
     Attributes:
-      crowded: [1] how many arenas have any.
-      arena: [A] which they are.
+      crowded: [1] number of arenas with such robots.
+      arena: [A] indices of these arenas.
       count: [A] rows between two robots.
-      row: [A, N] which they are.
-      step: [A, V] Newton's; 0 of all other robots.
-      gap: [A, N] J a - aref: a row acts below 0.
+      row: [A, N] indices of these rows.
+      step: [A, V] Newton's step; 0 for all other robots.
+      gap: [A, N] J a - aref; a row is active below 0.
       slope: [A, N] J times the step.
-      slot: [A, N] which of the terms of their own a row is; -1: none.
-      taken: [A] how many there are.
-      pair: [A, P] the rows that they are.
-      factor: [A, R] Cholesky's, of a robot's block.
-      response: [A, P, 2] what a unit of the force of a pair's contact brings about in either robot.
+      slot: [A, N] index of a row's separate term; -1 for none.
+      taken: [A] number of separate terms.
+      pair: [A, P] rows of the separate terms.
+      factor: [A, R] Cholesky factor of a robot's block.
+      response: [A, P, 2] effect of a unit of a pair's contact force on either robot.
     """
 
     crowded: wp.array[int]
@@ -114,7 +117,7 @@ class Together:
 
 
 def gather(m: Any, d: Any, robots: int) -> Any:
-    """Gathers the problem; what it lists is not filled in yet."""
+    """Gathers the problem; its lists are filled in later."""
     problem = Problem()
     problem.force = wp.empty((d.nworld, m.nv), dtype=float)
     problem.qacc, problem.M = d.qacc, d.M
@@ -132,13 +135,13 @@ def gather(m: Any, d: Any, robots: int) -> Any:
 
 
 def _most_rows(m: Any, robots: int) -> int:
-    """Rows that a robot can have: 4 of each wheel, 1 of each skid, 1 of its hull with all else."""
-    others = m.ngeom - 1 - _GEOMS * robots  # but the floor
+    """Counts the rows of a robot, at most: 4 per wheel, 1 per skid, 1 per object near its hull."""
+    others = m.ngeom - 1 - _GEOMS * robots  # without the floor
     return 2 * 4 + 2 + robots - 1 + others
 
 
 def make_room(m: Any, d: Any, robots: int) -> Any:
-    """Makes room for what is worked out for robots that touch each other."""
+    """Allocates the work arrays for robots that touch each other."""
     arenas, together = d.nworld, Together()
     together.crowded = wp.empty(1, dtype=int)
     together.arena = wp.empty(arenas, dtype=int)
@@ -157,22 +160,22 @@ def make_room(m: Any, d: Any, robots: int) -> Any:
 
 @wp.func
 def does_switch(gap: float, slope: float) -> bool:
-    """Whether a row acts before a whole step and not after it, or the other way round.
+    """Returns whether a row is active before a whole step and not after it, or vice versa.
 
-    If none does, the cost is quadratic along the step, and its whole length the best.
+    If no row switches, the cost is quadratic along the step, and the whole step is best.
     """
     return (gap < 0.0) != (gap + slope < 0.0)
 
 
 @wp.func
 def goes_on(moves: bool, step: float, acceleration: float) -> bool:
-    """Whether there is more to do: a long step leaves its rounding behind, a tiny one is that."""
+    """Returns whether to continue: a long step leaves rounding errors; a tiny one is only that."""
     return (moves or step > _SHORT * acceleration) and step > _ROUNDING * acceleration
 
 
 @wp.func
 def of_robot(of_joints: wp.array2d[float], arena: int, robot: int) -> Vector:
-    """What a robot has at its joints."""
+    """Returns the values of a robot's joints."""
     found = Vector()
     for i in range(8):
         found[i] = of_joints[arena, robot * JOINTS + i]
@@ -181,14 +184,14 @@ def of_robot(of_joints: wp.array2d[float], arena: int, robot: int) -> Vector:
 
 @wp.func
 def put_robot(of_joints: wp.array2d[float], arena: int, robot: int, numbers: Vector) -> None:
-    """Gives a robot's joints their numbers."""
+    """Sets the values of a robot's joints."""
     for i in range(8):
         of_joints[arena, robot * JOINTS + i] = numbers[i]
 
 
 @wp.func
 def inertia_of(problem: Problem, arena: int, robot: int) -> Matrix:
-    """M of a robot, the lower half of it: MuJoCo keeps its rows one after the other."""
+    """Returns the lower half of a robot's M; MuJoCo stores it row by row."""
     found = Matrix()
     entry = robot * _INERTIA
     for i in range(6):
@@ -208,11 +211,14 @@ def inertia_of(problem: Problem, arena: int, robot: int) -> Matrix:
 
 @wp.func
 def entries_of(problem: Problem, arena: int, side: wp.vec3i) -> Vector:
-    """A row's entries at a robot.
+    """Returns a row's entries for one robot.
 
     Args:
-      side: the robot or the row, which is not looked at; where the body's six entries are, which
-        come from the last joint to the first; and which wheel's joint has the one before them.
+      problem: the problem.
+      arena: index of the arena.
+      side: three numbers. The first is the robot or the row and is not read here. The second is the
+        place of the body's six entries, which are stored from the last joint to the first. The
+        third is the wheel whose entry precedes them.
     """
     found = Vector()
     for i in range(6):
@@ -225,7 +231,7 @@ def entries_of(problem: Problem, arena: int, side: wp.vec3i) -> Vector:
 
 @wp.func
 def times(matrix: Matrix, vector: Vector) -> Vector:
-    """Product with a symmetric matrix of which there is the lower half."""
+    """Multiplies a symmetric matrix, given as its lower half, by a vector."""
     found = Vector()
     for i in range(8):
         for j in range(i):
@@ -237,7 +243,7 @@ def times(matrix: Matrix, vector: Vector) -> Vector:
 
 @wp.func
 def add(matrix: Matrix, left: Vector, right: Vector) -> Matrix:
-    """The lower half of matrix + left right', which is symmetric."""
+    """Returns the lower half of matrix + left right', which is symmetric."""
     for i in range(8):
         for j in range(i):
             matrix[i, j] = matrix[i, j] + left[i] * right[j]
@@ -247,7 +253,7 @@ def add(matrix: Matrix, left: Vector, right: Vector) -> Matrix:
 
 @wp.func
 def factor_of(matrix: Matrix) -> Matrix:
-    """Cholesky's L of a positive definite matrix L L' of which there is the lower half."""
+    """Returns the Cholesky factor L of a positive definite matrix L L', given as its lower half."""
     for i in range(8):
         for j in range(i):
             for k in range(j):
@@ -274,7 +280,7 @@ def substitute(lower: Matrix, right: Vector) -> Vector:
 
 @wp.func
 def narrow(search: wp.vec3, tilt: float, curve: float) -> wp.vec3:
-    """Too short a length, too long a one, and where to look next: by Newton, or halfway."""
+    """Narrows a range of step lengths; returns its ends and the next trial (Newton or midpoint)."""
     low = wp.where(tilt < 0.0, search[2], search[0])
     high = wp.where(tilt < 0.0, search[1], search[2])
     there = search[2] - tilt / curve

@@ -1,16 +1,17 @@
-"""Contacts of the wheeled body on the GPU: Newton's method robot by robot, one thread a robot.
+"""Contacts of the wheeled body on the GPU: Newton's method with one thread per robot.
 
-MuJoCo's convex problem for the accelerations a (MuJoCo's documentation, Computation, "Primal
-problem"), with rows of pyramidal friction cones and of contacts that only push,
+MuJoCo solves a convex problem for the accelerations a (MuJoCo's documentation, Computation, "Primal
+problem"), with rows for pyramidal friction cones and for contacts that only push,
 
-    minimise  1/2 (a - a0)' M (a - a0) + sum_i D_i / 2 min(0, J_i a - aref_i)^2,
+    minimise  1/2 (a - a0)' M (a - a0) + sum_i D_i / 2 min(0, J_i a - aref_i)^2.
 
-falls into one of 8 unknowns for each robot that touches the floor, walls and obstacles alone: M
-and those rows of J have entries of one robot each. MJX-Warp's Newton method takes all robots of an
-arena together and factorises a matrix of 8 R rows at every iteration. Here only robots that touch
-each other are taken together, and even their Hessian is one block of 8 x 8 a robot, and a term of
-rank one for each contact between two, which the Woodbury identity takes out of the inverse (Golub
-and Van Loan 2013, "Matrix Computations", 2.1.4).
+For robots that touch only the floor, walls and obstacles, the rows of M and J involve one robot
+each. The problem then splits into one problem with 8 unknowns per robot. MJX-Warp's Newton method
+instead takes all robots of an arena together, and factorises a matrix of 8 R rows per iteration.
+
+Here only robots that touch each other are taken together. Their Hessian is one 8 x 8 block per
+robot, plus a rank-one term per contact between two robots. The Woodbury identity moves these terms
+out of the inverse (Golub and Van Loan 2013, "Matrix Computations", 2.1.4).
 """
 
 from typing import Any
@@ -46,19 +47,19 @@ from swarmjax.sim.fast.wheeled_problem import (
     times,
 )
 
-NUMBER = -1  # what `opt.solver` says; MuJoCo has none of it
-_ITERATIONS = 20  # of Newton's method, at most; six do where robots touch, 18 were seen
-_BLOCK = 64  # threads; each has much to do, and some much more: small blocks wait less
+NUMBER = -1  # value of `opt.solver` for this solver; MuJoCo does not use it
+_ITERATIONS = 20  # limit of Newton's method; touching robots usually need six, at most 18 so far
+_BLOCK = 64  # threads; their work is long and uneven, so small blocks wait less
 
 
 def step(m: Any, d: Any) -> None:
-    """Moves all arenas of wheeled robots on by one physics step (MuJoCo's semi-implicit Euler).
+    """Advances all arenas of wheeled robots by one physics step (MuJoCo's semi-implicit Euler).
 
-    Of what acts on bodies, `xfrc_applied` is left out: nothing here uses it.
+    It ignores the external forces `xfrc_applied`, since nothing here uses them.
 
     Args:
-      m: Warp's model: robots of eight joints each, and no others; a sparse Jacobian.
-      d: Warp's data of all arenas, written to; the forces of contacts are not.
+      m: Warp's model: only robots, with eight joints each; a sparse Jacobian.
+      d: Warp's data of all arenas, modified in place, except for the contact forces.
     """
     mjw.fwd_position(m, d, factorize=False)
     mjw.fwd_velocity(m, d)
@@ -86,7 +87,7 @@ def _begin(
     actuator: wp.array2d[float],
     warmstart: wp.array2d[float],
 ) -> None:
-    """Adds up what acts on a joint, and starts at the acceleration of the step before."""
+    """Sums the forces on a joint, and starts from the previous step's acceleration."""
     arena, dof = wp.tid()
     given = applied[arena, dof] - bias[arena, dof]
     problem.force[arena, dof] = given + passive[arena, dof] + actuator[arena, dof]
@@ -95,7 +96,7 @@ def _begin(
 
 @wp.kernel(enable_backward=False)
 def _share_out(problem: Problem, together: Together) -> None:
-    """Lists the rows of a robot, and, by its first robot, an arena in which any touch."""
+    """Lists the rows of a robot. The first robot also lists its arena if any robots touch."""
     arena, robot = wp.tid()
     own = wp.int32(0)
     touches, crowded = wp.bool(False), wp.bool(False)
@@ -118,15 +119,16 @@ def _share_out(problem: Problem, together: Together) -> None:
 
 @wp.func
 def _count(problem: Problem, arena: int) -> int:
-    """How many rows there are; of more than there is room for, the rest is left out."""
+    """Returns the number of rows; rows beyond the memory's size are left out."""
     return wp.min(problem.count[arena], problem.first.shape[1])
 
 
 @wp.func
 def _sides(problem: Problem, arena: int, row: int) -> tuple[wp.vec3i, wp.vec3i]:
-    """The robots of a row and their `entries_of` in it; of two, the higher number comes first.
+    """Returns the `side` of a row's robots, as for `entries_of`; the higher number comes first.
 
-    A row has the six entries of a body, after that of a wheel if it is a wheel's; or twelve.
+    A row has a body's six entries, preceded by the wheel's entry for a wheel's row; or twelve
+    entries for two robots.
     """
     first = problem.J_first[arena, row]
     joint = problem.J_column[arena, 0, first]
@@ -142,7 +144,7 @@ def _sides(problem: Problem, arena: int, row: int) -> tuple[wp.vec3i, wp.vec3i]:
 
 @wp.func
 def _scale(problem: Problem, arena: int, robot: int, k: int) -> None:
-    """Copies a robot's row to where neighbouring threads read it at once."""
+    """Copies a robot's row to adjacent memory of neighbouring threads, for simultaneous reads."""
     side = problem.row[arena, robot, k]
     root = wp.sqrt(problem.D[arena, side[0]])
     entries = root * entries_of(problem, arena, side)
@@ -154,7 +156,7 @@ def _scale(problem: Problem, arena: int, robot: int, k: int) -> None:
 
 @wp.kernel(enable_backward=False)
 def _relax_each(problem: Problem, iterations: int) -> None:
-    """Finds the accelerations of a robot that touches no other."""
+    """Finds the accelerations of a robot that touches no other robot."""
     arena, robot = wp.tid()
     if not problem.touches[arena, robot]:
         _relax(problem, arena, robot, iterations)
@@ -162,9 +164,9 @@ def _relax_each(problem: Problem, iterations: int) -> None:
 
 @wp.func
 def _relax(problem: Problem, arena: int, robot: int, iterations: int) -> None:
-    """Newton's method for a robot alone."""
+    """Runs Newton's method for a single robot."""
     lane, own = arena * problem.own.shape[1] + robot, problem.own[arena, robot]
-    # Not where rows are listed: there, neighbouring threads come to theirs one after the other.
+    # Copy here, not where rows are listed: there, neighbouring threads would copy one by one.
     for k in range(own):
         _scale(problem, arena, robot, k)
     now = of_robot(problem.qacc, arena, robot)
@@ -188,7 +190,7 @@ def _relax(problem: Problem, arena: int, robot: int, iterations: int) -> None:
 
 @wp.func
 def _newton(problem: Problem, arena: int, robot: int, now: Vector) -> Vector:
-    """Newton's step, of the rows that act now."""
+    """Returns Newton's step for the rows that are active now."""
     lane = arena * problem.own.shape[1] + robot
     hessian = inertia_of(problem, arena, robot)
     uphill = times(hessian, now) - of_robot(problem.force, arena, robot)
@@ -204,7 +206,7 @@ def _newton(problem: Problem, arena: int, robot: int, now: Vector) -> Vector:
 
 @wp.func
 def _scaled(problem: Problem, k: int, lane: int) -> Vector:
-    """A robot's entries in a row of its own, times the root of D."""
+    """Returns a robot's entries in one of its rows, times the root of D."""
     found = Vector()
     for i in range(8):
         found[i] = problem.scaled[k, i, lane]
@@ -213,7 +215,7 @@ def _scaled(problem: Problem, k: int, lane: int) -> Vector:
 
 @wp.func
 def _length(problem: Problem, arena: int, robot: int, now: Vector, downhill: Vector) -> float:
-    """How far to go along a step: where the cost, which is convex along it, is least."""
+    """Returns the step length with the least cost; the cost is convex along the step."""
     inertia = inertia_of(problem, arena, robot)
     pull = times(inertia, now) - of_robot(problem.force, arena, robot)
     first, curve = wp.dot(pull, downhill), wp.dot(downhill, times(inertia, downhill))
@@ -230,7 +232,7 @@ def _length(problem: Problem, arena: int, robot: int, now: Vector, downhill: Vec
 
 @wp.func
 def _tilt(problem: Problem, arena: int, robot: int, length: float) -> wp.vec2:
-    """First and second derivative of the rows' cost along a step."""
+    """Returns first and second derivative of the rows' cost along a step."""
     lane = arena * problem.own.shape[1] + robot
     tilt = wp.vec2()
     for k in range(problem.own[arena, robot]):

@@ -1,4 +1,4 @@
-"""A corridor for one robot at a time, with a bay in which one lets the other pass."""
+"""A corridor for one robot at a time, with a bay where one robot lets the other pass."""
 
 from typing import Any
 
@@ -19,8 +19,8 @@ from swarmjax.task.layouts.site import (
 )
 
 Array = Any
-_ENDS = 0.10  # m, along which targets are spread at either end of the corridor
-_AHEAD = 0.20  # m, between the end of where one robot's target is and where the other starts
+_ENDS = 0.10  # m, length of the target area at either end of the corridor
+_AHEAD = 0.20  # m, between one robot's target area and the other robot's start
 
 
 def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
@@ -32,8 +32,8 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      What is drawn. The first robot starts at the left end and the second at the right, each with
-      its target at the other's end, behind where the other starts.
+      The layout. The first robot starts at the left end and the second at the right end. Each has
+      its target at the opposite end, behind the start of the other robot.
     """
     count = site.present.shape[0]
     place, starts, targets, aside = split(uniforms, [2, count, count, 2 * count])
@@ -42,7 +42,7 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     most = xp.maximum(half_y - gap // 2 - recess - THICKNESS, 0)
     middle = pick(place[0], -most, most, xp)
     bay = pick(place[1], -(half_x // 4), half_x // 4, xp)
-    # The first goes right, the second left; there is no third.
+    # The first robot goes right, the second left; there is no third.
     way = xp.where(np.arange(count) % 2 == 0, 1, -1)
     end = half_x - site.clear
     last = in_units(_ENDS)
@@ -60,7 +60,7 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
 
 
 def _walls(site: Site, bay: Array, middle: Array, recess: Array, xp: Any) -> Array:
-    """The wall on the right, those on the left before, behind and beyond the bay, [4, 4] units."""
+    """Returns the walls [4, 4] (units): the right one, then the left ones around the bay."""
     half_x, thin, aside = site.half[0], THICKNESS // 2, site.numbers.gap // 2
     along = site.numbers.length // 2
     left = between(-half_x, bay - along)

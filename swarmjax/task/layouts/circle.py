@@ -1,4 +1,4 @@
-"""Robots on a circle, each with its target on the far side of it."""
+"""Robots on a circle, each with its target on the opposite side."""
 
 import math
 from typing import Any
@@ -8,15 +8,15 @@ import numpy as np
 from swarmjax.task.layouts.site import ArenaLayout, Demand, Drawn, Site, pick
 
 Array = Any
-_TURN = 5040  # directions around the circle; 2 to 10, 12, 14, 15, 16, 18 and 20 robots divide it
-_ONE = 2**14  # of the table's sines: times a radius of 2 m (2**13 units) it fits an int32
+_TURN = 5040  # directions around the circle; divisible by 2 to 10, 12, 14, 15, 16, 18 and 20 robots
+_ONE = 2**14  # scale of the sine table; times a radius of 2 m (2**13 units) it fits an int32
 _ANGLE = np.arange(_TURN) * (2.0 * math.pi / _TURN)
 _TABLE = np.round(_ONE * np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=-1)).astype(np.int32)
-_WALL = 0.07  # m, from the circle to the walls: a hull of 0.045 m and some way
+_WALL = 0.07  # m, from the circle to the walls: a hull of 0.045 m and some spare space
 
 
 def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
-    """Places robots evenly on a circle that begins anywhere.
+    """Places robots evenly on a circle with a random first direction.
 
     Args:
       uniforms: [1] in [0, 1).
@@ -24,7 +24,7 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      What is drawn, without walls.
+      The layout, without walls.
     """
     robots = xp.sum(site.present.astype(xp.int32), dtype=xp.int32)
     number = np.arange(site.present.shape[0], dtype=np.int32)
@@ -37,7 +37,7 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
 
 
 def _on_circle(direction: Array, radius: Array, xp: Any) -> Array:
-    """Points [R, 2] of a circle about the middle, units."""
+    """Returns points [R, 2] on a circle around the middle, units."""
     return (xp.asarray(_TABLE)[direction] * radius + _ONE // 2) // _ONE
 
 

@@ -1,7 +1,7 @@
-"""A crowd without obstacles: robots start anywhere but in a zone of arrival.
+"""A crowd without obstacles: robots start anywhere outside the arrival zones.
 
-Targets are `apart` while there is room. One that finds no such place takes the point that is
-farthest from those before it, so that as many fit as are asked for.
+Targets keep the distance `apart` while there is room. A target that finds no such place takes the
+point farthest from the earlier targets, so all of them are placed.
 """
 
 import math
@@ -14,7 +14,7 @@ from swarmjax.task.placement import Gap, place, score_things
 
 Array = Any
 _LATTICE = 40  # points along a side: 3 cm apart in an arena of 1.2 m
-_FILLING = 0.5  # of the arena by discs of the targets' distance; placed at random they jam at 0.547
+_FILLING = 0.5  # largest area share of discs as wide as `apart`; random discs jam at 0.547
 
 
 def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
@@ -26,7 +26,7 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      What is drawn, without walls.
+      The layout, without walls.
     """
     count = site.present.shape[0]
     shifts, targets, starts = split(uniforms, [4, count, count])

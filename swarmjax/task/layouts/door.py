@@ -1,4 +1,4 @@
-"""Two halls with a door for one robot at a time between them, and a flow each way."""
+"""Two halls joined by a door for one robot at a time, with robots going both ways."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ from swarmjax.task.layouts.site import (
 from swarmjax.task.placement import place, score_things
 
 Array = Any
-_ASIDE = 0.1  # of half the arena, by which the door stands off its middle
+_ASIDE = 0.1  # largest offset of the wall from the middle, as a share of half the arena
 _JAMB = 0.10  # m, of wall on either side of the door
 
 
@@ -30,11 +30,11 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
 
     Args:
       uniforms: [K] in [0, 1).
-      site: the arena; reads `gap` (of the door) and `apart` (of targets from it).
+      site: the arena; reads `gap` (of the door) and `apart` (from targets to the door).
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      What is drawn. Every other robot goes from left to right, the rest from right to left.
+      The layout. Every second robot goes from left to right, the others from right to left.
     """
     count = site.present.shape[0]
     position, shifts, targets, starts = split(uniforms, [2, 8, count, count])
@@ -65,7 +65,7 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
 
 
 def _hall(site: Site, where: Array, side: int, shifts: Array, xp: Any) -> tuple[Array, Array]:
-    """Points for targets and for starts in the hall left (-1) or right (1) of the wall."""
+    """Returns points for targets and for starts in the hall left (-1) or right (1) of the wall."""
     half_x, half_y = site.half[0], site.half[1]
     near = THICKNESS // 2 + site.clear
     low_x, high_x = (
@@ -82,7 +82,7 @@ def _hall(site: Site, where: Array, side: int, shifts: Array, xp: Any) -> tuple[
 def _least(demand: Demand) -> tuple[float, float]:
     gap, apart = demand.numbers["gap"][1], demand.numbers["apart"][1]
     breadth = gap + 2 * _JAMB
-    # A square of 0.15 m for each start and each target, and nothing near the door.
+    # A square of 0.15 m for each start and each target, and free space near the door.
     area = demand.robots * 2 * 0.15**2 + 3.2 * apart**2
     return max(2 * (apart + 0.15), area / max(demand.breadth, breadth)) / (1 - _ASIDE), breadth
 

@@ -1,4 +1,4 @@
-"""Levels of layouts: the numbers of a level drawn, its arena laid out, turned and put in metres."""
+"""Draws levels of layouts: draws numbers, lays the arena out, turns it and converts to metres."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,18 +12,18 @@ from swarmjax.task.placement import clearance, gaps_of, metres, round_up
 
 Array = Any
 _TURNS = 8  # quarter turns, and their mirror images
-LENGTHS = 2 + len(NUMBERS)  # of a level: extents along x and y, and `NUMBERS`
+LENGTHS = 2 + len(NUMBERS)  # lengths of a level: extents along x and y, and `NUMBERS`
 _BARS = 2  # walls that make an arena narrower than it is long
 
 
 class LaidOut(NamedTuple):
-    """What a layout makes of a level; all of it replaces that of the level.
+    """A laid-out arena, which replaces all of these fields of a level.
 
     Attributes:
       side: [] m.
       start: [R, 3] x (m), y (m), yaw (rad).
       target: [R, 2] m.
-      obstacle_present: [W] whether the wall is there.
+      obstacle_present: [W] whether the wall is present.
       obstacle: [W, 5] x (m), y (m), yaw (0 rad), half edges (m).
     """
 
@@ -38,11 +38,11 @@ class LayoutArrays(NamedTuple):
     """One layout's numbers in stages, [S, ...] or [...].
 
     Attributes:
-      chosen: whether the stage is laid out so, bool.
+      chosen: whether the stage has this layout, bool.
       side: smallest and largest extent along x, [2] units, int32.
-      breadth: smallest and largest extent along y, [2] units, int32; 0 of a square.
+      breadth: smallest and largest extent along y, [2] units, int32; 0 for a square.
       low: [6] smallest `NUMBERS`, units, int32.
-      high: [6] largest, units, int32.
+      high: [6] largest `NUMBERS`, units, int32.
     """
 
     chosen: Array
@@ -53,11 +53,11 @@ class LayoutArrays(NamedTuple):
 
 
 class RobotSizes(NamedTuple):
-    """Sizes of robots that a level is drawn for.
+    """Sizes of the robots that a level is drawn for.
 
     Attributes:
       hull_radius: m.
-      target_radius: within which a robot has arrived, m.
+      target_radius: distance at which a robot has arrived, m.
     """
 
     hull_radius: float
@@ -65,11 +65,11 @@ class RobotSizes(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """What of a layout is compiled in.
+    """The part of a layout that is compiled in.
 
     Attributes:
       name: in `LAYOUTS`.
-      cells: of a maze, along a side; 0 for others.
+      cells: along a side of a maze; 0 for other layouts.
       narrow: whether there are bars, so that an arena may be narrower than it is long.
     """
 
@@ -79,7 +79,7 @@ class Kind(NamedTuple):
 
     @property
     def walls(self) -> int:
-        """How many walls a level of this kind may have."""
+        """Largest number of walls in a level of this kind."""
         return LAYOUTS[self.name].walls(self.cells) + _BARS * self.narrow
 
 
@@ -90,8 +90,8 @@ def stack(entries: Sequence[Entry | None]) -> dict[Kind, LayoutArrays]:
     """Stacks the layouts of stages into NumPy arrays [S, ...], by kind.
 
     Args:
-      entries: of the stages, the kind and what `LayoutArrays` holds but for `chosen`; None where a
-        stage has none.
+      entries: for each stage, the kind and the fields of `LayoutArrays` except `chosen`; None for
+        a stage without a layout.
     """
     kinds = sorted({each[0] for each in entries if each is not None})
     return {kind: _stack(kind, entries) for kind in kinds}
@@ -106,12 +106,12 @@ def _stack(kind: Kind, entries: Sequence[Entry | None]) -> LayoutArrays:
 
 
 def uniform_count(kind: Kind, robots: int) -> int:
-    """How many uniform numbers an arena with room for so many robots takes."""
+    """Returns how many uniform numbers an arena for `robots` robots takes."""
     return before_own(robots) + LAYOUTS[kind.name].uniforms(robots, kind.cells)
 
 
 def before_own(robots: int) -> int:
-    """How many of them come before the layout's own: lengths, the turn and headings."""
+    """Returns how many of them precede the layout's own: lengths, the turn and headings."""
     return LENGTHS + 1 + robots
 
 
@@ -121,15 +121,15 @@ def draw(
     """Lays an arena out.
 
     Args:
-      kind: what is compiled in.
-      of: its numbers, fields [...] of one stage.
-      uniforms: [uniform_count(kind, R)] float32 in [0, 1), or more; all that is random follows.
-      present: [R] whether the robot takes part.
+      kind: the compiled part.
+      of: the layout's numbers, fields [...] of one stage.
+      uniforms: [uniform_count(kind, R)] float32 in [0, 1), or more; the only source of randomness.
+      present: [R] whether the robot is present.
       sizes: of robots and targets.
       xp: `numpy` or `jax.numpy`; both draw the same arena.
 
     Returns:
-      The arena, a square in which bars of wall leave what is narrower.
+      The arena: a square, in which bars of wall enclose a narrower arena.
     """
     layout, count = LAYOUTS[kind.name], present.shape[0]
     own = layout.uniforms(count, kind.cells)
@@ -169,10 +169,10 @@ def _numbers(of: LayoutArrays, uniforms: Array, xp: Any) -> tuple[Array, Array, 
 
 
 def _with_bars(drawn: Drawn, half: Array, xp: Any) -> Drawn:
-    """Fills the square about an arena that is narrower than it is long with walls."""
+    """Fills the rest of the square around a narrower arena with walls."""
     middle, deep = between(half[1], half[0])
     there = half[1] < half[0]
-    deep = xp.maximum(deep, 1)  # an absent wall has edges too
+    deep = xp.maximum(deep, 1)  # an absent wall needs non-zero edges too
     bars = rows(((0, middle, half[0], deep), (0, -middle, half[0], deep)), xp)
     return drawn._replace(
         wall=xp.concatenate([drawn.wall, bars]),
@@ -181,7 +181,7 @@ def _with_bars(drawn: Drawn, half: Array, xp: Any) -> Drawn:
 
 
 def _turned(drawn: Drawn, turn: Array, xp: Any) -> Drawn:
-    """Turns a layout by quarters, and mirrors it for turns from 4 on."""
+    """Turns a layout by quarter turns, and mirrors it for turns from 4 on."""
     across, flip_x, flip_y = turn % 2 == 1, turn // 2 % 2 == 1, turn // 4 == 1
 
     def place(point: Array) -> Array:

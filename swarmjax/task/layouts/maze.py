@@ -1,7 +1,7 @@
-"""Braided mazes: every cell has two ways out at least, so that there are rings to go round.
+"""Braided mazes: every cell has at least two ways out, so there are loops instead of dead ends.
 
-A random spanning tree by Kruskal's method (Kruskal 1956, "On the shortest spanning subtree of a
-graph"), with edges in random order; then each dead end is opened once more.
+Kruskal's method (Kruskal 1956, "On the shortest spanning subtree of a graph") builds a spanning
+tree from edges in random order. Each dead end then gets a second opening.
 """
 
 from typing import Any
@@ -19,17 +19,17 @@ from swarmjax.task.layouts.site import (
 )
 
 Array = Any
-_PASSAGE = 0.20  # m, least free width: a robot passes one that has parked in the middle
+_PASSAGE = 0.20  # m, least free width: a robot can pass one that parks in the middle
 
 
 def edges(cells: int) -> np.ndarray:
-    """Lists the pairs of neighbours of a maze.
+    """Lists the pairs of neighbouring cells of a maze.
 
     Args:
       cells: along a side.
 
     Returns:
-      [E, 2] numbers of cells, row by row from below, those beside each other along x first.
+      [E, 2] indices of cells, which count row by row from below. Pairs along x come first.
     """
     number = np.arange(cells * cells).reshape(cells, cells)
     along = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], axis=-1)
@@ -46,7 +46,7 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      What is drawn; starts and targets lie in cells of their own.
+      The layout; starts and targets each have their own cell.
     """
     count, cells = site.present.shape[0], site.cells
     pairs = edges(cells)
@@ -55,13 +55,13 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     edge = 2 * site.half[0] // cells
     corner = -site.half[0]
     chosen = xp.argsort(rooms, stable=True)[: 2 * count].astype(xp.int32)
-    if cells * cells < 2 * count:  # more are compiled in than a maze has room for
+    if cells * cells < 2 * count:  # more robots are compiled in than the maze has room for
         lacking = xp.zeros(2 * count - cells * cells, xp.int32)
         chosen = xp.concatenate([chosen, lacking])
     centre = xp.stack([chosen % cells, chosen // cells], axis=-1) * edge + corner + edge // 2
     most = xp.maximum(edge // 2 - THICKNESS // 2 - site.clear, 0)
     place = centre + pick(aside.reshape(2 * count, 2), -most, most, xp)
-    # Interleaved, so that a robot keeps its cells whatever number is compiled in.
+    # Interleaved, so that a robot's cells do not depend on the number of robots compiled in.
     return Drawn(_walls(pairs, cells, edge, corner, xp), ~open_, place[0::2], place[1::2])
 
 
@@ -81,9 +81,9 @@ def _tree(pairs: np.ndarray, order: Array, xp: Any) -> Array:
 
 
 def _braid(pairs: np.ndarray, open_: Array, order: Array, cells: int, xp: Any) -> Array:
-    """Opens one more edge of each cell that has but one open, [E].
+    """Opens one more edge [E] of each cell that has only one open edge.
 
-    One that leads to another such cell if there is one, so that most walls stay.
+    It prefers an edge that leads to another such cell, so that most walls remain.
     """
     touches = np.arange(cells * cells)[:, None, None] == pairs  # [C, E, 2]
     for cell in range(cells * cells):
@@ -98,7 +98,7 @@ def _braid(pairs: np.ndarray, open_: Array, order: Array, cells: int, xp: Any) -
 
 
 def _walls(pairs: np.ndarray, cells: int, edge: Array, corner: Array, xp: Any) -> Array:
-    """Walls between neighbours, [E, 4] units, long enough to meet at their ends."""
+    """Returns walls between neighbours, [E, 4] units, long enough to meet at their ends."""
     thin = THICKNESS // 2
     column, row = pairs[:, 0] % cells, pairs[:, 0] // cells
     beside = pairs[:, 1] - pairs[:, 0] == 1

@@ -1,4 +1,4 @@
-"""Targets one behind another in a dead-end corridor."""
+"""Targets one behind the other in a dead-end corridor."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ from swarmjax.task.layouts.site import (
 
 Array = Any
 _BEFORE = 0.08  # m, from the first target to the mouth of the corridor
-_HALL = 0.30  # m, in front of the corridor, in which robots start
+_HALL = 0.30  # m, depth of the hall before the corridor, where robots start
 
 
 def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
@@ -33,8 +33,8 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      What is drawn. The deepest target is the first robot's; robots start in the hall before the
-      corridor, anywhere.
+      The layout. The first robot gets the deepest target. Robots start anywhere in the hall before
+      the corridor.
     """
     count = site.present.shape[0]
     place, shift, starts = split(uniforms, [1, 2, count])

@@ -1,4 +1,4 @@
-"""What layouts share: the arena that they are drawn in, walls, and areas to place robots in."""
+"""Shared parts of layouts: the arena that they are drawn in, walls, and areas for robots."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -9,13 +9,13 @@ import numpy as np
 from swarmjax.task.placement import MARGIN, UNITS, Gap, Gaps, place, score_things
 
 Array = Any
-NUMBERS = ("gap", "width", "depth", "length", "radius", "apart")  # of a stage, m
+NUMBERS = ("gap", "width", "depth", "length", "radius", "apart")  # settings of a stage, m
 THICKNESS = math.ceil(0.02 * UNITS)  # of walls within an arena, units
-LATTICE = 24  # points along either edge of an area
+LATTICE = 24  # points along each edge of an area
 
 
 class Numbers(NamedTuple):
-    """Lengths that a layout is drawn with, [] int32 units each; a layout reads those it names.
+    """Lengths of a layout, [] int32 units each; a layout reads only some of them.
 
     Attributes:
       gap: free width of a door or a corridor.
@@ -23,7 +23,7 @@ class Numbers(NamedTuple):
       depth: of a trap.
       length: of a fence, or of a bay along its corridor.
       radius: of the circle on which robots start.
-      apart: distance between targets, or of targets from a door.
+      apart: distance between targets, or from targets to a door.
     """
 
     gap: Array
@@ -40,12 +40,12 @@ class Site(NamedTuple):
     Attributes:
       half: [2] half of the arena's extent along x and y.
       numbers: of this level.
-      cells: of a maze, along a side; 0 for other layouts.
-      present: [R] whether the robot takes part.
+      cells: along a side of a maze; 0 for other layouts.
+      present: [R] whether the robot is present.
       hull: radius of the robots.
-      clear: least distance of a robot's centre to a wall at the start.
-      reach: radius of the zone of arrival.
-      gaps: distances between starts and targets.
+      clear: least distance between a robot's centre and a wall at the start.
+      reach: radius of the arrival zone.
+      gaps: least distances between starts and targets.
     """
 
     half: Array
@@ -63,7 +63,7 @@ class Drawn(NamedTuple):
 
     Attributes:
       wall: [W, 4] x, y and half edges of rectangles, units.
-      there: [W] whether the wall is there.
+      there: [W] whether the wall is present.
       start: [R, 2] units.
       target: [R, 2] units.
     """
@@ -78,11 +78,11 @@ class Demand(NamedTuple):
     """Numbers of a stage that a layout must have room for, m.
 
     Attributes:
-      robots: how many.
+      robots: number of robots.
       side: smallest extent along x.
       breadth: smallest extent along y.
-      cells: of a maze, along a side.
-      numbers: smallest and largest of those that the layout reads.
+      cells: along a side of a maze.
+      numbers: smallest and largest of the numbers that the layout reads.
     """
 
     robots: int
@@ -93,18 +93,19 @@ class Demand(NamedTuple):
 
 
 class ArenaLayout(NamedTuple):
-    """A way of laying out arenas.
+    """Definition of a layout.
 
     Attributes:
-      draw: from uniform numbers [K] in [0, 1), a site and the array module to what is drawn.
-      parts: what the numbers place that it takes for so many robots and cells, and how many, in
-        their order: `wall`, `room`, `target` and `start` may move by themselves, the rest is `area`
-        (where the points of a lattice lie) and `aside` (from the middle of a way).
-      walls: how many walls it may have, by the cells of a maze.
-      reads: the `NUMBERS` of a stage that it is drawn with.
-      least: the smallest side and breadth that it has room in, m, of a demand.
-      most_robots: that it has room for, however large the arena.
-      square: whether the arena cannot be narrower than it is long.
+      draw: draws the layout from uniform numbers [K] in [0, 1), a site and the array module.
+      parts: returns the parts of its uniform numbers, in order, for a number of robots and cells:
+        what a part places, and its length. A mutation may change single numbers of `wall`, `room`,
+        `target` and `start`. The other parts are `area` (shift of a lattice's points) and `aside`
+        (offset from the middle of a way).
+      walls: largest number of walls, for the cells of a maze.
+      reads: the `NUMBERS` of a stage that it uses.
+      least: the smallest side and breadth with room for a demand, m.
+      most_robots: largest number of robots, however large the arena.
+      square: whether the arena must be square.
     """
 
     draw: Callable[[Array, Site, Any], Drawn]
@@ -116,19 +117,19 @@ class ArenaLayout(NamedTuple):
     square: bool = False
 
     def uniforms(self, robots: int, cells: int) -> int:
-        """How many numbers it takes for so many robots and cells."""
+        """Returns how many uniform numbers it takes for these robots and cells."""
         return sum(count for _, count in self.parts(robots, cells))
 
 
 def pick(uniform: Array, low: Array, high: Array, xp: Any) -> Array:
-    """Picks a whole number of low..high, each as likely as the next; `low` if there is none."""
+    """Picks an integer uniformly from low..high; returns `low` if the range is empty."""
     count = xp.maximum(high - low + 1, 1)
     above = xp.floor(uniform * count.astype(xp.float32)).astype(xp.int32)
     return low + xp.minimum(above, count - 1)
 
 
 def split(uniforms: Array, counts: Sequence[int]) -> list[Array]:
-    """Deals uniform numbers out, in parts of so many each."""
+    """Splits uniform numbers into parts of the given lengths."""
     ends = np.cumsum(counts)
     return [uniforms[end - count : end] for end, count in zip(ends, counts, strict=True)]
 
@@ -139,7 +140,7 @@ def rows(table: Sequence[Sequence[Array]], xp: Any) -> Array:
 
 
 def between(low: Array, high: Array) -> tuple[Array, Array]:
-    """Returns the middle of an interval and half its length, rounded up, so that it is covered."""
+    """Returns the middle of an interval, and half its length rounded up to cover the interval."""
     return (low + high) // 2, (high - low + 1) // 2
 
 
@@ -150,10 +151,10 @@ def points(
 
     Args:
       low: its corner with the smallest x and y, units.
-      high: its corner with the largest.
-      shift: [2] in [0, 1), of the spacing.
+      high: its corner with the largest x and y, units.
+      shift: [2] in [0, 1), as a share of the spacing.
       xp: `numpy` or `jax.numpy`.
-      count: points along either edge.
+      count: points along each edge.
 
     Returns:
       [count**2, 2] int32, units.
@@ -185,7 +186,7 @@ def place_starts(
 
 
 def beyond(passage: int) -> Gap:
-    """Returns a distance to keep that no room is so small as to shorten."""
+    """Returns a distance that is kept even where there is little room."""
     return Gap(passage, passage)
 
 

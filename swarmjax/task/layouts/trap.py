@@ -1,4 +1,4 @@
-"""U-shaped walls with their mouth towards the robots and the targets behind them."""
+"""A U-shaped wall that opens towards the robots, with the targets behind it."""
 
 from typing import Any
 
@@ -20,8 +20,8 @@ from swarmjax.task.layouts.site import (
 )
 
 Array = Any
-_ROOM = 0.20  # m, before the mouth and behind the trap: a start or a target with some choice
-_WAY = 0.14  # m, beside the trap: a hull of 0.045 m and 2 cm on either side, and 1 cm
+_ROOM = 0.20  # m, before the mouth and behind the trap: one start or target, with some choice
+_WAY = 0.14  # m, beside the trap: a hull of 0.045 m with 2 cm on either side, and 1 cm more
 
 
 def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
@@ -33,8 +33,8 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      What is drawn. The straight line from a start to a target leads into the trap: both lie within
-      its width.
+      The layout. Starts and targets lie within the trap's width, so the straight line from a start
+      to a target leads into the trap.
     """
     count = site.present.shape[0]
     place, shifts, targets, starts = split(uniforms, [2, 4, count, count])
@@ -57,7 +57,7 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
 
 
 def _walls(back: Array, middle: Array, width: Array, depth: Array, xp: Any) -> Array:
-    """The back wall, and those beside it, [3, 4] units."""
+    """Returns the back wall and the two side walls, [3, 4] units."""
     thin, half = THICKNESS // 2, width // 2
     arm, length = half + thin, depth // 2
     return rows(
