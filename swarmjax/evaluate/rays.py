@@ -1,4 +1,4 @@
-"""The judge's infrared rays: MuJoCo's own, cast on the real shapes. No JAX."""
+"""The judge's infrared rays: MuJoCo's rays, cast on the real shapes. No JAX."""
 
 from dataclasses import dataclass
 from typing import cast
@@ -17,14 +17,14 @@ _RAY_GROUPS = np.array([i not in (HULL_GROUP, FLOOR_GROUP) for i in range(6)], n
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RayScene:
-    """What rays are cast in.
+    """The scene that rays are cast in.
 
     Attributes:
-        model: One arena, compiled.
+        model: The compiled arena.
         ids: Rows of its moving bodies.
-        hull_radius: m.
-        side: Of the smallest arena, m.
-        reach: How far rays go, m.
+        hull_radius: Radius of the hulls, m.
+        side: Side of the smallest arena, m.
+        reach: Length of the rays, m.
     """
 
     model: mujoco.MjModel
@@ -41,23 +41,23 @@ def cast_rays(
     obstacle: np.ndarray,
     mount: infrared.Mount | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Casts the infrared sensors' rays by MuJoCo.
+    """Casts the infrared sensors' rays with MuJoCo.
 
-    A ray that starts inside something reads 0. MuJoCo reports where such a ray leaves, on a face
-    whose normal points along it; so of each sensor two rays are cast, ahead and back, and the
-    sensor is inside something if either of them leaves. Things overlap a little where robots
-    push, so that a single ray may enter a second thing before it leaves the first.
+    A ray that starts inside something reads 0. For such a ray MuJoCo reports where it leaves, on a
+    face whose normal points along the ray. So each sensor casts two rays, ahead and back, and is
+    inside something if either of them leaves. Pushing robots overlap a little, so a single ray may
+    enter a second thing before it leaves the first.
 
     Args:
-        scene: What rays are cast in.
-        data: [A] of `MjData`, positions up to date, each of a model whose boxes have its sizes.
+        scene: The scene.
+        data: [A] of `MjData`, positions up to date; each model's boxes have that arena's sizes.
         pose: [A, R, 3] x (m), y (m), yaw (rad).
         obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
-        mount: How far off the sensors sit.
+        mount: Deviations of the sensors' positions and directions.
 
     Returns:
-        [A, R, K] distance from the sensor's origin to the nearest surface, m, 0 to the reach of
-        the electronics; and the geom that is there, -1 where nothing is.
+        [A, R, K] distance from the sensor's origin to the nearest surface, m, from 0 to the reach
+        of the electronics; and the geom that the ray meets, -1 if none.
     """
     limit = scene.reach
     origin, direction = infrared.rays(pose, np, mount)
