@@ -46,12 +46,12 @@ class EvaluateConfig(Section):
         default=None,
         metadata=about("instead of a stage: a name in configs/suites/, or a .yaml or .npz file"),
     )
-    shape: Shape = field(default="box", metadata=about("of the obstacles of a random level"))
+    shape: Shape = field(default="box", metadata=about("shape of a random level's obstacles"))
     realism: RealismConfig = field(default_factory=RealismConfig)
     action: Literal["sampled", "mean"] = field(
         default="sampled",
         metadata=about(
-            "of the robots; sampled: drawn from the policy, the same for the same level; mean: "
+            "robots' actions; sampled: drawn from the policy, the same for the same level; mean: "
             "the policy's most likely action"
         ),
     )

@@ -93,7 +93,8 @@ class AlgoConfig(Section):
         default="tanh", metadata=about("activation of the hidden layers")
     )
     mean_activation: Literal["linear", "tanh"] = field(
-        default="linear", metadata=about("for the mean action; tanh: within the range of commands")
+        default="linear",
+        metadata=about("output of the mean action; tanh: within the commands' range"),
     )
     initialization: Literal["orthogonal", "uniform"] = field(
         default="orthogonal",
@@ -103,7 +104,7 @@ class AlgoConfig(Section):
     )
     normalize_observations: bool = field(
         default=True,
-        metadata=about("by running mean and deviation; false: raw, clipped to +-10"),
+        metadata=about("scale by running mean and deviation; false: raw, clipped to +-10"),
     )
     rollout_length: int = field(
         default=32, metadata=about("control steps per update", 1, MAX_COUNT)
@@ -115,7 +116,8 @@ class AlgoConfig(Section):
         default=8, metadata=about("gradient steps per pass; divides arenas", 1, MAX_COUNT)
     )
     discount: float = field(
-        default=0.998, metadata=about("per control step: 'discount factor (gamma)'", 0.0, 1.0)
+        default=0.998,
+        metadata=about("discount per control step: 'discount factor (gamma)'", 0.0, 1.0),
     )
     advantage: Literal["gae", "monte_carlo"] = field(
         default="gae",
@@ -129,7 +131,7 @@ class AlgoConfig(Section):
     )
     normalize_advantages: bool = field(
         default=True,
-        metadata=about("advantages of gae, to mean 0 and deviation 1 over the rollout"),
+        metadata=about("scale gae's advantages to mean 0 and deviation 1 over the rollout"),
     )
     time_out: Literal["bootstrap", "terminal", "leak"] | None = field(
         default=None,
@@ -139,12 +141,13 @@ class AlgoConfig(Section):
         ),
     )
     clip_epsilon: float = field(
-        default=0.2, metadata=about("of the probability ratio: 'PPO epsilon clip'", above=0.0)
+        default=0.2,
+        metadata=about("clip range of the probability ratio: 'PPO epsilon clip'", above=0.0),
     )
     actor_learning_rate: float | None = field(
         default=None,
         metadata=about(
-            "of the policy: 'optimizer learning rate actor'; null: 3e-4, reduced in proportion "
+            "rate of the policy: 'optimizer learning rate actor'; null: 3e-4, reduced in proportion "
             "in a run of more than 15000 gradient steps",
             above=0.0,
             high=1.0,
@@ -153,7 +156,7 @@ class AlgoConfig(Section):
     critic_learning_rate: float | None = field(
         default=None,
         metadata=about(
-            "of the value: 'optimizer learning rate critic'; null: 1e-3, reduced in the same way",
+            "rate of the critic: 'optimizer learning rate critic'; null: 1e-3, reduced in the same way",
             above=0.0,
             high=1.0,
         ),

@@ -39,7 +39,7 @@ class LearnerState:
         params: `{"actor": .., "critic": ..}`.
         optimizer_state: State of the optimiser that `init` made.
         normalizer: Moments of the valid observations of all updates so far. A learner that does not
-            normalise keeps the first ones.
+            normalise keeps the initial ones.
         explored: [], int32, control steps that the schedule of exploration has counted; None if
             exploration is learned.
     """
@@ -171,12 +171,12 @@ def act(
 
 
 def mode(learner: LearnerState, config: AlgoConfig, observation: jax.Array) -> jax.Array:
-    """Returns the most likely actions [..., U] for raw observations, without memory."""
+    """Returns the most likely actions [..., U] of a policy without memory, from raw observations."""
     return recall_mode(learner, config, observation, None)[0]
 
 
 def values(learner: LearnerState, config: AlgoConfig, observation: jax.Array) -> jax.Array:
-    """Returns the expected discounted return [...] of raw observations, without memory or state."""
+    """Returns the values [...] of raw observations, from a critic without memory or state."""
     return recall_values(learner, config, observation, None)[0]
 
 

@@ -107,8 +107,8 @@ def take(
     Devices add up their gradients and metrics, and take the same step.
 
     A step is skipped, and counted, if its gradient or its result is not finite.
-    `optax.apply_if_finite` does not suit: it checks the gradient alone, so a broken optimiser state
-    would break the parameters, and after some skips it takes such a step anyway.
+    `optax.apply_if_finite` is not enough: it checks the gradient alone, so a broken optimiser state
+    would break the parameters. After some skips it also takes such a step anyway.
 
     Args:
         config: Settings of the optimiser.

@@ -53,14 +53,14 @@ class ProgramConfig(Section):
     devices: int = field(
         default=1,
         metadata=about(
-            "that share the arenas of every seed; seeds_by=devices: the seeds", 1, 2**16
+            "devices that share every seed's arenas; with seeds_by=devices, the seeds", 1, 2**16
         ),
     )
     streams: int | None = field(
         default=None,
         metadata=about(
-            "of random numbers, a multiple of devices: with as many, a run draws the same on fewer "
-            "or more devices; null: devices",
+            "random streams, a multiple of devices; a run with as many draws the same on fewer or "
+            "more devices; null: devices",
             1,
             2**16,
         ),

@@ -127,7 +127,7 @@ def _edit(name: str, index: Any, value: Any) -> Callable[[dict[str, Any]], None]
         (_meta(lambda m: m.update(format=2)), "meta.format is not 1"),
         (_meta(lambda m: m.pop("cells")), "meta.suite or meta.cells is missing"),
         (_meta(lambda m: m["cells"].append(m["cells"][0])), "meta.cells names a cell more than"),
-        (_meta(lambda m: m["cells"].pop()), "some/episode is unknown: meta.cells lists no such cell."),
+        (_meta(lambda m: m["cells"].pop()), "some/episode is unknown: meta.cells lists no such"),
         (_meta(lambda m: m["cells"][0].update(x=1)), "cell one: x is not a key"),
         (_meta(lambda m: m["cells"][0]["stage"].update(robots=0)), "cell one: stage.robots is 0"),
         (_meta(lambda m: m["cells"][0].update(seed=1)), "cell one: seed is 1: give 1000000 to"),
@@ -146,7 +146,7 @@ def _edit(name: str, index: Any, value: Any) -> Callable[[dict[str, Any]], None]
         (_edit("two/obstacle", (0, 0, 3), 9.0), "cell two: obstacle is longer than the largest "),
         (_edit("two/obstacle_present", (0, 0), False), "cell two: obstacle is not present, but "),
         (_edit("two/obstacle", (0, 0, 0), 0.1), "cell two of the file has the digest "),
-        (_set("two/obstacle", np.array([None])), "it cannot be read: 'two/obstacle.npy' is not"),
+        (_set("two/obstacle", np.array([None])), "it cannot be read: 'two/obstacle.npy' does not"),
     ],
 )
 def test_a_file_that_is_unsound_is_refused(

@@ -9,7 +9,7 @@ is
 
 b_s is how far the mean action lies beyond -1..1.
 
-The kernels sum over samples. Factors and terms that all samples share, such as 1/n, come
+The kernels sum over samples. Factors and terms that all samples share, such as 1/n, are applied
 afterwards. The kernels take tiles of samples in any order, so they read the batch in place once its
 valid samples lie first: a minibatch is a choice of tiles, and the tiles without a valid sample are
 never read.

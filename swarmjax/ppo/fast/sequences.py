@@ -21,7 +21,7 @@ from swarmjax.ppo.optimizer import Progress
 from swarmjax.shards import ALONE, Shards
 
 # Sequences of a tile on a CPU. Tiles of 32 take no longer than whole minibatches where all robots
-# are present, and few slots stay empty where few are.
+# are present, and are well filled where few are.
 CPU_TILE = 32
 # Fewest and most samples of a tile on an accelerator. An accelerator runs one step after the other,
 # so a large tile takes little longer than a small one. With default layers, the largest tile takes
