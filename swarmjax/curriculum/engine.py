@@ -49,7 +49,7 @@ _SLOWNESS = 0.2
 
 
 class Schedule(NamedTuple):
-    """The curriculum's numbers: an argument of the compiled program, so that it contains none.
+    """The curriculum's numbers, an argument of the compiled program: it fixes none of them.
 
     Numbers that a mode does not have are nan, or `NEVER`.
 
@@ -317,9 +317,10 @@ def assign(curriculum: Curriculum, arenas: int) -> Array:
 
     The weights divide a line into stages. The arenas are spread along it like the points (a + u) /
     A, so that the share of arenas, and of time, on a stage is its weight. From cohort to cohort, u
-    moves by the golden ratio: a few arenas visit every stage over time, while many arenas mostly
-    stay on theirs. An arena that moves must wait for its episode to end. If all arenas moved,
-    stages with long episodes would get more than their share.
+    moves by the golden ratio. If there are few arenas, each then visits every stage over time. If
+    there are many, most stay on their stage. That matters because an arena that moves must wait for
+    its episode to end: if all arenas moved, stages with long episodes would get more than their
+    share.
 
     Args:
       curriculum: its current state.

@@ -106,7 +106,7 @@ def by_policy(judge: Judge) -> Controller:
     Its random draws depend only on the level and the clock.
 
     Args:
-        judge: What the arenas share.
+        judge: Data that the arenas share.
     """
     return _ByPolicy(judge)
 
@@ -119,7 +119,7 @@ def simulate(
     With `task.arrival=hold` they have arrived once all robots are within their targets.
 
     Args:
-        judge: What the arenas share.
+        judge: Data that the arenas share.
         levels: Levels to start from.
         controller: Controller of the robots; None: the judge's policy.
 
@@ -159,7 +159,7 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     """Starts episodes.
 
     Args:
-        judge: What the arenas share.
+        judge: Data that the arenas share.
         levels: [A], with the judge's numbers of robots and boxes.
 
     Returns:
@@ -252,7 +252,7 @@ def place(
     """Sets an arena up, at rest.
 
     Args:
-        judge: What the arenas share.
+        judge: Data that the arenas share.
         model: Model of the arena.
         pose: [R, 3] x (m), y (m), yaw (rad).
         obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m; equal to the model's).
@@ -275,7 +275,7 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
     """Moves arenas by one control step, by the rules of `task.env.step`.
 
     Args:
-        judge: What the arenas share.
+        judge: Data that the arenas share.
         arenas: Their state before.
         action: [A, R, U] of the robots, -1..1; None: actions of a policy without memory.
 
@@ -401,8 +401,8 @@ def _drive(
     qpos = np.stack([data.qpos for data in arenas.data])
     if not np.isfinite(qpos).all():
         raise ConfigError(
-            "the physics broke down, with positions that are not finite: give substeps of more "
-            f"than {judge.substeps}, or a robot nearer to the real one."
+            "the physics broke down, with positions that are not finite: give more than "
+            f"{judge.substeps} substeps, or a robot closer to the real one."
         )
     return memory, body.pose(qpos, np), _impulses(judge, pushes, len(arenas.data))
 
@@ -453,7 +453,7 @@ def _impulses(judge: Judge, pushes: list[_Pushes], arenas: int) -> np.ndarray:
     """Sums the impulses of contacts, [A, R, 3] N s, in the order of `gaps.KINDS`.
 
     Args:
-        judge: What the arenas share.
+        judge: Data that the arenas share.
         pushes: [A * substeps], grouped by arena.
         arenas: A.
 
@@ -478,7 +478,7 @@ def touching(judge: Judge, data: np.ndarray) -> np.ndarray:
     """Tells which robots touch anything, from MuJoCo's contacts.
 
     Args:
-        judge: What the arenas share.
+        judge: Data that the arenas share.
         data: [A] of `MjData`, positions up to date.
 
     Returns:
@@ -505,7 +505,7 @@ def look(
     """Finds what the sensors can see.
 
     Args:
-        judge: What the arenas share.
+        judge: Data that the arenas share.
         data: [A] of `MjData`, positions up to date.
         factors: [A] of the episodes.
         pose: [A, R, 3] x (m), y (m), yaw (rad).

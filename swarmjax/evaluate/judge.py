@@ -1,4 +1,4 @@
-"""The judge: what all arenas of an evaluation in MuJoCo's C engine share. No JAX."""
+"""The judge: data that all arenas of an evaluation in MuJoCo's C engine share. No JAX."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ SOLVER_ITERATIONS = 100  # at most, MuJoCo's default; it stops at its tolerance 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Judge:
-    """What all arenas of an evaluation share.
+    """Data that all arenas of an evaluation share.
 
     Attributes:
         config: Settings of the evaluation.

@@ -96,8 +96,8 @@ def read(folder: Path, judged: Mapping[str, Any], cells: Sequence[Cell]) -> dict
     key = _first_difference(before, judged)
     if key is not None:
         raise ConfigError(
-            f"out has {folder} of an unfinished evaluation that differs from this one in {key}: "
-            "repeat its command, give another out, or remove that folder."
+            f"out has {folder}, from an unfinished evaluation that differs from this one in "
+            f"{key}: repeat its command, give another out, or remove that folder."
         )
     return {row: _read_trial(path, cells[row]) for row, path in paths.items()}
 

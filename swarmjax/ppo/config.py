@@ -94,7 +94,7 @@ class AlgoConfig(Section):
     )
     mean_activation: Literal["linear", "tanh"] = field(
         default="linear",
-        metadata=about("output of the mean action; tanh: within the commands' range"),
+        metadata=about("for the mean action; tanh: within the commands' range"),
     )
     initialization: Literal["orthogonal", "uniform"] = field(
         default="orthogonal",
@@ -117,7 +117,7 @@ class AlgoConfig(Section):
     )
     discount: float = field(
         default=0.998,
-        metadata=about("discount per control step: 'discount factor (gamma)'", 0.0, 1.0),
+        metadata=about("each control step: 'discount factor (gamma)'", 0.0, 1.0),
     )
     advantage: Literal["gae", "monte_carlo"] = field(
         default="gae",
@@ -142,13 +142,13 @@ class AlgoConfig(Section):
     )
     clip_epsilon: float = field(
         default=0.2,
-        metadata=about("clip range of the probability ratio: 'PPO epsilon clip'", above=0.0),
+        metadata=about("range of the probability ratio: 'PPO epsilon clip'", above=0.0),
     )
     actor_learning_rate: float | None = field(
         default=None,
         metadata=about(
-            "rate of the policy: 'optimizer learning rate actor'; null: 3e-4, reduced in proportion "
-            "in a run of more than 15000 gradient steps",
+            "rate of the policy: 'optimizer learning rate actor'; null: 3e-4, reduced in "
+            "proportion in a run of more than 15000 gradient steps",
             above=0.0,
             high=1.0,
         ),
@@ -156,7 +156,7 @@ class AlgoConfig(Section):
     critic_learning_rate: float | None = field(
         default=None,
         metadata=about(
-            "rate of the critic: 'optimizer learning rate critic'; null: 1e-3, reduced in the same way",
+            "rate of the critic: 'optimizer learning rate critic'; null: 1e-3, reduced likewise",
             above=0.0,
             high=1.0,
         ),

@@ -171,7 +171,7 @@ def act(
 
 
 def mode(learner: LearnerState, config: AlgoConfig, observation: jax.Array) -> jax.Array:
-    """Returns the most likely actions [..., U] of a policy without memory, from raw observations."""
+    """Returns the most likely actions [..., U] of a policy without memory; observations are raw."""
     return recall_mode(learner, config, observation, None)[0]
 
 

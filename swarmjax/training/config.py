@@ -12,8 +12,8 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig
 from swarmjax.task.stage_config import StageConfig
 
-# One episode is drawn for each arena for every so many control steps of a rollout. The shortest
-# episodes of the six stages take 23 steps.
+# For each arena, one waiting episode is drawn for every so many control steps of a rollout. The
+# shortest episodes of the six stages take 23 steps.
 _STEPS_PER_EPISODE = 32
 
 
@@ -34,8 +34,8 @@ class ProgramConfig(Section):
             "runs trained at once, of seed, seed + 1, ...",
             1,
             4096,
-            reason="a call of the compiled program reports 4096 rows, one a seed. Train more in a "
-            "second run, with seed=4096",
+            reason="a call of the compiled program reports 4096 rows, one per seed. Train more in "
+            "a second run, with seed=4096",
         ),
     )
     seeds_by: Literal["vmap", "map", "cores", "devices"] = field(

@@ -32,7 +32,7 @@ class _Layout(NamedTuple):
     """How a run is spread over devices.
 
     Attributes:
-      mesh: The devices.
+      mesh: the devices.
       lanes: sharding of arrays with a seed axis.
       state: sharding of each part of a state.
     """
