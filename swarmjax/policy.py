@@ -175,7 +175,7 @@ def act(policy: Policy, observation: np.ndarray, normal: Any = 0.0) -> np.ndarra
 def begin(policy: Policy, shape: tuple[int, ...]) -> np.ndarray | None:
     """Returns the memory of robots whose episode begins; None if there is none.
 
-    It is [*shape, H], or with a history the earlier observations, [*shape, (k - 1) O].
+    It is [*shape, H] or, with a history, the earlier observations, [*shape, (k - 1) O].
     """
     return np.zeros((*shape, policy.carried), "f4") if policy.carried else None
 

@@ -213,7 +213,7 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     if heard.size > size:
         raise PolicyError(
             f"meta.observation.neighbours takes {heard.size} entries, but meta.observation.names "
-            f"has {size}: expected those of neighbours among them."
+            f"has {size}: expected the neighbours' entries among them."
         )
     actions = _check_action(meta["action"], heard.messages)
     _check_embodiment(meta)

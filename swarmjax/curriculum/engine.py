@@ -49,7 +49,7 @@ _SLOWNESS = 0.2
 
 
 class Schedule(NamedTuple):
-    """The curriculum's numbers, an argument of the compiled program: it fixes none of them.
+    """The curriculum's numbers: an argument of the compiled program, not constants in it.
 
     Numbers that a mode does not have are nan, or `NEVER`.
 

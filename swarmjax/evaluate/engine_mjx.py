@@ -144,7 +144,7 @@ def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
 
 
 def _largest(stage: StageConfig, half: np.ndarray) -> StageConfig:
-    """Returns a stage with as many robots and boxes as large: the program depends on no more."""
+    """Returns a stage with the same robot count and box size; the program needs only these."""
     largest = 2.0 * float(half.max(initial=0.05))  # without boxes any size will do
     if largest > LARGEST_BOX:
         raise ConfigError(
@@ -351,7 +351,7 @@ class _Counts(NamedTuple):
     still: Array
 
 
-# From a memory [E, R, H] or None, and arenas, to the memory after and actions.
+# Takes a memory [E, R, H] or None, and arenas; returns the memory after, and actions.
 _Actor = Callable[[Any, EnvState], tuple[Any, Array]]
 
 

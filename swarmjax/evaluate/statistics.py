@@ -117,9 +117,9 @@ def cvar(
 ) -> np.float64 | np.ndarray:
     """Computes the conditional value at risk: the mean of the worst share of the values.
 
-    It follows Rockafellar & Uryasev 2000, "Optimization of conditional value-at-risk", for a sample
-    whose share is rounded up to whole values, so that it is never empty. It includes the luck of
-    each value: over levels that were tried once, it is worse than over the levels' expected values.
+    It follows Rockafellar & Uryasev 2000, "Optimization of conditional value-at-risk". The share is
+    rounded up to whole values, so it is never empty. The result includes the luck of each value:
+    over levels that were tried once, it is worse than over the levels' expected values.
 
     Args:
       x: [...] of any unit.
@@ -242,7 +242,7 @@ def probability_of_improvement(
     resamples: int = 2000,
     seed: int = 0,
 ) -> Interval[float]:
-    """Computes an interval of how likely a run of a beats one of b: P(a > b) + P(a = b) / 2.
+    """Computes the interval of the probability that a beats b: P(a > b) + P(a = b) / 2.
 
     The probability is averaged over tasks. On each task it is U / (n m) of the Mann-Whitney test,
     as in Agarwal et al. 2021, section 4.3. The runs of a and b are resampled independently; drawn

@@ -111,7 +111,7 @@ def ppo_loss(
 def evaluate(
     params: Params, config: AlgoConfig, minibatch: Minibatch
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Runs actor and critic on samples; sequences run through time.
+    """Runs actor and critic on samples; with memory, step by step.
 
     Args:
         params: Parameters of the actor and the critic.

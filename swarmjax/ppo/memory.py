@@ -132,9 +132,9 @@ def remember_all(
 ) -> jax.Array:
     """Computes the memory after each observation of sequences.
 
-    Its gradient is that of `remember`, step by step. Only terms that depend on the next step are
-    computed one step after the other. Autodiff would also sum the gradient by `kernel` step by
-    step, from products that fill a small part of a GPU.
+    Its gradient follows that of `remember`. Only terms that depend on the next step are computed
+    step by step. Autodiff would also sum the gradient of `kernel` step by step, from products that
+    fill a small part of a GPU.
 
     Args:
         kernel: [H, 3 H], recurrent weights.
@@ -165,7 +165,7 @@ def _remember_forward(
 
 
 def _remember_backward(kept: tuple[jax.Array, ...], slope: jax.Array) -> tuple[Any, ...]:
-    """Takes the gradient [T, B, H] by the memories back to all arguments."""
+    """Backpropagates from the memories [T, B, H] to all arguments."""
     kernel, bias, seen, begins, memory, every = kept
     before = jnp.concatenate([memory[None], every[:-1]])
     before = jnp.where(begins[..., None], 0.0, before)

@@ -19,7 +19,7 @@ from swarmjax.training import episodes, practice
 from swarmjax.training.config import ProgramConfig
 
 ACTION_SIZE = drive.COMMAND_SIZE  # of robots that broadcast nothing
-MAX_ROWS = 4096  # most updates that a call can report, over all seeds; longer chunks take several
+MAX_ROWS = 4096  # most updates of a call, over all seeds; longer chunks take several calls
 
 
 @dataclass(frozen=True, eq=False)

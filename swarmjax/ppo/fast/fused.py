@@ -10,9 +10,9 @@ is
 b_s is how far the mean action lies beyond -1..1.
 
 The kernels sum over samples. Factors and terms that all samples share, such as 1/n, are applied
-afterwards. The kernels take tiles of samples in any order, so they read the batch in place once its
-valid samples lie first: a minibatch is a choice of tiles, and the tiles without a valid sample are
-never read.
+afterwards. The kernels take tiles of samples in any order. So once the valid samples lie first, the
+kernels can read the batch in place: a minibatch is a choice of tiles, and tiles without a valid
+sample are never read.
 """
 
 import functools
@@ -273,7 +273,7 @@ def _critic_sums(
 def _with_entropy(
     gradient: jax.Array, config: AlgoConfig, weight: jax.Array, first: int, width: int
 ) -> jax.Array:
-    """Adds the derivative of the entropy's cost by `log_std`, which starts at index `first`.
+    """Adds the entropy cost's derivative with respect to `log_std`, which starts at `first`.
 
     The entropy is the sum of log_std and a constant, so the derivative is 1. The gradient never
     moves a deviation that follows a schedule.
@@ -320,11 +320,12 @@ def _surrogate(
 ) -> tuple[jax.Array, Metrics]:
     """Computes the clipped surrogate, negated, with the action padded by zeros.
 
-    Schulman et al. 2017, "Proximal Policy Optimization Algorithms", equation 7. If the minimum is r
-    A, its derivative by log pi is r A, since dr / dlog pi = r. If the minimum is the clipped term,
-    the derivative is 0. Within the range the two terms are equal. With z = (a - mu) / sigma, log pi
-    is the sum over the action of -z^2 / 2 - log sigma - log(2 pi) / 2. Its derivatives are z /
-    sigma by mu and z^2 - 1 by log sigma.
+    Schulman et al. 2017, "Proximal Policy Optimization Algorithms", equation 7. If the minimum is
+    r A, its derivative with respect to log pi is r A, since dr / dlog pi = r. If the minimum is the
+    clipped term, the derivative is 0. Within the range the two terms are equal. With
+    z = (a - mu) / sigma, log pi is the sum over the action of
+    -z^2 / 2 - log sigma - log(2 pi) / 2. Its derivatives with respect to mu and log sigma are
+    z / sigma and z^2 - 1.
     """
     mean = jnp.tanh(output) if config.mean_activation == "tanh" else output
     log_std = vectors["log_std"][None, :]

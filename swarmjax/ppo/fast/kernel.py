@@ -316,8 +316,8 @@ def _backward(
     """Backpropagates, summed over the tile: Goodfellow et al. 2016, "Deep Learning", alg. 6.4.
 
     With z = x W + b and g the derivative with respect to z, the derivatives with respect to W, b
-    and x are x^T g, the sum of g over samples, and g W^T. Where x = f(z') comes from the layer
-    before, f'(z') is a further factor.
+    and x are x^T g, the sum of g over samples, and g W^T. If x = f(z') is the output of the layer
+    before, its derivative is multiplied by f'(z').
     """
     gradient = []
     for index in reversed(range(len(network))):
@@ -330,7 +330,7 @@ def _backward(
 
 
 def _outer(features: jax.Array, slope: jax.Array) -> jax.Array:
-    """Computes x^T g, the wider of both in front: an H100's fast products need 64 rows or more."""
+    """Computes x^T g with the wider one in front: an H100's fast products need 64 rows or more."""
     if features.shape[1] < slope.shape[1]:
         return jnp.dot(slope.T, features).T
     return jnp.dot(features.T, slope)

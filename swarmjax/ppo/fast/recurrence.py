@@ -19,8 +19,8 @@ from jax.experimental.pallas import triton
 
 from swarmjax.ppo.fast.kernel import logistic
 
-# Sequences of a tile. On an H100 the backward pass took a program of 8 warps twice as long with 64
-# of them, and a program of 4 warps was slower with 32 (docs/performance.md).
+# Sequences of a tile. In the backward pass on an H100, 64 sequences took 8 warps twice as long, and
+# 4 warps were slower than 8 for 32 sequences (docs/performance.md).
 TILE = 32
 _WARPS, _BACKWARD_WARPS = 4, 8
 # The GRU's inputs and their gradient are the largest arrays. With half as many bytes, training took
@@ -187,7 +187,7 @@ def _through_forward(weights: _Weights, sequences: _Sequences, interpret: bool) 
 def _through_backward(
     interpret: bool, kept: tuple[_Weights, _Sequences, jax.Array], slope: jax.Array
 ) -> tuple[_Weights, _Sequences]:
-    """Takes the gradient [T, B, H] by the memories back to weights, inputs and first memories."""
+    """Backpropagates from the memories [T, B, H] to weights, inputs and first memories."""
     weights, sequences, every = kept
     steps, count, size = every.shape
     programs = pl.cdiv(count, TILE)
@@ -272,7 +272,7 @@ def _backward(
 def _write_sums(
     found: dict[str, Any], products: tuple[jax.Array, ...], totals: tuple[jax.Array, ...]
 ) -> None:
-    """Writes the sums of a program: gradients by the weights, gate by gate, and by the biases."""
+    """Writes the sums of a program: gradients of the weights, gate by gate, and of the biases."""
     program, size = pl.program_id(0), len(totals[0])
     columns = jnp.arange(size)
     for gate, product in enumerate(products):
@@ -296,14 +296,15 @@ def _gates(seen: Any, rows: _Rows, before: jax.Array, unit: _Unit) -> _Gates:
 
 
 def _slopes(slope: jax.Array, gates: _Gates, before: jax.Array) -> tuple[_Three, _Three, jax.Array]:
-    """Takes the derivative by the memory after a step back through the gates.
+    """Backpropagates from the memory after a step through the gates.
 
     r and u are the gates, n = tanh(x + r c) is the candidate, and h' = n + u (h - n). The
-    derivatives by n, u and h are 1 - u, h - n and u. Those of tanh and of the logistic function are
-    1 - n^2 and r (1 - r).
+    derivatives of h' with respect to n, u and h are 1 - u, h - n and u. Those of tanh and of the
+    logistic function are 1 - n^2 and r (1 - r).
 
     Returns:
-        Derivatives by the inputs and by the memory's part, gate by gate, and by the memory before.
+        Derivatives with respect to the inputs and to the memory's part, gate by gate, and to the
+        memory before.
     """
     reset, update, candidate, recalled = gates
     by_candidate = slope * (1.0 - update) * (1.0 - candidate * candidate)
