@@ -12,8 +12,8 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig
 from swarmjax.task.stage_config import StageConfig
 
-# Each arena gets one waiting episode per this many control steps of a rollout. The shortest episodes
-# of the six stages take 23 steps.
+# Each arena gets one waiting episode per this many control steps of a rollout. The shortest
+# episodes of the six stages take 23 steps.
 _STEPS_PER_EPISODE = 32
 
 
