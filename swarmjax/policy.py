@@ -11,12 +11,12 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 FORMAT = 2
-MEMORY_FORMAT = 4  # of a policy that remembers, by a memory or a history
-HEARING_FORMAT = 5  # of a policy that hears neighbours, whether it remembers or not
+MEMORY_FORMAT = 4  # of a policy with a memory or a history
+HEARING_FORMAT = 5  # of a policy that hears neighbours, with or without memory
 MAX_BYTES = 2**30  # of all arrays; those of two layers of 64 take 20 kB
-_MAX_LIST = 2**16  # bytes of the list of members, of which a name takes a hundred
-MAX_LETTERS = 2**20  # of `meta`, each four bytes
-MAX_ENTRIES = 2**16  # of `meta`, of which each may take a hundred bytes and more
+_MAX_LIST = 2**16  # bytes of the list of members; a name takes a hundred
+MAX_LETTERS = 2**20  # characters of `meta`, four bytes each
+MAX_ENTRIES = 2**16  # entries of `meta`, each a hundred bytes or more
 MEMORY = ("input/kernel", "input/bias", "recurrent/kernel", "recurrent/bias")
 _ACTIVATIONS = {
     "tanh": np.tanh,
@@ -26,7 +26,7 @@ _ACTIVATIONS = {
 
 
 class PolicyError(ValueError):
-    """A policy that is refused, in one sentence for the person who gave it."""
+    """A refusal of a policy, in one sentence for the user."""
 
 
 class Policy(NamedTuple):
@@ -34,43 +34,43 @@ class Policy(NamedTuple):
 
     layers: list[tuple[np.ndarray, np.ndarray]]  # kernel [L, in, out] and bias [L, out]
     log_std: np.ndarray  # [L, U], logarithm of the deviation of the action
-    mean: np.ndarray  # [L, k O], of the observations, newest first; k is `history`
-    std: np.ndarray  # [L, k O], likewise
+    mean: np.ndarray  # [L, k O], mean of the observations, newest first; k is `history`
+    std: np.ndarray  # [L, k O], their deviation
     is_shared: bool
     encoding: Any  # "metric" or "webots"
     max_speed: float  # m/s; commands begin at 0
     max_turn_rate: float  # rad/s, to either side
     meta: dict[str, Any]
-    digest: str  # SHA-256 of all else in the file, in hexadecimal
+    digest: str  # SHA-256 of the rest of the file, in hexadecimal
     network: Any = None  # with `meta["network"]`: normalised [..., R, k O] to features
-    # of format 4: kernel [L, F, 3 H] and bias [L, 3 H] of what is seen, and of what is recalled
+    # format 4: input weights [L, F, 3 H] and bias [L, 3 H], recurrent weights and bias
     memory: tuple[np.ndarray, ...] | None = None
-    # of format 5: kernel [L, W, E] and bias [L, E] of what is made of each neighbour
+    # format 5: kernel [L, W, E] and bias [L, E] of the layer for neighbours
     hearing: tuple[np.ndarray, ...] | None = None
 
     @property
     def neighbours(self) -> dict[str, Any]:
-        """What is heard: `count`, `range` (m) and `message_size`; empty if nothing."""
+        """Neighbour settings: `count`, `range` (m) and `message_size`; empty if not used."""
         return self.meta["observation"].get("neighbours", {})
 
     @property
     def history(self) -> int:
-        """How many observations the policy takes: the last one, and those before."""
+        """Number of observations that the policy uses: the last one, and those before."""
         return self.meta["observation"].get("history", 1)
 
     @property
     def carried(self) -> int:
-        """How many numbers a robot carries from one control step to the next."""
+        """Count of numbers that a robot carries from one control step to the next."""
         if self.memory is not None:
             return self.memory[2].shape[1]
         return (self.history - 1) * (self.mean.shape[1] // self.history)
 
 
 def load(path: str | Path | IO[bytes]) -> Policy:
-    """Returns the policy in a file (path, or open in binary); PolicyError if it is none."""
+    """Returns the policy in a file (path, or open in binary); raises PolicyError if unsound."""
     try:
         if isinstance(path, str | Path) and Path(path).exists() and not Path(path).is_file():
-            raise ValueError("it is no plain file")  # a pipe would be waited for
+            raise ValueError("it is not a plain file")  # reading a pipe would wait for its writer
         with open(path, "rb") if isinstance(path, str | Path) else nullcontext(path) as file:
             arrays = _read(file)
         found, text = _text(arrays.pop("digest")), _text(arrays["meta"])
@@ -101,13 +101,13 @@ def load(path: str | Path | IO[bytes]) -> Policy:
         rest += [meta["policy"] == "shared", meta["observation"]["encoding"]]
         rest += [*meta["action"]["high"][:2], meta, found]
         return Policy(*[layers, *rest], memory=memory, hearing=hearing)
-    except Exception as error:  # whatever a damaged file makes zipfile, NumPy and json raise
+    except Exception as error:  # zipfile, NumPy and json raise many kinds for a damaged file
         reason = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
         raise PolicyError(f"{path} cannot be read as a policy: {reason[:200]}.") from None
 
 
 def open_archive(file: IO[bytes]) -> zipfile.ZipFile:
-    """Opens an archive after a look at its end, which says how much zipfile would read of it."""
+    """Opens an archive, after checking at its end how much of it zipfile would read."""
     file.seek(max(0, file.seek(0, 2) - 42))
     end = file.read()
     if end[-22:-18] != b"PK\5\6":
@@ -118,37 +118,37 @@ def open_archive(file: IO[bytes]) -> zipfile.ZipFile:
 
 
 def _read(file: IO[bytes]) -> dict[str, np.ndarray]:
-    """Reads the arrays of an archive; nothing is unpacked that takes more room than the file."""
+    """Reads the arrays of an archive; refuses one that unpacks to more bytes than the file has."""
     with open_archive(file) as archive:
         members, size = archive.infolist(), file.seek(0, 2)
         if size > MAX_BYTES or sum(member.file_size for member in members) > size:
             raise ValueError(f"it unpacks to more than the file, or {MAX_BYTES} bytes")
         plain = {x.filename for x in members if not (x.compress_type or x.flag_bits & 1)}
         if len(plain) < len(members):
-            raise ValueError("a member is compressed, encrypted or there twice")
+            raise ValueError("a member is compressed, encrypted or duplicated")
         return {x.filename.removesuffix(".npy"): read_array(archive, x) for x in members}
 
 
 def read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """Reads a member whose header says neither more nor less than there is."""
+    """Reads a member, and checks that its size is that of its header."""
     with archive.open(member) as file:
         if np.lib.format.read_magic(file) != (1, 0):
             raise ValueError(f"{member.filename!r} is not of npy version 1.0")
         shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
         size = file.tell() + math.prod(shape) * dtype.itemsize
         if dtype.hasobject or is_fortran or size != member.file_size:
-            raise ValueError(f"{member.filename!r} is not the array that its header tells of")
+            raise ValueError(f"{member.filename!r} does not match its header")
         return np.frombuffer(file.read(), dtype).reshape(shape)
 
 
 def _text(array: np.ndarray) -> str:
     if array.dtype.kind == "U" and not array.shape and array.itemsize <= 4 * MAX_LETTERS:
         return array.item()
-    raise ValueError(f"meta or digest is no text of {MAX_LETTERS} letters at most")
+    raise ValueError(f"meta or digest is not a text of at most {MAX_LETTERS} letters")
 
 
 def digest(arrays: dict[str, np.ndarray]) -> str:
-    """Returns the SHA-256 over the names, types, shapes and bytes of arrays, names sorted."""
+    """Returns the SHA-256 over the names, types, shapes and bytes of arrays, sorted by name."""
     found = hashlib.sha256()
     for name, x in sorted(arrays.items()):
         found.update(f"{name} {x.dtype.str} {list(x.shape)}\n".encode())
@@ -160,22 +160,22 @@ def act(policy: Policy, observation: np.ndarray, normal: Any = 0.0) -> np.ndarra
     """Draws the action of each robot; without `normal` it is the most likely one.
 
     Args:
-        policy: Without memory or history, of one learner for all robots, or of R or more.
+        policy: Without memory or history, with one learner for all robots, or at least R.
         observation: [..., R, O] as `meta["observation"]` says: (quantity - offset) / scale.
-        normal: [..., R, U] standard normal, drawn anew at each control step.
+        normal: [..., R, U] standard normal, drawn afresh at each control step.
 
     Returns:
-        [..., R, U] float32; -1..1 spans the commands, but it may lie beyond.
+        [..., R, U] float32. -1..1 spans the commands, but actions may lie beyond it.
     """
     if policy.carried:
-        raise PolicyError("the policy remembers: call `begin` once an episode, and `step`.")
+        raise PolicyError("the policy has a memory: call `begin` once an episode, then `step`.")
     return step(policy, None, observation, normal)[1]
 
 
 def begin(policy: Policy, shape: tuple[int, ...]) -> np.ndarray | None:
     """Returns the memory of robots whose episode begins; None if there is none.
 
-    It is [*shape, H], or, of a policy with a history, the observations before: [*shape, (k - 1) O].
+    It is [*shape, H] or, with a history, the earlier observations, [*shape, (k - 1) O].
     """
     return np.zeros((*shape, policy.carried), "f4") if policy.carried else None
 
@@ -183,11 +183,11 @@ def begin(policy: Policy, shape: tuple[int, ...]) -> np.ndarray | None:
 def step(
     policy: Policy, memory: np.ndarray | None, observation: np.ndarray, normal: Any = 0.0
 ) -> tuple[np.ndarray | None, np.ndarray]:
-    """Draws actions as `act`, and remembers.
+    """Draws actions as `act` does, and updates the memory.
 
     Args:
-        policy: Of one learner for all robots, or of R or more.
-        memory: [..., R, H] as `begin` or the step before returned it.
+        policy: With one learner for all robots, or at least R.
+        memory: [..., R, H] from `begin` or from the step before.
         observation: As in `act`; of this control step alone, also with a history.
         normal: As in `act`.
 
@@ -215,7 +215,7 @@ def step(
 
 
 def _check(policy: Policy, memory: np.ndarray | None, observation: np.ndarray) -> None:
-    """Refuses what `step` cannot take."""
+    """Refuses arguments of `step` with wrong shapes."""
     robots, learners = observation.shape[-2], len(policy.mean)
     if robots > learners and not policy.is_shared:
         raise PolicyError(f"{robots} robots are too many for {learners} independent policies.")
@@ -230,7 +230,7 @@ def _check(policy: Policy, memory: np.ndarray | None, observation: np.ndarray) -
 
 
 def _hear(parts: list[np.ndarray], policy: Policy, x: np.ndarray) -> np.ndarray:
-    """Returns the observation with the sum over neighbours of one layer in the place of them."""
+    """Returns the observation with its neighbours replaced by the sum of one layer over them."""
     (kernel, bias), count = parts, policy.neighbours["count"]
     first = x.shape[-1] - count * kernel.shape[1]
     rows = x[..., first:].reshape(*x.shape[:-1], count, kernel.shape[1])
@@ -239,7 +239,7 @@ def _hear(parts: list[np.ndarray], policy: Policy, x: np.ndarray) -> np.ndarray:
 
 
 def _remember(parts: list[np.ndarray], memory: np.ndarray, features: np.ndarray) -> np.ndarray:
-    """Returns the memory after a gated recurrent unit (GRU), reset gate behind the product."""
+    """Returns the memory after a gated recurrent unit (GRU), reset gate after the product."""
     seen, recalled = (
         np.vecmat(features, parts[0]) + parts[1],
         np.vecmat(memory, parts[2]) + parts[3],
@@ -257,8 +257,8 @@ def command(policy: Policy, action: np.ndarray) -> np.ndarray:
     """Scales actions [..., U], clipped to -1..1, to commands.
 
     Returns:
-        [..., U]: speed, 0..max_speed (m/s), and turn rate (rad/s, left positive); of a policy that
-        broadcasts, what it does, -1..1, follows.
+        [..., U]: speed, 0..max_speed (m/s), and turn rate (rad/s, left positive). With messages,
+        these follow, within -1..1.
     """
     speed, turn, *said = np.moveaxis(np.clip(action, -1, 1), -1, 0)
     drive = [(speed + 1) * (0.5 * policy.max_speed), turn * policy.max_turn_rate]

@@ -1,8 +1,8 @@
 """Reads and writes policy files (docs/policy-format.md), every field checked. No JAX.
 
-`policy.load` trusts what NumPy makes of a file; `read` trusts nothing. Each member's header is
-matched against the one form that NumPy writes, rather than evaluated, and sizes are compared
-before anything is allocated.
+`policy.load` trusts NumPy's reading of a file; `read` trusts nothing. It matches each member's
+header against the one form that NumPy writes, instead of evaluating it, and compares sizes before
+it allocates anything.
 """
 
 import io
@@ -40,14 +40,14 @@ BODIES = ("planar", "wheeled")
 RESPONSES = ("ideal", "webots", "real")
 ARRIVALS = ("latch", "hold")
 
-_MOST_MEMORY = 1024  # numbers that a robot remembers
-_MOST_HISTORY = 64  # observations that a policy takes
-_MOST_HEARD = 32  # neighbours, and numbers that each broadcasts
-NETWORK_FORMAT = 3  # of a policy whose network is code that its file does not hold
+_MOST_MEMORY = 1024  # numbers in a robot's memory
+_MOST_HISTORY = 64  # observations that a policy uses
+_MOST_HEARD = 32  # neighbours, and numbers in each message
+NETWORK_FORMAT = 3  # of a policy whose network is an extension's code, not in the file
 _NETWORK = "network/"
 _DTYPE = np.dtype("<f4")
-_MOST = float(np.finfo(np.float32).max)  # numbers of `meta` are computed with in float32
-_MOST_LIMIT = 1e6  # standard deviations; beyond, sums of float32 may overflow
+_MOST = float(np.finfo(np.float32).max)  # for numbers of `meta`, which are used in float32
+_MOST_LIMIT = 1e6  # standard deviations; above it, sums of float32 may overflow
 _MEMBER = re.compile(
     r"(actor/(hidden_\d{1,3}|mean|hearing|memory/(input|recurrent))/(kernel|bias)|actor/log_std|"
     r"normalizer/(mean|std)|meta|digest|"
@@ -59,11 +59,11 @@ _HEADER = re.compile(
     rb"\{'descr': '([<>|][a-zA-Z]\d{0,9})', 'fortran_order': False, "
     rb"'shape': \((N,|N(?:, N){1,7}|)\), \} *\n".replace(b"N", rb"(?:0|[1-9]\d{0,8})")
 )
-_MOST_LOG_STD = 20.0  # 5e8 times the range of commands; exp of 89 is more than a float32 holds
-_MOST_HEADER = 10_000  # bytes, of a header and what is before it; NumPy reads no longer ones
+_MOST_LOG_STD = 20.0  # 5e8 times the range of commands; exp(89) overflows float32
+_MOST_HEADER = 10_000  # bytes, with all that precedes the header; NumPy reads no longer ones
 _NAME = re.compile(r"[a-zA-Z][\w.-]{0,63}", re.ASCII)
-_UNIT = re.compile(r"(?!.*(?:\*/|/\*))[a-zA-Z0-9/^*. -]{1,16}")  # nothing that bounds a comment
-_META = {  # what `meta` holds, and as which type of JSON
+_UNIT = re.compile(r"(?!.*(?:\*/|/\*))[a-zA-Z0-9/^*. -]{1,16}")  # cannot open or close a comment
+_META = {  # keys of `meta`, with their JSON types
     "policy": str,
     "learners": int,
     "activation": str,
@@ -78,7 +78,7 @@ _META = {  # what `meta` holds, and as which type of JSON
     "seed": int,
 }
 _KINDS = {str: "text", int: "a whole number", dict: "an object"}
-# What a damaged or foreign archive makes zipfile raise.
+# Exceptions of zipfile for a damaged or foreign archive.
 _UNREADABLE = (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile)
 
 
@@ -86,15 +86,16 @@ def read(path: str | Path, extensions: str | None = None) -> Policy:
     """Reads a policy file and checks all of it.
 
     Args:
-        path: Of the file.
-        extensions: As the key of that name, for a policy whose network is code of the user's.
+        path: Path of the file.
+        extensions: Value of the key with that name, for a policy whose network is an extension's
+            code.
 
     Returns:
         The policy.
 
     Raises:
-        PolicyError: If it is missing, damaged, of another format or inconsistent.
-        ConfigError: If its network is not in `extensions`.
+        PolicyError: The file is missing, damaged, of another format or inconsistent.
+        ConfigError: Its network is not in `extensions`.
     """
     path = Path(path)
     content = _read_bytes(path)
@@ -103,22 +104,22 @@ def read(path: str | Path, extensions: str | None = None) -> Policy:
         return _with_network(path, members, meta, extensions)
     try:
         return policy.load(io.BytesIO(content))
-    except PolicyError as error:  # whose sentence names what it read from
+    except PolicyError as error:  # its sentence names the buffer instead of the path
         _, _, reason = str(error).partition(" cannot be read as a policy: ")
         raise PolicyError(f"{path} cannot be read as a policy: {reason}") from None
 
 
 def read_meta(path: str | Path) -> dict[str, Any]:
-    """Reads what a policy file says of itself, all of the file checked.
+    """Reads the description in a policy file, and checks the whole file.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
 
     Returns:
         Its `meta`.
 
     Raises:
-        PolicyError: If it is missing, damaged, of another format or inconsistent.
+        PolicyError: The file is missing, damaged, of another format or inconsistent.
     """
     path = Path(path)
     content = _read_bytes(path)
@@ -128,7 +129,7 @@ def read_meta(path: str | Path) -> dict[str, Any]:
 def _with_network(
     path: Path, members: Mapping[str, np.ndarray], meta: dict[str, Any], extensions: str | None
 ) -> Policy:
-    """Makes a policy whose network is code of the user's."""
+    """Makes a policy whose network is an extension's code."""
     found = extension.load(extensions)
     extension.check_needs(meta.get("extensions", {}), found, str(path), ["network"])
     depth = _depth(members, own=True)
@@ -157,12 +158,12 @@ def write(path: str | Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str,
     """Writes a policy file, whole or not at all.
 
     Args:
-        path: Of the file; folders that are missing are made.
-        arrays: All arrays of the format, by name, but `meta` and `digest`.
-        meta: All of the format's `meta` but `format`, which is added.
+        path: Path of the file; missing folders are made.
+        arrays: All arrays of the format, by name, except `meta` and `digest`.
+        meta: All keys of the format's `meta` except `format`, which is added.
 
     Raises:
-        PolicyError: If `read` would refuse the file, or if it cannot be written.
+        PolicyError: `read` would refuse the file, or it cannot be written.
     """
     path = Path(path)
     full = {**meta, "format": _format(meta)}
@@ -177,14 +178,14 @@ def write(path: str | Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str,
 
 
 def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
-    """Refuses what does not make a policy.
+    """Refuses contents that do not make a policy.
 
     Args:
-        arrays: All of a file but `meta` and `digest`.
-        meta: All of the file's.
+        arrays: All arrays of a file except `meta` and `digest`.
+        meta: All of the file's `meta`.
 
     Raises:
-        PolicyError: In one sentence that names the field.
+        PolicyError: One sentence that names the field.
     """
     own = "network" in meta
     if meta.get("format") != _format(meta):
@@ -212,7 +213,7 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     if heard.size > size:
         raise PolicyError(
             f"meta.observation.neighbours takes {heard.size} entries, but meta.observation.names "
-            f"has {size}: expected those of neighbours among them."
+            f"has {size}: expected the neighbours' entries among them."
         )
     actions = _check_action(meta["action"], heard.messages)
     _check_embodiment(meta)
@@ -220,7 +221,7 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
 
 
 def _format(meta: Mapping[str, Any]) -> int:
-    """Returns the number of the format of a file that says this of itself."""
+    """Returns the number of the format that a file with this `meta` has."""
     layout = meta.get("observation")
     if isinstance(layout, Mapping) and "neighbours" in layout:
         return HEARING_FORMAT
@@ -230,14 +231,14 @@ def _format(meta: Mapping[str, Any]) -> int:
 
 
 def _has_history(meta: Mapping[str, Any]) -> bool:
-    """Tells whether a file says that its policy takes more than the last observation."""
+    """Tells whether a file's policy uses more than the last observation."""
     layout = meta.get("observation")
     history = layout.get("history", 1) if isinstance(layout, Mapping) else 1
     return isinstance(history, int) and history > 1
 
 
 def _check_history(meta: Mapping[str, Any]) -> int:
-    """Checks how many observations the policy takes and returns that number, 1 if none is said."""
+    """Checks and returns how many observations the policy uses; 1 if the file does not say."""
     if "history" not in meta["observation"]:
         return 1
     _entry(meta["observation"], "history", int, "meta.observation")
@@ -254,11 +255,11 @@ def _check_history(meta: Mapping[str, Any]) -> int:
 
 
 def _check_memory(meta: Mapping[str, Any]) -> int:
-    """Checks what the file says of the policy's memory; returns its size H, 0 without one."""
+    """Checks the file's entry for memory; returns the memory's size H, 0 without one."""
     if "memory" not in meta:
         return 0
     if "network" in meta:
-        raise PolicyError("meta.memory is there beside meta.network: expected one of them.")
+        raise PolicyError("meta.memory and meta.network are both given: expected one of them.")
     _entry(meta, "memory", dict)
     _choice(meta["memory"], "kind", ("gru",), "meta.memory")
     _entry(meta["memory"], "size", int, "meta.memory")
@@ -270,7 +271,7 @@ def _check_memory(meta: Mapping[str, Any]) -> int:
 
 
 class _Heard(NamedTuple):
-    """How many neighbours are heard, and how many numbers each broadcasts."""
+    """The number of neighbours that a robot hears, and of numbers in each message."""
 
     robots: int = 0
     messages: int = 0
@@ -282,12 +283,12 @@ class _Heard(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Entries of all of them."""
+        """Entries of all neighbours."""
         return self.robots * self.width
 
 
 class _Sizes(NamedTuple):
-    """L, O, H (0 without memory), what is heard and U."""
+    """L, O, H (0 without memory), sizes of hearing, and U."""
 
     learners: int
     size: int
@@ -297,12 +298,12 @@ class _Sizes(NamedTuple):
 
 
 def _check_neighbours(meta: Mapping[str, Any]) -> _Heard:
-    """Checks what the file says of neighbours and returns it."""
+    """Checks and returns the file's settings of neighbours."""
     if "neighbours" not in meta["observation"]:
         return _Heard()
     if "network" in meta:
         raise PolicyError(
-            "meta.observation.neighbours is there beside meta.network: expected one of them."
+            "meta.observation.neighbours and meta.network are both given: expected one of them."
         )
     where = "meta.observation.neighbours"
     _entry(meta["observation"], "neighbours", dict, "meta.observation")
@@ -315,12 +316,12 @@ def _check_neighbours(meta: Mapping[str, Any]) -> _Heard:
             )
     _check_positive(held, "range", where)
     if meta["observation"].get("history", 1) != 1:
-        raise PolicyError(f"{where} is there beside a history: expected one of them.")
+        raise PolicyError(f"{where} is given beside a history: expected one of them.")
     return _Heard(held["count"], held["message_size"])
 
 
 def _refuse_in[T](path: Path, make: Callable[[], T]) -> T:
-    """Puts the file's name before what is wrong with it."""
+    """Puts the file's name in front of an error."""
     try:
         return make()
     except PolicyError as error:
@@ -331,7 +332,7 @@ def _refuse_in[T](path: Path, make: Callable[[], T]) -> T:
 
 
 def _read_bytes(path: Path) -> bytes:
-    """Reads a file that is not too large to be a policy."""
+    """Reads a file, unless it is too large for a policy."""
     try:
         if not path.is_file():
             raise PolicyError(f"{path} is no file: give the path of a policy.npz.")
@@ -347,7 +348,7 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _check_file(content: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Refuses whatever is no sound policy file; returns its arrays, with the digest, and meta."""
+    """Refuses an unsound policy file; returns its arrays, with the digest, and meta."""
     members = {name: _parse_array(name, data) for name, data in _unpack(content).items()}
     expected, meta = _text(members, "digest"), _parse_meta(_text(members, "meta"))
     del members["digest"]
@@ -363,7 +364,7 @@ def _check_file(content: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def _unpack(content: bytes) -> dict[str, bytes]:
-    """Returns the members of an archive by their arrays' names."""
+    """Returns the members of an archive by the names of their arrays."""
     found: set[str] = set()
     try:
         with policy.open_archive(io.BytesIO(content)) as archive:
@@ -376,14 +377,14 @@ def _unpack(content: bytes) -> dict[str, bytes]:
     except PolicyError:
         raise
     except _UNREADABLE as error:
-        # zipfile quotes a damaged header whole, which says nothing to a reader.
+        # zipfile quotes a damaged header in full, which does not help a reader.
         said = str(error).strip().partition(" and header ")[0] or type(error).__name__
         reason = _plain(said.splitlines()[0].rstrip("."))
         raise PolicyError(f"it is no npz archive that can be read: {reason[:200]}.") from None
 
 
 def _check_total(total: int, most: int) -> None:
-    """Refuses members that overlap, of which a small file could hold any number."""
+    """Refuses members that overlap: a small file could hold any number of them."""
     if total > most:
         raise PolicyError(
             f"its members have {total} bytes in all: expected at most the {most} of the file."
@@ -391,7 +392,7 @@ def _check_total(total: int, most: int) -> None:
 
 
 def _check_member(member: zipfile.ZipInfo, found: Set[str]) -> None:
-    """Refuses a member that no policy has, before any of it is read."""
+    """Refuses a member that no policy has, before reading it."""
     name = member.filename
     if not _MEMBER.fullmatch(name):
         raise PolicyError(f"{_show(name)} is not known: format {FORMAT} has no such member.")
@@ -402,11 +403,11 @@ def _check_member(member: zipfile.ZipInfo, found: Set[str]) -> None:
 
 
 def _parse_array(name: str, data: bytes) -> np.ndarray:
-    """Reads an array in the one form in which NumPy writes those of the format."""
+    """Reads an array in the single form that NumPy writes for this format."""
     start = len(_MAGIC) + 2 + int.from_bytes(data[len(_MAGIC) : len(_MAGIC) + 2], "little")
     header = _HEADER.fullmatch(data, len(_MAGIC) + 2, start) if data.startswith(_MAGIC) else None
     if header is None or start > _MOST_HEADER:
-        raise PolicyError(f"{name} is no plain array: expected one of npy version 1.0.")
+        raise PolicyError(f"{name} is not a plain array: expected one of npy version 1.0.")
     shape = tuple(int(axis) for axis in header[2].split(b",") if axis)
     try:
         dtype = np.dtype(header[1].decode())
@@ -415,17 +416,17 @@ def _parse_array(name: str, data: bytes) -> np.ndarray:
     if dtype.kind not in "biufcSU" or not dtype.itemsize:
         raise PolicyError(f"{name} is {header[1].decode()}: expected numbers or text.")
     if math.prod(shape) * dtype.itemsize != len(data) - start:
-        raise PolicyError(f"{name} has not as many values as its shape {list(shape)} says.")
+        raise PolicyError(f"{name} does not have as many values as its shape {list(shape)}.")
     try:
         return np.ndarray(shape, dtype, data, start)
-    except ValueError:  # of an axis of 0 beside others whose product NumPy cannot hold
+    except ValueError:  # an axis of 0, where NumPy cannot hold the product of the others
         raise PolicyError(f"{name} has shape {list(shape)}: expected no axis of 0.") from None
 
 
 def _text(members: Mapping[str, np.ndarray], name: str) -> str:
     array = members.get(name)
     if array is None:
-        raise PolicyError(f"{name} is missing: the file is no policy of format {FORMAT}.")
+        raise PolicyError(f"{name} is missing: the file is not a policy of format {FORMAT}.")
     if array.shape != () or not array.dtype.str.startswith("<U"):
         raise PolicyError(f"{name} is {array.dtype} {list(array.shape)}: expected one text.")
     try:
@@ -448,7 +449,7 @@ def _parse_meta(text: str) -> dict[str, Any]:
     return meta
 
 
-# What `meta` says
+# Contents of `meta`
 
 
 def _entry(mapping: Mapping[str, Any], key: str, kind: type, where: str = "meta") -> None:
@@ -460,7 +461,7 @@ def _entry(mapping: Mapping[str, Any], key: str, kind: type, where: str = "meta"
 
 
 def _check_optional(meta: Mapping[str, Any]) -> None:
-    """Checks the keys that files of older versions lack."""
+    """Checks the keys that older files lack."""
     for key in ("realism", "extensions"):
         if key in meta:
             _entry(meta, key, dict)
@@ -475,7 +476,7 @@ def _check_optional(meta: Mapping[str, Any]) -> None:
 
 
 def _are_texts(pieces: object) -> bool:
-    """Tells whether these are texts by name."""
+    """Tells whether an object maps names to texts."""
     return isinstance(pieces, dict) and all(isinstance(each, str) for each in pieces.values())
 
 
@@ -501,7 +502,7 @@ def _check_observation(layout: Mapping[str, Any]) -> int:
     for key in ("offset", "scale"):
         _check_numbers(layout, key, len(names), where)
     if not np.array(layout["scale"], np.float32).all():
-        raise PolicyError(f"{where}.scale holds 0: it divides.")
+        raise PolicyError(f"{where}.scale holds 0, but it is a divisor.")
     _check_positive(layout, "limit", where)
     if layout["limit"] > _MOST_LIMIT:
         raise PolicyError(
@@ -511,7 +512,7 @@ def _check_observation(layout: Mapping[str, Any]) -> int:
 
 
 def _words(layout: Mapping[str, Any], key: str, form: re.Pattern[str]) -> list[str]:
-    """Returns a list of words that may stand in a comment of any language."""
+    """Returns a list of words that are safe in a comment of any language."""
     value = layout.get(key)
     if not isinstance(value, list | tuple) or not all(
         isinstance(item, str) and form.fullmatch(item) for item in value
@@ -535,10 +536,10 @@ def _check_positive(layout: Mapping[str, Any], key: str, where: str) -> None:
 
 
 def action_layout(messages: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names the numbers of an action, U, and their units.
+    """Returns the names and the units of the numbers of an action.
 
     Args:
-        messages: How many numbers a robot broadcasts.
+        messages: Count of numbers that a robot broadcasts.
     """
     said = tuple(f"message_{i}" for i in range(messages))
     return (*ACTION_NAMES, *said), (*ACTION_UNITS, *("1" for _ in said))
@@ -568,7 +569,7 @@ def _check_action(layout: Mapping[str, Any], messages: int) -> int:
 
 
 def _check_embodiment(meta: Mapping[str, Any]) -> None:
-    """Checks what the policy was trained as: which robot, with which sensors, at which task."""
+    """Checks the robot, the sensors and the task of the policy's training."""
     robot, sensors, task = meta["robot"], meta["sensors"], meta["task"]
     _check_preset(robot, "meta.robot")
     _choice(robot, "body", BODIES, "meta.robot")
@@ -579,7 +580,7 @@ def _check_embodiment(meta: Mapping[str, Any]) -> None:
     _check_positive(sensors, "range", "meta.sensors")
     for key in ("control_step", "target_radius"):
         _check_positive(task, key, "meta.task")
-    if "arrival" in task:  # older files are all of the first rule
+    if "arrival" in task:  # older files lack it, and mean the first rule
         _choice(task, "arrival", ARRIVALS, "meta.task")
 
 
@@ -596,7 +597,7 @@ def _is_name(value: object) -> bool:
 def _is_number(value: object) -> TypeGuard[float]:
     if not isinstance(value, int | float) or isinstance(value, bool):
         return False
-    return -_MOST <= value <= _MOST  # also of an integer that no float can hold
+    return -_MOST <= value <= _MOST  # works for integers beyond a float's range too
 
 
 # Arrays
@@ -605,7 +606,7 @@ def _is_number(value: object) -> TypeGuard[float]:
 def _check_arrays(arrays: Mapping[str, np.ndarray], sizes: _Sizes, *, own: bool) -> None:
     """Checks names, then types, shapes and values.
 
-    `own` says that the network is code.
+    `own` tells whether the network is an extension's code.
     """
     learners, size = sizes.learners, sizes.size
     depth = _depth(arrays, own=own)
@@ -628,7 +629,7 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], sizes: _Sizes, *, own: bool)
             "deviation."
         )
     if (arrays["normalizer/std"] <= 0).any():
-        raise PolicyError("normalizer/std holds a value that is not above 0: it divides.")
+        raise PolicyError("normalizer/std holds a value of 0 or less, but it is a divisor.")
 
 
 def _check_array(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
@@ -643,13 +644,13 @@ def _check_array(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
 
 
 def _network_shapes(arrays: Mapping[str, np.ndarray], learners: int) -> dict[str, tuple[int, ...]]:
-    """Returns the shapes of the arrays of a network that is code: one axis of learners at least."""
+    """Returns the shapes of an extension's network arrays; each has an axis of learners."""
     found = {name: array for name, array in arrays.items() if name.startswith(_NETWORK)}
     return {name: (learners, *array.shape[1:]) for name, array in found.items()}
 
 
 def _depth(arrays: Mapping[str, np.ndarray], *, own: bool) -> int:
-    """Counts the hidden layers, at least one unless the network is code."""
+    """Counts the hidden layers; at least one, unless the network is an extension's code."""
     found = {match[0] for name in arrays if (match := re.match(r"actor/hidden_\d+/", name))}
     return len(found) if own else max(1, len(found))
 
@@ -657,9 +658,9 @@ def _depth(arrays: Mapping[str, np.ndarray], *, own: bool) -> int:
 def _shapes(
     arrays: Mapping[str, np.ndarray], sizes: _Sizes, width: int, depth: int
 ) -> dict[str, tuple[int, ...]]:
-    """Returns the shape that each array should have; a bias says how wide its layer is.
+    """Returns the expected shape of each array; the width of a layer comes from its bias.
 
-    `width` is what the first layer takes of a policy that does not hear.
+    `width` is the input size of the first layer, for a policy without neighbours.
     """
     shapes, (learners, size, recalled, heard, actions) = {}, sizes
     if heard.robots:
@@ -688,11 +689,11 @@ def _shapes(
 
 
 def _show(value: object) -> str:
-    """Writes a value as JSON would, and short."""
+    """Formats a value as short JSON."""
     text = json.dumps(value, default=str)
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def _plain(text: str) -> str:
-    """Writes text so that no control character is left in it."""
+    """Removes control characters from text."""
     return text.encode("unicode_escape").decode("ascii")

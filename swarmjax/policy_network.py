@@ -1,6 +1,6 @@
-"""The network of an extension in a policy: code from a file of the user's, weights from the policy.
+"""The network of an extension in a policy: code from a user's file, weights from the policy.
 
-Imports JAX when it is first called, so that policies that need none run without.
+It imports JAX when it is first called, so that other policies run without JAX.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,18 +13,18 @@ from swarmjax import extension
 
 
 class PolicyNetwork:
-    """What comes before the last layer of a policy: normalised [..., R, O] to features [..., R, F].
+    """The part before a policy's last layer: normalised [..., R, O] to features [..., R, F].
 
-    It can be sent to another process, which loads the extension again.
+    It can be sent to another process, which then loads the extension again.
     """
 
     def __init__(self, source: str, name: str, arrays: Mapping[str, np.ndarray]) -> None:
-        """Keeps the weights.
+        """Stores the weights.
 
         Args:
-            source: as the key `extensions`.
-            name: of the network.
-            arrays: [L, ...] of its parameters, by their paths.
+            source: value of the key `extensions`.
+            name: name of the network.
+            arrays: [L, ...] its parameters, by their paths.
         """
         self._source, self._name, self._arrays = source, name, dict(arrays)
         self._apply: Callable[[np.ndarray], Any] | None = None
@@ -42,7 +42,7 @@ class PolicyNetwork:
 
     @property
     def params(self) -> dict[str, Any]:
-        """Parameters [L, ...] as the Flax module nests them."""
+        """Parameters [L, ...], nested as in the Flax module."""
         nested: dict[str, Any] = {}
         for path, array in self._arrays.items():
             *parts, last = path.split("/")
@@ -65,11 +65,11 @@ class PolicyNetwork:
 
 
 def features(module: Any, params: Any, x: Any) -> Any:
-    """Applies a network to arenas side by side, by JAX.
+    """Applies a network to arenas side by side, with JAX.
 
     Args:
         module: Flax module.
-        params: [L, ...] of it; of one learner for all robots, or of one for each.
+        params: [L, ...] its parameters, of one learner for all robots or of one for each robot.
         x: [B, R, O] normalised observations.
 
     Returns:

@@ -1,7 +1,7 @@
 """`python -m swarmjax.suite suite=NAME [out=FILE]`: draws the levels of a suite.
 
-They are held to the digests in its file; `write=true` puts digests there. With `policies` the
-levels of each cell are chosen: those of a pool that these policies fail most.
+The levels are checked against the digests in the suite's file. `write=true` writes new digests into
+it. With `policies`, each cell gets the levels of a pool that these policies fail most.
 """
 
 import json
@@ -33,34 +33,34 @@ from swarmjax.evaluate.suite_config import CellConfig, read_suite
 from swarmjax.evaluate.table import PLAIN_WIDTH
 from swarmjax.evaluate.trials import Entrant, Trial
 
-_WIDTH = 100  # of a line of a suite's file
+_WIDTH = 100  # columns of a suite's file
 
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteConfig(Section):
-    """Which suite is drawn, and what becomes of it."""
+    """The suite to draw, and the outputs."""
 
     command: ClassVar[str] = "suite"
 
-    suite: str = field(metadata=about("a name of configs/suites/, or a file .yaml"))
-    out: str | None = field(default=None, metadata=about("file .npz for all of its levels"))
+    suite: str = field(metadata=about("a name in configs/suites/, or a .yaml file"))
+    out: str | None = field(default=None, metadata=about(".npz file for all of its levels"))
     write: bool = field(
         default=False,
-        metadata=about("put digests, and episodes that were chosen, into the suite's file"),
+        metadata=about("write digests, and chosen episodes, into the suite's file"),
     )
     policies: str | None = field(
         default=None,
-        metadata=about("choose the levels that these fail most: a.npz,b.npz or a pattern"),
+        metadata=about("choose the levels that these policies fail most: a.npz,b.npz or a pattern"),
     )
     pool: int = field(default=20_000, metadata=about("levels drawn to choose from", 1, 1_000_000))
     steps: int | None = field(
         default=None,
         metadata=about(
-            f"control steps of an episode; null: those of the cell, else {STEPS}", 1, MOST_STEPS
+            f"control steps of an episode; null: the cell's, else {STEPS}", 1, MOST_STEPS
         ),
     )
     workers: int | None = field(
-        default=None, metadata=about("processes; null: one a core", 1, 1024)
+        default=None, metadata=about("processes; null: one per core", 1, 1024)
     )
 
 
@@ -68,12 +68,12 @@ def choose(trial: Trial, count: int) -> np.ndarray:
     """Chooses the levels that policies fail most.
 
     Args:
-        trial: Of one or more policies on a pool of levels.
-        count: How many to choose, at most as many as there are.
+        trial: Trial of one or more policies on a pool of levels.
+        count: Number of levels to choose, at most the size of the pool.
 
     Returns:
-        Their numbers [count], rising: those of which the fewest targets were reached, of equal ones
-        those with the most contacts, then those that took longest, then the first ones.
+        Their numbers [count], rising. Levels with the fewest reached targets are chosen first.
+        Ties go to the level with the most contacts, then to the slowest, then to the first.
     """
     reached, contacts, time = (
         trial.found[name].mean(axis=0)
@@ -104,7 +104,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _renew(settings: SuiteConfig) -> Suite:
-    """Draws a suite whatever its digests are, and writes those that it finds into its file."""
+    """Draws a suite without checking its digests, and writes the new digests into its file."""
     file = read_suite(settings.suite)
     wanted = file.cells
     if settings.policies is not None:
@@ -122,7 +122,7 @@ def _renew(settings: SuiteConfig) -> Suite:
 
 
 def _replace(path: Path, text: str) -> None:
-    """Puts a text in the place of a file's, whole or not at all."""
+    """Replaces the text of a file, whole or not at all."""
     try:
         with replacing(path) as temporary:
             temporary.write_text(text)
@@ -140,7 +140,7 @@ def _search(settings: SuiteConfig, cell: CellConfig, entrants: Sequence[Entrant]
     judged = EvaluateConfig(
         policy=settings.policies,
         stage=cell.stage,
-        action="mean",  # the luck of a draw is no property of a level
+        action="mean",  # a level should not depend on lucky draws
         steps=settings.steps,
         workers=settings.workers,
     )
@@ -154,17 +154,17 @@ def _search(settings: SuiteConfig, cell: CellConfig, entrants: Sequence[Entrant]
 
 
 def _comment(path: Path) -> str:
-    """The lines of comment that a file begins with."""
+    """Returns the comment lines at the beginning of a file."""
     lines = reading.read_text(path).splitlines(keepends=True)
     end = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
     return "".join(lines[:end])
 
 
 def to_yaml(content: dict[str, Any]) -> str:
-    """Writes a suite's file: a line for each key, lists of numbers wrapped.
+    """Formats a suite's file: a line for each key, with lists of numbers wrapped.
 
     Args:
-        content: Plain data, as `files.read_yaml` gives it.
+        content: Plain data, as from `files.read_yaml`.
 
     Returns:
         The text.
@@ -185,7 +185,7 @@ def to_yaml(content: dict[str, Any]) -> str:
 
 
 def _flow(value: Any) -> str:
-    """Writes a value in YAML's flow style, text without quotes where YAML reads it as just that."""
+    """Formats a value in YAML's flow style; quotes text only where YAML would misread it."""
     if isinstance(value, dict):
         items = (f"{_flow(key)}: {_flow(item)}" for key, item in value.items())
         return "{" + ", ".join(items) + "}"

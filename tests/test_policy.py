@@ -144,15 +144,15 @@ def _say(path: Path, text: str) -> None:
             r"digest is not that of the arrays",
         ),
         (lambda path: _claim(path, 2**30 + 1), "it unpacks to more than the file, or"),
-        (_compress, "a member is compressed, encrypted or there twice"),
-        (_double, "a member is compressed, encrypted or there twice"),
+        (_compress, "a member is compressed, encrypted or duplicated"),
+        (_double, "a member is compressed, encrypted or duplicated"),
         (
             lambda path: _member(path, _npy("<f4", "2147483648,")),
-            "'actor/hidden_9/bias.npy' is not the array that",
+            "'actor/hidden_9/bias.npy' does not match",
         ),
         (
             lambda path: _member(path, _npy("|O", "1,")),
-            "'actor/hidden_9/bias.npy' is not the array that",
+            "'actor/hidden_9/bias.npy' does not match",
         ),
         (lambda path: _member(path, _npy("<U0", "1,")), ""),
         (
@@ -162,7 +162,7 @@ def _say(path: Path, text: str) -> None:
         (_crowd, "its list of members has more than 65536 bytes"),
         (lambda path: _say(path, "[" * 100_000), "meta has more than 65536 entries"),
         (lambda path: _say(path, "[" * 60_000), "maximum recursion depth"),
-        (lambda path: _say(path, "x" * 2**21), "meta or digest is no text of 1048576 letters"),
+        (lambda path: _say(path, "x" * 2**21), "meta or digest is not a text of at most 1048576"),
         (lambda path: _say(path, '{"format": ' + "9" * 5000 + "}"), "Exceeds the limit"),
     ],
     ids=[
@@ -183,7 +183,7 @@ def test_load_refuses_in_one_sentence(tmp_path: Path, damage: Any, sentence: str
 @pytest.mark.parametrize("path", ["a pipe", "/tmp"])
 def test_load_waits_for_no_pipe(tmp_path: Path, path: str) -> None:
     os.mkfifo(tmp_path / "a pipe")
-    with pytest.raises(PolicyError, match=r"cannot be read as a policy: it is no plain file\.$"):
+    with pytest.raises(PolicyError, match=r"cannot be read as a policy: it is not a plain file\.$"):
         policy.load(tmp_path / path)
 
 
@@ -342,7 +342,7 @@ def test_a_memory_is_handed_in_and_out(tmp_path: Path) -> None:
     said = {"memory": {"kind": "gru", "size": 3}}
     loaded = saved(tmp_path / "a.npz", policies.remembering(policies.arrays(), 3), **said)
     seen = np.zeros((5, 2, SIZE), np.float32)
-    with pytest.raises(PolicyError, match=r"^the policy remembers: call `begin` once an episode"):
+    with pytest.raises(PolicyError, match=r"^the policy has a memory: call `begin` once an"):
         policy.act(loaded, seen)
     with pytest.raises(PolicyError, match=r"^memory is \[2, 3\]: give \[5, 2, 3\], as `begin`"):
         policy.step(loaded, policy.begin(loaded, (2,)), seen)
@@ -377,7 +377,7 @@ def test_a_history_is_handed_in_and_out(tmp_path: Path) -> None:
     said = {"observation": policies.observed() | {"history": 3}}
     loaded = saved(tmp_path / "a.npz", policies.stacked(policies.arrays(), 3), **said)
     seen, size = np.zeros((5, 2, SIZE), np.float32), 2 * SIZE
-    with pytest.raises(PolicyError, match=r"^the policy remembers: call `begin` once an episode"):
+    with pytest.raises(PolicyError, match=r"^the policy has a memory: call `begin` once an"):
         policy.act(loaded, seen)
     with pytest.raises(PolicyError, match=rf"^memory is \[2, {size}\]: give \[5, 2, {size}\], as"):
         policy.step(loaded, policy.begin(loaded, (2,)), seen)

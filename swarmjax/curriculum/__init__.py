@@ -1,6 +1,6 @@
-"""Which stage each arena trains on, and when that changes.
+"""The curriculum: which stage each arena trains on, and when that changes.
 
-Imports `task` for stages and for episodes that have ended. `engine.py` counts, judges and hands
-over to a mode; `modes.py` has one pure function a mode; `log.py` puts decisions into words. Start
-with `engine.advance`.
+It imports `task` for stages and for ended episodes. `engine.py` counts and judges episodes, and
+calls a mode. `modes.py` has one pure function for each mode. `log.py` writes decisions as log
+entries. Start with `engine.advance`.
 """

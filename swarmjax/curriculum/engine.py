@@ -1,9 +1,10 @@
-"""The curriculum's engine: where each arena begins, how each stage goes, when something is decided.
+"""The curriculum's engine: it assigns stages to arenas, judges each stage, and times decisions.
 
-All of it on device, for any mode of `modes.py`. Episodes are counted in cohorts: all those
-that began within one step limit. A cohort's verdict falls another step limit later, when the last
-of its episodes has ended; the short episodes that end first are the lucky ones, and would promote
-too early. An episode counts for the stage and the cohort in which it began.
+All of it runs on the device, for any mode of `modes.py`. Episodes are counted in cohorts: a cohort
+holds all episodes that began within one step limit. Its verdict falls another step limit later,
+when its last episode has ended. An earlier verdict would count only the short episodes, which are
+the lucky ones, and would promote too early. An episode counts for the stage and the cohort in which
+it began.
 """
 
 import math
@@ -29,37 +30,37 @@ from swarmjax.task.stage_config import StageConfig
 
 STAYED, BY_THRESHOLD, BY_BUDGET, BY_DEMOTION, REWEIGHED = range(5)
 REASONS = ("stayed", "threshold", "budget", "demotion", "reweighed")
-NEVER = np.iinfo(np.int32).max  # a deadline
+NEVER = np.iinfo(np.int32).max  # as a deadline
 
-# Of the golden ratio, in steps of 2**-32: the multiples of it fill the circle as evenly as any
-# (Knuth, The Art of Computer Programming 3, section 6.4, multiplicative hashing, theorem S).
+# The golden ratio in steps of 2**-32: its multiples fill the circle as evenly as those of any
+# number (Knuth, The Art of Computer Programming 3, section 6.4, multiplicative hashing, theorem S).
 _GOLDEN = np.uint32(2654435769)
-# A verdict on n trials moves `fast` by n / (n + 20) of the way: as if 20 trials had been seen that
-# came out as before, so that a few episodes do not overturn what many have said.
+# A verdict on n trials moves `fast` by n / (n + 20) of the way to it, as if there were 20 earlier
+# trials with the old result. A few episodes then cannot outweigh many earlier ones.
 _PRIOR_TRIALS = 20.0
-# What those trials are before the first verdict: half a success, where p (1 - p) is largest.
+# The success of those trials before the first verdict: half, where p (1 - p) is largest.
 _PRIOR_SUCCESS = 0.5
-# `slow` moves a fifth as fast: it lags about five verdicts behind, and |fast - slow| is how far
-# success has come since (the learning progress of Kanitscheider et al. 2021, "Multi-task
-# curriculum learning in a complex, visual, hard-exploration domain: Minecraft", arXiv:2106.14876,
-# which takes it between a fast and a slow mean, in both directions). The two rates are this
-# project's choice.
+# `slow` moves a fifth as fast, so it lags about five verdicts behind. |fast - slow| is how far
+# success has moved since then. This is the learning progress of Kanitscheider et al. 2021
+# ("Multi-task curriculum learning in a complex, visual, hard-exploration domain: Minecraft",
+# arXiv:2106.14876): the difference of a fast and a slow mean, in both directions. The two rates
+# are this project's choice.
 _SLOWNESS = 0.2
 
 
 class Schedule(NamedTuple):
-    """The curriculum's numbers: an argument of the compiled program, so that none is fixed in it.
+    """The curriculum's numbers: an argument of the compiled program, not constants in it.
 
-    Those that a mode does not have are nan, or `NEVER`.
+    Numbers that a mode does not have are nan, or `NEVER`.
 
     Attributes:
       stages: [S], in order.
-      deadline: [S] update at which the stage is left in any case, int32.
+      deadline: [S] update at which the stage ends at the latest, int32.
       threshold: [] success that promotes.
       demotion: [] success below which the stage before returns; -1: never.
       earlier_share: [] share of the arenas on earlier stages.
       floor: [] share of the arenas that is spread evenly over all stages.
-      cohort_updates: [] updates that hold one step limit, int32.
+      cohort_updates: [] updates of one step limit, int32.
       levels: numbers of the curriculum over levels; None without one.
     """
 
@@ -74,14 +75,14 @@ class Schedule(NamedTuple):
 
 
 class CohortTally(NamedTuple):
-    """Episodes of one cohort that have ended, by the stage on which they began, [S] each.
+    """Ended episodes of one cohort, by the stage on which they began, [S] each.
 
     Attributes:
-      episodes: how many, int32.
-      targets: robots that took part, int32.
+      episodes: number of episodes, int32.
+      targets: robots that were present, int32.
       reached: robots that arrived, int32.
       complete: episodes in which every robot arrived, int32.
-      contacts: of all kinds, over all robots, int32.
+      contacts: contacts of all kinds, over all robots, int32.
       reward: sum over all robots, float32.
     """
 
@@ -94,15 +95,15 @@ class CohortTally(NamedTuple):
 
 
 class Record(NamedTuple):
-    """How each stage goes, [S] each; nan, and 0 episodes, before its first verdict.
+    """The record of each stage, [S] each; nan, and 0 episodes, before its first verdict.
 
     Attributes:
-      episodes: of the newest verdict, int32.
+      episodes: episodes of the newest verdict, int32.
       success: share of its targets that were reached.
       complete: share of its episodes in which every robot arrived.
       contacts: per robot.
       reward: per robot.
-      fast: running mean of the success that decides.
+      fast: running mean of the deciding success.
       slow: the same, five times as slow.
     """
 
@@ -116,24 +117,24 @@ class Record(NamedTuple):
 
     @property
     def progress(self) -> Array:
-        """How far the success that decides has come, or gone back, of late, [S]."""
+        """How far the deciding success has recently risen or fallen, [S], at least 0."""
         return jnp.abs(self.fast - self.slow)
 
 
 @struct.dataclass(kw_only=True)
 class Curriculum:
-    """Where the curriculum stands.
+    """The state of the curriculum.
 
     Attributes:
       stage: [] index of the newest stage, int32.
       weights: [S] share of the arenas on each stage, float32.
-      cohort: [] number of the cohort that episodes now begin in, int32.
+      cohort: [] number of the cohort in which episodes now begin, int32.
       age: [] updates since that cohort began, int32.
-      since: [] cohort with which the newest decision took effect, int32.
-      current: episodes of this cohort that have ended.
-      previous: those of the one before.
-      record: how each stage goes.
-      met: [] the most robots that any stage has had so far, int32.
+      since: [] cohort in which the newest decision took effect, int32.
+      current: ended episodes of this cohort.
+      previous: ended episodes of the cohort before.
+      record: the record of each stage.
+      met: [] most robots of any stage so far, int32.
       levels: the buffer of the curriculum over levels; None without one.
     """
 
@@ -150,12 +151,12 @@ class Curriculum:
 
 
 class CohortVerdict(NamedTuple):
-    """What an update brought to light.
+    """The findings of an update.
 
     Attributes:
-      over: [] whether a cohort is over, and with it all episodes of the one before.
-      judged: [S] whether the cohort before had episodes on the stage, all False unless `over`.
-      success: [S] the success that decides, of each stage's newest verdict; nan before.
+      over: [] whether a cohort is over, and therefore all episodes of the cohort before have ended.
+      judged: [S] whether the cohort before had episodes on the stage; all False unless `over`.
+      success: [S] deciding success of each stage's newest verdict; nan before the first.
     """
 
     over: Array
@@ -164,7 +165,7 @@ class CohortVerdict(NamedTuple):
 
 
 class StageChoice(NamedTuple):
-    """What a mode chose.
+    """The choice of a mode.
 
     Attributes:
       stage: [] index of the newest stage, int32.
@@ -181,10 +182,10 @@ class Decision(NamedTuple):
     """What `advance` decided.
 
     Attributes:
-      reason: [] of `REASONS`, int32.
-      stage: [] index of the stage that was the newest, int32.
-      next_stage: [] index of the one that is now, int32.
-      success: [] the success that decides, of the newest verdict on `stage`; nan before.
+      reason: [] one of `REASONS`, int32.
+      stage: [] index of the newest stage before the decision, int32.
+      next_stage: [] index of the newest stage after it, int32.
+      success: [] deciding success of the newest verdict on `stage`; nan before the first.
     """
 
     reason: Array
@@ -194,7 +195,7 @@ class Decision(NamedTuple):
 
     @property
     def promoted(self) -> Array:
-        """Whether a stage was left for the next one, []."""
+        """Whether the decision left a stage for the next one, []."""
         return (self.reason == BY_THRESHOLD) | (self.reason == BY_BUDGET)
 
 
@@ -210,16 +211,16 @@ def schedule(
     rollout: int,
     drawings: Sequence[LevelDrawing] = (),
 ) -> Schedule:
-    """Works the curriculum's numbers out.
+    """Computes the curriculum's numbers.
 
-    The stages before the last share `budget_share` of the updates in equal parts; prerequisites
-    may take all of it.
+    The stages before the last share `budget_share` of the updates in equal parts. Prerequisites may
+    take all of it.
 
     Args:
       stages: S, in order.
-      options: what the config says of the curriculum.
-      updates: of the whole run.
-      step_limit: control steps of an episode, at most.
+      options: settings of the curriculum.
+      updates: updates of the whole run.
+      step_limit: most control steps of an episode.
       rollout: control steps of an update.
       drawings: an extension's ways of drawing levels.
 
@@ -244,15 +245,15 @@ def schedule(
 
 
 def last_begins(schedule: Schedule) -> int:
-    """After how many updates the last stage begins at the latest: by the deadlines alone.
+    """Returns the update at which the last stage begins at the latest, from the deadlines alone.
 
-    Each decision waits for one step limit after the one before.
+    Each decision comes at least one step limit after the one before.
 
     Args:
       schedule: the curriculum's numbers.
 
     Returns:
-      Updates; 0 for a single stage, `NEVER` or more where a stage has no deadline.
+      Updates; 0 for a single stage, `NEVER` or more if a stage has no deadline.
     """
     begins = 0
     for deadline in np.asarray(schedule.deadline)[:-1].tolist():
@@ -265,11 +266,11 @@ def _number(value: float | None, absent: float) -> np.float32:
 
 
 def init(schedule: Schedule, options: CurriculumConfig, mode: Mode) -> Curriculum:
-    """Starts where the mode puts those of whom nothing is known.
+    """Starts the curriculum with the mode's first choice.
 
     Args:
       schedule: the curriculum's numbers.
-      options: what the config says of the curriculum.
+      options: settings of the curriculum.
       mode: one of `modes.MODES`.
 
     Returns:
@@ -293,10 +294,10 @@ def init(schedule: Schedule, options: CurriculumConfig, mode: Mode) -> Curriculu
 
 
 def begin_cohort(curriculum: Curriculum) -> Curriculum:
-    """Begins a cohort where all arenas are drawn again, so that open episodes are not waited for.
+    """Begins a cohort when all arenas are drawn again: their open episodes will never end.
 
     Args:
-      curriculum: where it stands; what it has measured and decided stays.
+      curriculum: before; its measurements and decisions stay.
 
     Returns:
       The curriculum with empty tallies.
@@ -312,37 +313,38 @@ def begin_cohort(curriculum: Curriculum) -> Curriculum:
 
 
 def assign(curriculum: Curriculum, arenas: int) -> Array:
-    """Says on which stage [A] the next episode of each arena begins.
+    """Chooses the stage [A] on which the next episode of each arena begins.
 
-    The arenas are spread over the stages like the points (a + u) / A of a line that the weights
-    divide, so that the share of arenas on a stage, and with it of the time, is its weight. From
-    cohort to cohort u moves on by the golden ratio: few arenas come round to every stage, while
-    many stay where they are. (An arena that moves waits for its episode to end; if all moved, the
-    stages of long episodes would hold more than their share.)
+    The weights divide a line into stages. The arenas are spread along it like the points (a + u) /
+    A, so that the share of arenas, and of time, on a stage is its weight. From cohort to cohort, u
+    moves by the golden ratio. If there are few arenas, each then visits every stage over time. If
+    there are many, most stay on their stage. That matters because an arena that moves must wait for
+    its episode to end: if all arenas moved, stages with long episodes would get more than their
+    share.
 
     Args:
-      curriculum: where it stands.
+      curriculum: its current state.
       arenas: A.
 
     Returns:
-      [A] int32, never a stage without weight.
+      [A] int32, never a stage with weight 0.
     """
-    turned = curriculum.cohort.astype(jnp.uint32) * _GOLDEN >> 8  # what a float32 holds of it
+    turned = curriculum.cohort.astype(jnp.uint32) * _GOLDEN >> 8  # a float32 holds 24 bits
     point = (jnp.arange(arenas) + turned * np.float32(2.0**-24)) / arenas
     ends = jnp.cumsum(curriculum.weights)
     inner = (ends / ends[-1])[:-1]
     stage = jnp.searchsorted(inner, point, side="right", method="compare_all")
-    # The last point may round to 1, and would fall behind all stages that have weight.
+    # The last point may round to 1, and would otherwise fall behind all stages with a weight.
     last = jnp.max(jnp.where(curriculum.weights > 0.0, jnp.arange(ends.shape[0]), 0))
     return jnp.minimum(stage, last).astype(jnp.int32)
 
 
 def count(curriculum: Curriculum, ended: Ended, shards: Shards = ALONE) -> Curriculum:
-    """Adds episodes that have ended to the cohort and the stage in which they began.
+    """Adds ended episodes to the cohort and the stage in which they began.
 
     Args:
       curriculum: before.
-      ended: [T, A]; episodes of any other cohort than the last two are left out.
+      ended: [T, A]; only episodes of the last two cohorts count.
       shards: how the arenas are spread over devices.
 
     Returns:
@@ -364,16 +366,16 @@ def advance(
     mode: Mode,
     update: Array,
 ) -> tuple[Curriculum, Decision]:
-    """Moves the cohorts on by one update, judges the one that has ended and lets the mode decide.
+    """Moves the cohorts on by one update, judges an ended cohort and lets the mode decide.
 
     A decision begins a new cohort at once.
 
     Args:
       curriculum: after `count`.
       schedule: the curriculum's numbers.
-      options: what the config says of the curriculum.
+      options: settings of the curriculum.
       mode: one of `modes.MODES`.
-      update: [] the update that has just been done, from 0.
+      update: [] number of the finished update, from 0.
 
     Returns:
       The curriculum for the next update, and the decision.
@@ -419,7 +421,7 @@ def _add(tally: CohortTally, ended: Ended, cohort: Array, shards: Shards) -> Coh
 
 
 def _judge(record: Record, tally: CohortTally, judged: Array, options: CurriculumConfig) -> Record:
-    """Writes a whole cohort down for the stages [S] that it had episodes on."""
+    """Records a whole cohort for the stages [S] on which it had episodes."""
     robots, episodes = jnp.maximum(tally.targets, 1), jnp.maximum(tally.episodes, 1)
     verdict = Record(
         episodes=tally.episodes,
@@ -445,12 +447,12 @@ def _judge(record: Record, tally: CohortTally, judged: Array, options: Curriculu
 
 
 def _deciding(record: Record, options: CurriculumConfig) -> Array:
-    """Returns the success [S] of the newest verdicts that the curriculum decides by."""
+    """Returns the deciding success [S] of the newest verdicts."""
     return {"targets": record.success, "all": record.complete}[options.success]
 
 
 def _next_cohort(curriculum: Curriculum, reason: Array, over: Array) -> Curriculum:
-    """Begins a cohort, where one is over or something was decided."""
+    """Begins a cohort if one is over or the mode decided something."""
     decided = reason != STAYED
     begins = over | decided
     empty = _no_episodes(curriculum.weights.shape[0])
@@ -469,7 +471,7 @@ def _next_cohort(curriculum: Curriculum, reason: Array, over: Array) -> Curricul
 
 
 def _settle(curriculum: Curriculum, schedule: Schedule, choice: StageChoice) -> Curriculum:
-    """Takes a mode's choice over."""
+    """Applies a mode's choice."""
     robots = jnp.where(choice.weights > 0.0, jnp.asarray(schedule.stages.robots), 0)
     return replace(
         curriculum,

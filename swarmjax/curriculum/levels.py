@@ -1,8 +1,8 @@
-"""A buffer of levels: which of them are played again, and which make room for others.
+"""A buffer of levels: which levels are played again, and which are replaced.
 
-The curriculum's mode says on which stage an episode begins; the buffer says on which level of it.
-Each stage has an equal part of the buffer, so that no stage crowds another out and the share of the
-arenas on a stage stays its weight. A level is kept as the numbers that it is drawn from.
+The curriculum's mode chooses the stage on which an episode begins. The buffer chooses the level of
+that stage. Each stage has an equal part of the buffer, so no stage displaces another, and the share
+of arenas on a stage stays its weight. The buffer stores the numbers that define a level.
 
 - Prioritised level replay: Jiang et al. 2021, "Prioritized Level Replay", arXiv:2010.03934.
 - Learnability: Rutherford et al. 2024, "No Regrets: Investigating and Improving Regret
@@ -25,19 +25,19 @@ from jax import Array
 
 from swarmjax.curriculum.config import LevelsConfig
 
-# What an episode was begun on, where it is no level of the buffer: one just drawn, one just made
-# from a level of the buffer, or one that has since lost its place there.
+# Sources of an episode other than a level in the buffer: a level just drawn, a mutation of one in
+# the buffer, or a level that has since been replaced.
 FRESH, MUTATED, LOST = -1, -2, -3
 
-# Of an empty place: below every score.
+# Score of an empty place, below every real score.
 _EMPTY = -1.0
-# Episodes that a level's success is remembered over. The policy changes meanwhile: this project's
-# choice.
+# Episodes after which a level's older results fade, because the policy changes. The number is this
+# project's choice.
 _MEMORY = 16.0
-# What is known of a level before its first episode: as much as of two that came out as those of
-# its stage do on the whole: this project's choice.
+# Weight of what is known before a level's first episode: as much as two episodes with the mean
+# success of its stage. The number is this project's choice.
 _PRIOR_EPISODES = 2.0
-_LARGEST_STEP = 0.25  # of the range of a number, in a mutation: this project's choice
+_LARGEST_STEP = 0.25  # of a number's range, in a mutation: this project's choice
 _BELOW_ONE = np.float32(1.0 - 2.0**-24)  # the largest float32 below 1
 
 
@@ -46,10 +46,10 @@ class LevelNumbers(NamedTuple):
 
     Attributes:
       replay: [] share of episodes that begin on a level of a full buffer.
-      mutation: [] share of those that begin on a mutated one instead.
-      temperature: [] of the ranks; the higher, the more evenly levels are played again.
-      staleness: [] share of the replay that goes to levels by how long they have not been played.
-      minimum_episodes: [] that a level has had before it is mutated, int32.
+      mutation: [] share of those that begin on a mutated level instead.
+      temperature: [] temperature of the ranks; the higher, the more evenly levels are replayed.
+      staleness: [] share of replays chosen by how long the levels have not been played.
+      minimum_episodes: [] episodes that a level needs before it is mutated, int32.
       movable: [S, V] 1 for each number that a mutation may change, else 0; None without mutation.
     """
 
@@ -63,16 +63,16 @@ class LevelNumbers(NamedTuple):
 
 @struct.dataclass(kw_only=True)
 class LevelBuffer:
-    """Levels that are kept, [S, C, ...].
+    """The levels in the buffer, [S, C, ...].
 
     Attributes:
-      numbers: [.., V] that the level is drawn from, float32.
-      episodes: that have ended on it, at most `_MEMORY` remembered, float32; 0: the place is empty.
-      successes: of these, float32.
-      loss: positive value loss of the newest, float32.
+      numbers: [.., V] numbers that define the level, float32.
+      episodes: ended episodes on it, at most `_MEMORY` remembered, float32; 0: the place is empty.
+      successes: successes among these, float32.
+      loss: positive value loss of the newest episodes, float32.
       score: the higher, the sooner the level is played again, float32.
-      begun: update in which one was last begun on it, int32.
-      generation: how many mutations it is away from one that was drawn, int32.
+      begun: update in which an episode last began on it, int32.
+      generation: number of mutations since the drawn level, int32.
       clock: [] updates so far, int32.
     """
 
@@ -95,16 +95,16 @@ class Play(NamedTuple):
     """Episodes of an update, [N].
 
     Attributes:
-      slot: place in the buffer, counted through all stages, of the level it began on; or `FRESH`,
-        `MUTATED` or `LOST`.
-      stage: that the level is of.
+      slot: place in the buffer, counted through all stages, of the level on which it began; or
+        `FRESH`, `MUTATED` or `LOST`.
+      stage: stage of the level.
       begun: whether it began in this update.
       ended: whether it ended in this update.
-      successes: how many trials succeeded, int32; 0 unless it ended.
-      trials: robots, or 1 where the episode counts as a whole, int32.
+      successes: number of successful trials, int32; 0 unless it ended.
+      trials: number of robots, or 1 if the episode counts as a whole, int32.
       loss: positive value loss, mean over the transitions of all robots.
-      numbers: [.., V] that the level is drawn from.
-      generation: of the level.
+      numbers: [.., V] numbers that define the level.
+      generation: generation of the level.
     """
 
     slot: Array
@@ -119,11 +119,11 @@ class Play(NamedTuple):
 
 
 def init(stages: int, size: int, numbers: int) -> LevelBuffer:
-    """Starts without a level.
+    """Makes an empty buffer.
 
     Args:
       stages: S.
-      size: places of all stages together, at least S; C is the whole part of size / S.
+      size: places of all stages together, at least S; C is size / S, rounded down.
       numbers: V.
 
     Returns:
@@ -144,17 +144,17 @@ def init(stages: int, size: int, numbers: int) -> LevelBuffer:
 
 
 def probabilities(buffer: LevelBuffer, options: LevelNumbers) -> Array:
-    """Says how likely each level is, if one of its stage is played again.
+    """Computes the probability of each level, given that a level of its stage is replayed.
 
-    (1 - rho) P_score + rho P_stale, with P_score proportional to rank^(-1 / temperature) and
+    It is (1 - rho) P_score + rho P_stale. P_score is proportional to rank^(-1 / temperature), and
     P_stale to the updates since the level was last begun (Jiang et al. 2021, equations 2 to 5).
 
     Args:
-      buffer: of levels.
+      buffer: buffer of levels.
       options: `temperature` and `staleness` (rho).
 
     Returns:
-      [S, C], 0 where there is no level; each stage that has one sums to 1.
+      [S, C], 0 where there is no level; the sum is 1 for each stage with a level.
     """
     order = jnp.argsort(-buffer.score, axis=1, stable=True)
     rank = jnp.argsort(order, axis=1, stable=True) + 1
@@ -166,35 +166,36 @@ def probabilities(buffer: LevelBuffer, options: LevelNumbers) -> Array:
 
 
 def _normal(weight: Array) -> Array:
-    """Divides weights [S, C] by the sum of each stage, where there is one."""
+    """Divides weights [S, C] by their sum on each stage, unless that is 0."""
     total = jnp.sum(weight, axis=1, keepdims=True)
     return weight / jnp.where(total > 0.0, total, 1.0)
 
 
 def choose(buffer: LevelBuffer, options: LevelNumbers, stage: Array, picks: Array) -> Array:
-    """Chooses which level each episode begins on.
+    """Chooses the level on which each episode begins.
 
-    The share that is played again grows with the part of the stage's places that are taken, so
-    that the first levels are not played over and over.
+    The replayed share grows with the filled part of the stage's places, so that the first levels
+    are not played over and over.
 
     Args:
-      buffer: of levels.
+      buffer: buffer of levels.
       options: the curriculum's numbers.
-      stage: [N] of the episodes.
+      stage: [N] stage of the episodes.
       picks: [N, 2] uniform numbers in [0, 1).
 
     Returns:
-      [N] place in the buffer, counted through all stages; `FRESH` for a level yet to be drawn.
+      [N] place in the buffer, counted through all stages; `FRESH` for a level still to be drawn.
     """
     stages, places = buffer.score.shape
     held = buffer.held
     share = options.replay * jnp.mean(held.astype(jnp.float32), axis=1)
     ends = jnp.cumsum(probabilities(buffer, options), axis=1)
     ends = ends / jnp.maximum(ends[:, -1:], np.finfo(np.float32).tiny)
-    # The ends of all stages on one line, each shifted by its stage: one search finds any.
+    # The cumulative shares of all stages on one line, each shifted by its stage: one search
+    # suffices.
     line = (ends + jnp.arange(stages)[:, None]).ravel()
     found = jnp.searchsorted(line, stage + picks[:, 1], side="right")
-    # Rounding may lead beyond a stage's last level, or to the end of the stage before.
+    # Rounding may lead past a stage's last level, or to the end of the stage before.
     last = jnp.max(jnp.where(held, jnp.arange(places), 0), axis=1)
     found = jnp.clip(found, stage * places, stage * places + last[stage])
     return jnp.where(picks[:, 0] < share[stage], found, FRESH).astype(jnp.int32)
@@ -203,16 +204,16 @@ def choose(buffer: LevelBuffer, options: LevelNumbers, stage: Array, picks: Arra
 def update(
     buffer: LevelBuffer, plays: Play, config: LevelsConfig, usual: Array
 ) -> tuple[LevelBuffer, Array]:
-    """Takes in an update's episodes: scores all levels again, and lets the best new ones enter.
+    """Adds an update's episodes: scores all levels again, and lets the best new ones in.
 
     Args:
       buffer: before.
-      plays: [N] of all arenas, those of all devices among them.
-      config: says what a score is.
-      usual: [S] success that episodes of a stage have on the whole, 0 to 1.
+      plays: [N] episodes of all arenas, on all devices.
+      config: defines the score.
+      usual: [S] mean success of the episodes of each stage, 0 to 1.
 
     Returns:
-      The buffer after, and [S C] which places have another level than before.
+      The buffer after, and [S C] whether the level in each place is new.
     """
     buffer = _score(_record(buffer, plays), config, usual)
     buffer, taken = _admit(buffer, plays, config, usual)
@@ -220,7 +221,7 @@ def update(
 
 
 def mark_lost(slot: Array, taken: Array) -> Array:
-    """Marks the places [...] that have another level by now, of those that episodes began on."""
+    """Marks as lost the slots [...] of episodes whose level has been replaced."""
     gone = (slot >= 0) & taken[jnp.maximum(slot, 0)]
     return jnp.where(gone, LOST, slot)
 
@@ -236,7 +237,7 @@ def _record(buffer: LevelBuffer, plays: Play) -> LevelBuffer:
 
     one = jnp.ones_like(plays.slot)
     new, begun = total(one, plays.ended), total(one, plays.begun)
-    # Whole numbers first: they add up to the same in any order.
+    # Whole numbers first: their sum is the same in any order.
     successes, trials = (total(x, plays.ended) for x in (plays.successes, plays.trials))
     episodes = buffer.episodes + new
     successes = buffer.successes + new * (successes / jnp.maximum(trials, 1))
@@ -260,15 +261,16 @@ def _score(buffer: LevelBuffer, config: LevelsConfig, usual: Array) -> LevelBuff
 
 
 def _mode(config: LevelsConfig) -> str:
-    assert config.mode in _SCORES, config.mode  # there is no buffer in the others
+    assert config.mode in _SCORES, config.mode  # other modes have no buffer
     return config.mode
 
 
 def _learnability(episodes: Array, successes: Array, loss: Array, usual: Array) -> Array:
-    """Returns p (1 - p), as expected of a level of which no more is known than its episodes.
+    """Returns the expected p (1 - p) of a level, given its episodes alone.
 
-    With p of a beta distribution of parameters a and b that is a b / ((a + b) (a + b + 1)). It
-    grows with what is known: one episode says too little to displace a level of p near 1/2.
+    If p has a beta distribution with parameters a and b, this is a b / ((a + b) (a + b + 1)). It
+    grows with the number of episodes: one episode is too little evidence to displace a level with p
+    near 1/2.
     """
     a = successes + _PRIOR_EPISODES * usual
     b = episodes - successes + _PRIOR_EPISODES * (1.0 - usual)
@@ -289,7 +291,7 @@ _SCORES: dict[str, Callable[[Array, Array, Array, Array], Array]] = {
 def _admit(
     buffer: LevelBuffer, plays: Play, config: LevelsConfig, usual: Array
 ) -> tuple[LevelBuffer, Array]:
-    """Puts new levels in the place of those that score less: the best in place of the worst."""
+    """Replaces levels by new ones with a higher score: the worst by the best."""
     stages, places = buffer.score.shape
     new = plays.ended & ((plays.slot == FRESH) | (plays.slot == MUTATED))
     share = plays.successes / jnp.maximum(plays.trials, 1)
@@ -325,16 +327,16 @@ def _admit(
 
 
 def describe(buffer: LevelBuffer, plays: Play) -> dict[str, Any]:
-    """Says what is practised, by stage.
+    """Summarises the practised levels by stage.
 
     Args:
       buffer: after `update`.
       plays: [N] of the update.
 
     Returns:
-      [S] each: `levels_fresh`, `levels_replayed` and `levels_mutated`, episodes that ended by what
-      they began on; `levels_held`, levels in the buffer; their mean `levels_success`,
-      `levels_score` and `levels_generation`, nan where there is none.
+      [S] each: `levels_fresh`, `levels_replayed` and `levels_mutated` count the ended episodes by
+      their source, and `levels_held` the levels in the buffer. `levels_success`, `levels_score` and
+      `levels_generation` are the means over those levels, nan if there are none.
     """
     stages, held = buffer.score.shape[0], buffer.held
     mine = plays.stage == jnp.arange(stages)[:, None]
@@ -360,15 +362,15 @@ def describe(buffer: LevelBuffer, plays: Play) -> dict[str, Any]:
 
 
 def mutate(numbers: Array, movable: Array, picks: Array) -> Array:
-    """Moves one thing of a level: changes one of its numbers by a quarter of its range at most.
+    """Changes one thing of a level: moves one of its numbers by at most a quarter of its range.
 
     Args:
-      numbers: [V] that the level is drawn from.
-      movable: [V] 1 for each that may be changed, else 0.
+      numbers: [V] numbers that define the level.
+      movable: [V] 1 for each number that may change, else 0.
       picks: [2] uniform numbers in [0, 1).
 
     Returns:
-      [V] numbers in [0, 1) of the mutated level, which is drawn by the same rules as any other.
+      [V] numbers in [0, 1) of the mutated level. It is drawn by the same rules as any other.
     """
     ends = jnp.cumsum(movable)
     chosen = jnp.searchsorted(ends, picks[0] * ends[-1], side="right")
@@ -379,5 +381,5 @@ def mutate(numbers: Array, movable: Array, picks: Array) -> Array:
 
 
 def split_picks(key: Array, shape: tuple[int, ...]) -> Array:
-    """Draws the uniform numbers [*shape, 5] of `choose`, of whether to mutate, and of `mutate`."""
+    """Draws uniform numbers [*shape, 5]: for `choose`, for whether to mutate, and for `mutate`."""
     return jax.random.uniform(key, (*shape, 5))

@@ -1,4 +1,4 @@
-"""The decision log: rows of metrics as what the curriculum decided, and by which figures."""
+"""The decision log: each decision of the curriculum and the figures behind it."""
 
 from collections.abc import Sequence
 
@@ -11,16 +11,17 @@ def log(rows: Sequence[dict], names: Sequence[str], seed: int) -> list[dict]:
     """Turns rows of metrics into the decision log.
 
     Args:
-      rows: metrics of one update of one seed each, as `loop.update` names them; lists by stage.
-      names: of the stages.
-      seed: what the entries say of it.
+      rows: metrics, a row for each update of a seed, with the names of `loop.update`; lists by
+        stage.
+      names: names of the stages.
+      seed: seed to write into the entries.
 
     Returns:
-      One entry a decision: `update`, `seed` and `why`; for a promotion or demotion `from`, `to`
-      and what was measured on the stage that was left (`targets_reached`, `all_reached`,
-      `episodes`), for new weights `weights` and `success`, by stage. With a curriculum over levels
-      `levels` says by stage how many are `held` in the buffer, and their mean `success` and
-      `score`.
+      One entry for each decision: `update`, `seed` and `why`. A promotion or demotion also has
+      `from`, `to` and the results on the stage that was left (`targets_reached`, `all_reached`,
+      `episodes`). New weights have `weights` and `success`, by stage. With a curriculum over
+      levels, `levels` gives, by stage, how many levels the buffer has (`held`) and their mean
+      `success` and `score`.
     """
     return [
         {"update": row["update"], "seed": seed, **_entry(row, names), **_levels(row, names)}
@@ -30,7 +31,7 @@ def log(rows: Sequence[dict], names: Sequence[str], seed: int) -> list[dict]:
 
 
 def _entry(row: dict, names: Sequence[str]) -> dict:
-    """Says what was decided in an update, and by which figures."""
+    """Describes the decision of an update, with the figures behind it."""
     why = {"why": REASONS[row["decision"]]}
     if row["decision"] == REWEIGHED:
         weights, success = row["weights"], row["estimate_by_stage"]
@@ -51,7 +52,7 @@ def _entry(row: dict, names: Sequence[str]) -> dict:
 
 
 def _levels(row: dict, names: Sequence[str]) -> dict:
-    """Says what was practised then, where there is a buffer of levels."""
+    """Describes the practised levels, if there is a buffer of levels."""
     if "levels_held" not in row:
         return {}
     told = [row[f"levels_{key}"] for key in _OF_LEVELS]

@@ -1,7 +1,7 @@
-"""Policies judged on levels that they never saw, by another engine than the one that trains.
+"""The judge of policies: levels that they never trained on, and another engine than training's.
 
-Imports `task`, `sim` and policy files, and no JAX: only `engine_mjx.py`, which judges on the
-device, takes `training` and `ppo` too, and `trials.py` keeps its programs in `run`'s cache.
-`cells.py` says which levels, `trials.py` runs the episodes, `measures.py` and `statistics.py` say
-what came of them. Start with `evaluation.evaluate`.
+It imports `task`, `sim` and policy files, and no JAX. Two modules differ: `engine_mjx.py` judges on
+the device and imports `training` and `ppo` too, and `trials.py` stores its programs in `run`'s
+cache. `cells.py` draws or reads the levels, `trials.py` runs the episodes, and `measures.py` and
+`statistics.py` compute the figures. Start with `evaluation.evaluate`.
 """

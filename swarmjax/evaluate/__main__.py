@@ -1,7 +1,7 @@
 """`python -m swarmjax.evaluate policy=FILE suite=stages`: judges policies on levels never seen.
 
-`cells.py` says which levels, `trials.py` runs the episodes, `summary.py` sums them up; here they
-are put together, and the result is written and shown.
+`cells.py` draws the levels, `trials.py` runs the episodes, and `summary.py` summarises them. This
+module joins them, and writes and shows the result.
 """
 
 import json
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _say(sentence: str, keep: Path | None, done: int, cells: int) -> None:
-    """Says what was taken from the policies, before it takes a minute to judge them."""
+    """Prints which settings come from the policies, before the judging, which takes a minute."""
     sys.stdout.write(f"swarmjax.evaluate: {sentence}\n")
     if done:
         sys.stdout.write(f"swarmjax.evaluate: {done} of {cells} cells were judged before, {keep}\n")
@@ -60,7 +60,7 @@ def _say(sentence: str, keep: Path | None, done: int, cells: int) -> None:
 
 
 def _left(keep: Path | None) -> str:
-    """Says what is there of an evaluation that was interrupted."""
+    """Describes what an interrupted evaluation has saved."""
     done = 0 if keep is None else unfinished.count(keep)
     if not done:
         return "nothing was written"
@@ -69,7 +69,7 @@ def _left(keep: Path | None) -> str:
 
 
 def _check_out(path: Path) -> None:
-    """Makes the folder of the result, before there is one to lose."""
+    """Makes the result's folder before the work starts, so that no result can be lost."""
     is_file = path.suffix == ".json"
     folder = path.parent if is_file else path
     try:
@@ -83,7 +83,7 @@ def _check_out(path: Path) -> None:
 
 
 def _write(path: Path, found: Evaluation, limit: float) -> None:
-    """Writes a JSON file, or a folder with all there is; `limit` is that of an episode, s."""
+    """Writes a JSON file, or a folder with all outputs; `limit` is an episode's length, s."""
     text = json.dumps(found.result, indent=2, allow_nan=False) + "\n"
     try:
         if path.suffix == ".json":
@@ -92,7 +92,7 @@ def _write(path: Path, found: Evaluation, limit: float) -> None:
         (path / "result.json").write_text(text)
         evaluate_table.write_levels(path / "levels.csv", found.entrants, found.trials)
         if "policies" in found.result:
-            from swarmjax.evaluate import figures  # Matplotlib, a second in every process
+            from swarmjax.evaluate import figures  # Matplotlib takes a second to import
 
             for name, content in figures.draw(found.result, found.trials, limit).items():
                 (path / f"{name}.png").write_bytes(content)

@@ -1,7 +1,8 @@
-"""Cells: sets of levels that policies are judged on, drawn from numbers or read from a file.
+"""Cells: sets of levels for judging policies, drawn from numbers or read from a file.
 
-A suite is a list of cells with a digest over the levels of each, so that whoever draws them knows
-that they are the same to the last bit. Levels of a suite are drawn for the nominal e-puck.
+A suite is a list of cells. Each cell has a digest of its levels, so that everybody who draws them
+can check that they are the same to the last bit. Levels of a suite are drawn for the nominal
+e-puck.
 """
 
 import io
@@ -30,24 +31,24 @@ FORMAT = 1
 _NEWER = ("steps", "hull_friction")  # keys of a cell that files of the first version lack
 _TARGET_RADIUS = TaskConfig().target_radius
 _LARGEST_HALF = 2.5  # m, of a box: longer than half the largest arena
-MAX_BYTES = 2**30  # of all levels of a file; those of a thousand of s6 take 0.2 MB
-_LEAST_ROOM = 2**22  # bytes that any file may unpack to, and some times its own
-_PACKED = 20  # numbers drawn at random are packed to half their size, never to a thousandth
+MAX_BYTES = 2**30  # of all levels of a file; a thousand levels of s6 take 0.2 MB
+_LEAST_ROOM = 2**22  # bytes to which any file may unpack, plus `_PACKED` times its own
+_PACKED = 20  # most that packing may shrink: random numbers halve, never to a thousandth
 
 
 class Cell(NamedTuple):
     """Levels of one kind.
 
     Attributes:
-        name: Of the cell.
-        stage: Its numbers.
-        shape: Of the obstacles.
-        realism: Name of a preset, or None for that of the command.
-        seed: That the levels were drawn with.
-        episodes: [E] their numbers.
-        levels: [E], obstacles as the boxes that they are put together of.
-        steps: Control steps of an episode, or None for those of the command.
-        hull_friction: Of the robots, or None for that of the command.
+        name: Name of the cell.
+        stage: Settings of the stage.
+        shape: Shape of the obstacles.
+        realism: Name of a preset, or None for the command's.
+        seed: Seed of the levels.
+        episodes: [E] numbers of the levels.
+        levels: [E] levels, with obstacles as the boxes that they consist of.
+        steps: Control steps of an episode, or None for the command's.
+        hull_friction: Friction of the robots' hulls, or None for the command's.
     """
 
     name: str
@@ -62,12 +63,12 @@ class Cell(NamedTuple):
 
     @property
     def digest(self) -> str:
-        """SHA-256 over the names, types, shapes and bytes of the level's arrays."""
+        """SHA-256 over the names, types, shapes and bytes of the levels' arrays."""
         return policy.digest(_arrays(self))
 
     @property
     def half(self) -> np.ndarray:
-        """[M, 2] half edges of the boxes of the first level, m; those of others may differ."""
+        """[M, 2] half edges of the first level's boxes, m; those of other levels may differ."""
         return self.levels.obstacle[0, :, 3:]
 
     @property
@@ -77,23 +78,23 @@ class Cell(NamedTuple):
 
 
 class Suite(NamedTuple):
-    """Cells under a name; None if they are one stage's."""
+    """A list of cells with a name, or None as the name if they come from a single stage."""
 
     name: str | None
     cells: tuple[Cell, ...]
 
 
 def load(config: EvaluateConfig) -> Suite:
-    """Draws or reads the levels that an evaluation is about.
+    """Draws or reads the levels of an evaluation.
 
     Args:
-        config: Of the evaluation.
+        config: Settings of the evaluation.
 
     Returns:
-        The suite that it names, or one cell of its stage.
+        The suite that the settings name, or one cell with their stage.
 
     Raises:
-        ConfigError: If the suite is unsound, or made for smaller robots or other targets.
+        ConfigError: The suite is unsound, or made for smaller robots or other targets.
     """
     if config.suite is None:
         return Suite(None, (draw_stage(config, range(config.episodes)),))
@@ -113,7 +114,7 @@ def load(config: EvaluateConfig) -> Suite:
 
 
 def stages(config: EvaluateConfig) -> list[StageConfig]:
-    """Lists the stages of an evaluation's levels, before any is drawn; none of a file of levels."""
+    """Lists the stages of an evaluation before drawing levels; none for a file of levels."""
     if config.suite is None:
         return [config.stage]
     if Path(config.suite).suffix == ".npz":
@@ -122,7 +123,7 @@ def stages(config: EvaluateConfig) -> list[StageConfig]:
 
 
 def draw(choice: str) -> Suite:
-    """Draws the levels of a suite and holds them to their digests.
+    """Draws the levels of a suite and checks their digests.
 
     Args:
         choice: A name of configs/suites/, or the path of a .yaml file.
@@ -131,7 +132,7 @@ def draw(choice: str) -> Suite:
         The suite.
 
     Raises:
-        ConfigError: If the file is unsound, or a digest is missing or off.
+        ConfigError: The file is unsound, or a digest is missing or wrong.
     """
     file = read_suite(choice)
     found = []
@@ -150,8 +151,8 @@ def draw_stage(config: EvaluateConfig, numbers: Sequence[int]) -> Cell:
     """Draws levels of an evaluation's stage, for its robot and targets.
 
     Args:
-        config: Of the evaluation; its suite is not read.
-        numbers: [E] of the levels.
+        config: Settings of the evaluation; its suite is ignored.
+        numbers: [E] numbers of the levels.
 
     Returns:
         The cell, under the stage's name.
@@ -164,7 +165,7 @@ def draw_stage(config: EvaluateConfig, numbers: Sequence[int]) -> Cell:
 
 
 def draw_cell(cell: CellConfig) -> Cell:
-    """Draws the levels of a cell of a suite, whatever its digest."""
+    """Draws the levels of a cell of a suite, without checking its digest."""
     numbers, radii = cell.episodes or range(cell.levels), (epuck.HULL_RADIUS, _TARGET_RADIUS)
     levels = _draw(cell.stage, cell.shape, cell.seed, numbers, radii)
     episodes = np.array(numbers)
@@ -180,7 +181,7 @@ def _draw(
     radii: tuple[float, float],
     drawings: Sequence[LevelDrawing] = (),
 ) -> Level:
-    """Draws levels of these numbers, for hulls and targets of these radii, m."""
+    """Draws levels with these numbers, for hulls and targets with these radii, m."""
     one = task_stage.single(stage, drawings)
     spacing = level.Spacing(stage.robots, stage.obstacles, *radii)
     draw = judge.draw_level
@@ -197,7 +198,7 @@ def _check_digest(cell: Cell, expected: str, where: str) -> None:
     if cell.digest != expected:
         raise ConfigError(
             f"cell {cell.name} of {where} has the digest {cell.digest[:12]}..., but "
-            f"{expected[:12]}... is written down: these are other levels."
+            f"{expected[:12]}... is recorded: the levels differ."
         )
 
 
@@ -212,17 +213,17 @@ def write(path: Path, suite: Suite) -> None:
     """Writes levels for other tools, whole or not at all; docs/evaluation.md lists the fields.
 
     Args:
-        path: Of the .npz file.
+        path: Path of the .npz file.
         suite: The levels.
 
     Raises:
-        ConfigError: If it cannot be written.
+        ConfigError: The file cannot be written.
     """
     arrays = {f"{c.name}/{name}": x for c in suite.cells for name, x in _arrays(c).items()}
     keys = ("name", "shape", "realism", "seed", "digest")
     about = [
         {"stage": to_dict(cell.stage), **{key: getattr(cell, key) for key in keys}}
-        # A file that needs none of these is one that older versions read.
+        # A file without these keys can be read by older versions.
         | {key: value for key in _NEWER if (value := getattr(cell, key)) is not None}
         for cell in suite.cells
     ]
@@ -238,13 +239,13 @@ def read(path: Path) -> Suite:
     """Reads levels that `write` or another tool has written, and checks all of them.
 
     Args:
-        path: Of the .npz file.
+        path: Path of the .npz file.
 
     Returns:
         The suite.
 
     Raises:
-        ConfigError: If anything about it is unsound.
+        ConfigError: The file is unsound.
     """
     section.check_text("suite", str(path))
     try:
@@ -258,7 +259,7 @@ def read(path: Path) -> Suite:
 
 
 def _unpack(content: bytes) -> dict[str, np.ndarray]:
-    """Reads the arrays of an archive, none of them pickled, and none larger than it may be."""
+    """Reads the arrays of an archive; refuses pickled arrays and archives that are too large."""
     try:
         with policy.open_archive(io.BytesIO(content)) as archive:
             members = archive.infolist()
@@ -266,12 +267,12 @@ def _unpack(content: bytes) -> dict[str, np.ndarray]:
             if sum(each.file_size for each in members) > most:
                 raise ValueError(f"it unpacks to more than {most} bytes")
             if len({each.filename for each in members}) < len(members):
-                raise ValueError("a member is there twice")
+                raise ValueError("it holds a member twice")
             return {
                 each.filename.removesuffix(".npy"): policy.read_array(archive, each)
                 for each in members
             }
-    except Exception as error:  # whatever a damaged file makes zipfile and NumPy raise
+    except Exception as error:  # zipfile and NumPy raise many kinds for a damaged file
         reason = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
         raise ConfigError(f"it cannot be read: {reason}.") from None
 
@@ -280,18 +281,20 @@ def _parse(arrays: dict[str, np.ndarray]) -> Suite:
     meta = _parse_meta(arrays.pop("meta", None))
     cells = [_parse_cell(about, arrays) for about in meta["cells"]]
     if arrays:
-        raise ConfigError(f"{sorted(arrays)[0]} is not known: no cell of it is listed.")
+        raise ConfigError(f"{sorted(arrays)[0]} is unknown: meta.cells lists no such cell.")
     return Suite(str(meta["suite"]), tuple(cells))
 
 
 def _parse_meta(array: np.ndarray | None) -> dict[str, Any]:
-    """Reads what the file says of itself."""
+    """Reads the file's description of itself."""
     try:
         meta = reading.parse_json(str(array), "meta")
     except ConfigError:
-        raise ConfigError("meta is missing or no JSON: it is no suite of this project.") from None
+        raise ConfigError(
+            "meta is missing or not JSON: this is not a suite of this project."
+        ) from None
     if not isinstance(meta, dict) or meta.get("format") != FORMAT:
-        raise ConfigError(f"meta.format is not {FORMAT}: it is no suite that this version reads.")
+        raise ConfigError(f"meta.format is not {FORMAT}: this version cannot read the suite.")
     cells = meta.get("cells")
     if not isinstance(meta.get("suite"), str) or not isinstance(cells, list) or not cells:
         raise ConfigError("meta.suite or meta.cells is missing: give a name and a list.")
@@ -302,12 +305,12 @@ def _parse_meta(array: np.ndarray | None) -> dict[str, Any]:
 
 
 def _parse_cell(about: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Cell:
-    """Takes a cell's arrays out of those of the file."""
+    """Takes a cell's arrays from the file's arrays."""
     if not isinstance(about, Mapping):
         raise ConfigError(f"meta.cells holds {show(about)}: give keys and values.")
     name = str(about.get("name"))
     numbers = arrays.get(f"{name}/episode")
-    # The same checks as of a suite's file.
+    # The same checks as for a suite's file.
     size = 0 if numbers is None else numbers.size
     cell = build(CellConfig, {"levels": size, **about}, f"cell {name}: ")
     if cell.digest is None:
@@ -338,7 +341,7 @@ def _parse_cell(about: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Cell
 def _take(
     arrays: dict[str, np.ndarray], name: str, dtype: type, shape: tuple[int, ...]
 ) -> np.ndarray:
-    """Takes one array out of a file's, which must be just this."""
+    """Takes one array from a file's arrays, and checks its type and shape."""
     if name not in arrays:
         raise ConfigError(f"{name} is missing.")
     array = arrays.pop(name)
@@ -353,11 +356,11 @@ def _take(
 
 
 def _check_levels(name: str, levels: Level, stage: StageConfig) -> None:
-    """Refuses levels that no arena can be set up for."""
+    """Refuses levels that are impossible in any arena."""
     half = 0.5 * levels.side[:, None, None]
     low, high = (np.float32(end) for end in stage.sides)
     place, boxes = np.abs(levels.obstacle[..., :2]), levels.obstacle[..., 3:]
-    beyond = half + np.hypot(boxes[..., :1], boxes[..., 1:])  # of the circle about a box
+    beyond = half + np.hypot(boxes[..., :1], boxes[..., 1:])  # for the circle around a box
     rules = {
         f"side is outside {show(stage.sides)} m": (levels.side < low) | (levels.side > high),
         "present is not all true": ~levels.present,

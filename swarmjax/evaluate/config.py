@@ -13,9 +13,9 @@ from swarmjax.task.shapes import Shape
 from swarmjax.task.stage_config import StageConfig
 
 MOST_STEPS = 1_000_000  # control steps of an episode; nine hours
-STEPS = 1500  # of an episode where nobody says otherwise; Table 1
-MOST_EPISODES = 1_000_000  # whose levels fill some gigabytes
-# What `witness.load` takes from the policies.
+STEPS = 1500  # of an episode by default; Table 1
+MOST_EPISODES = 1_000_000  # their levels take some gigabytes
+# Values that `witness.load` takes from the policies.
 AS_TRAINED = {
     "stage": "its last stage",
     "robot": "as trained, on wheels",
@@ -26,42 +26,42 @@ AS_TRAINED = {
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig(Section):
-    """Everything that fixes an evaluation of policies."""
+    """All settings of an evaluation of policies."""
 
     command: ClassVar[str] = "evaluate"
     inherited: ClassVar[Mapping[str, str]] = AS_TRAINED
 
     policy: str | None = field(
         default=None,
-        metadata=about("policy.npz, or several of one recipe: a.npz,b.npz or a pattern"),
+        metadata=about("policy.npz, or several seeds of a recipe: a.npz,b.npz or a pattern"),
     )
     compare: str | None = field(
         default=None,
-        metadata=about("two instead, level by level: a.npz,b.npz; each may be a pattern"),
+        metadata=about("two recipes instead, compared level by level: a.npz,b.npz, or patterns"),
     )
     stage: StageConfig
     robot: RobotConfig = field(default_factory=lambda: RobotConfig(body="wheeled"))
     task: TaskConfig = field(default_factory=TaskConfig)
     suite: str | None = field(
         default=None,
-        metadata=about("instead of a stage: a name of configs/suites/, or a file .yaml or .npz"),
+        metadata=about("instead of a stage: a name in configs/suites/, or a .yaml or .npz file"),
     )
-    shape: Shape = field(default="box", metadata=about("of the obstacles of a random level"))
+    shape: Shape = field(default="box", metadata=about("shape of a random level's obstacles"))
     realism: RealismConfig = field(default_factory=RealismConfig)
     action: Literal["sampled", "mean"] = field(
         default="sampled",
         metadata=about(
-            "of the robots; sampled: drawn from the policy, the same for the same level; mean: "
-            "the most likely one"
+            "robots' actions; sampled: drawn from the policy, the same for the same level; mean: "
+            "the policy's most likely action"
         ),
     )
     engine: Literal["c", "mjx"] = field(
-        default="c", metadata=about("c: MuJoCo's C engine; mjx: the one that trains")
+        default="c", metadata=about("c: MuJoCo's C engine; mjx: the engine of training")
     )
     steps: int | None = field(
         default=None,
         metadata=about(
-            f"control steps of an episode; null: those of the suite's cell, else {STEPS} (Table 1)",
+            f"control steps of an episode; null: the suite cell's, else {STEPS} (Table 1)",
             1,
             MOST_STEPS,
         ),
@@ -69,24 +69,24 @@ class EvaluateConfig(Section):
     episodes: int = field(default=1000, metadata=about("episodes", 1, MOST_EPISODES))
     seed: int = field(default=1, metadata=about("random seed of the levels", 0, MAX_COUNT))
     workers: int | None = field(
-        default=None, metadata=about("processes; null: one a core", 1, 1024)
+        default=None, metadata=about("processes; null: one per core", 1, 1024)
     )
     substeps: int | None = field(
         default=None,
-        metadata=about("physics steps per control step; null: those of the body", 1, 1000),
+        metadata=about("physics steps per control step; null: the body's default", 1, 1000),
     )
     extensions: str | None = field(
         default=None,
-        metadata=about("Python file with the pieces that the policies need; it is run"),
+        metadata=about("Python file with the policies' extension; it is executed"),
     )
     out: str | None = field(
         default=None,
-        metadata=about("folder for result.json, levels.csv and plots, or a file .json alone"),
+        metadata=about("folder for result.json, levels.csv and plots, or a single .json file"),
     )
 
     @property
     def step_limit(self) -> int:
-        """Control steps of an episode, where no cell of a suite has its own."""
+        """Control steps of an episode, unless a cell of a suite has its own."""
         return STEPS if self.steps is None else self.steps
 
     def _check(self) -> None:

@@ -9,39 +9,39 @@ from swarmjax.evaluate.statistics import Interval, Statistic, bootstrap, checked
 
 
 def area_under(steps: ArrayLike, values: ArrayLike) -> np.ndarray:
-    """Mean height of learning curves: the area under them by trapezoids, by the span of the steps.
+    """Computes the mean height of learning curves: their area by trapezoids over their width.
 
     Args:
-      steps: [points] at which the curves are known, rising.
+      steps: [points] rising steps of the curves' points.
       values: [..., points] of any unit, finite.
 
     Returns:
       [...] in the unit of values.
 
     Raises:
-      ValueError: If there are fewer than two points, steps do not rise, or a number is not finite.
+      ValueError: There are fewer than two points, steps do not rise, or a number is not finite.
     """
     at, curves = _curves(steps, values)
     return np.asarray(np.trapezoid(curves, at, axis=-1) / (at[-1] - at[0]))
 
 
 def steps_to(steps: ArrayLike, values: ArrayLike, threshold: float) -> np.ndarray:
-    """Steps until learning curves first reach a threshold, whether they stay there or not.
+    """Computes the steps until learning curves first reach a threshold, even if they fall again.
 
-    Curves are straight between their points. One that scatters touches a threshold early: let
-    its values be means over episodes enough.
+    Curves are straight between their points. A noisy curve touches a threshold early, so its values
+    should be means over enough episodes.
 
     Args:
-      steps: [points] at which the curves are known, rising.
+      steps: [points] rising steps of the curves' points.
       values: [..., points] of any unit, finite.
-      threshold: to reach from below, in the same unit.
+      threshold: threshold to reach from below, in the same unit.
 
     Returns:
-      [...] in the unit of steps: the first one if a curve begins there, inf if it never does.
-      `iqm`, `np.median` and `probability_of_improvement` take these as they are.
+      [...] in the unit of steps: the first step if a curve begins at the threshold, inf if it never
+      reaches it. `iqm`, `np.median` and `probability_of_improvement` accept inf.
 
     Raises:
-      ValueError: If there are fewer than two points, steps do not rise, or a number is not finite.
+      ValueError: There are fewer than two points, steps do not rise, or a number is not finite.
     """
     if not math.isfinite(threshold):
         raise ValueError(f"threshold is {threshold}: give a finite number.")
@@ -55,7 +55,7 @@ def steps_to(steps: ArrayLike, values: ArrayLike, threshold: float) -> np.ndarra
 
 
 def _curves(steps: ArrayLike, values: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Takes the points of curves; refuses what does not fit together or is not finite."""
+    """Converts the points of curves; refuses unequal lengths and numbers that are not finite."""
     at, curves = checked("steps", steps), checked("values", values)
     if at.ndim != 1 or len(at) < 2 or not (np.diff(at) > 0).all():
         raise ValueError(f"steps of shape {at.shape} must be two or more numbers that rise.")
@@ -75,23 +75,23 @@ def curve(
     resamples: int = 2000,
     seed: int = 0,
 ) -> Interval[np.ndarray]:
-    """Interval of a statistic over runs at each point of their curves.
+    """Computes the interval of a statistic over runs at each point of their curves.
 
-    All points share their draws, so that runs are drawn with their whole curves. The band holds
-    at each point by itself, not at all of them at once.
+    All points use the same draws, so runs are drawn with their whole curves. The band holds at each
+    point by itself, not at all points at once.
 
     Args:
       values: [runs, points] of any unit, at least three runs.
-      statistic: as of `bootstrap`, called on [..., runs, 1].
-      confidence: as of `bootstrap`.
-      resamples: as of `bootstrap`.
-      seed: of the draws.
+      statistic: as in `bootstrap`, called on [..., runs, 1].
+      confidence: as in `bootstrap`.
+      resamples: as in `bootstrap`.
+      seed: seed of the draws.
 
     Returns:
       Estimates and intervals [points].
 
     Raises:
-      ValueError: As of `bootstrap`.
+      ValueError: As in `bootstrap`.
     """
     columns = checked_table("values", values, "runs").T[..., None]
     found = [

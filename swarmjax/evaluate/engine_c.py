@@ -1,11 +1,11 @@
 """Episodes in MuJoCo's C engine: the independent judge of policies.
 
-The policy is NumPy, the engine is not the one that trained, its solver converges, and the
-infrared sensors are MuJoCo's rays on the real shapes. Only the rules of the task are shared with
-training; `task/env.py` is what a step here mirrors. No JAX.
+It is independent of training in four ways: the policy is computed with NumPy, the engine is another
+one, its solver converges, and the infrared sensors are MuJoCo's rays on the real shapes. Training
+and judge share only the rules of the task; a step here mirrors `task/env.py`. No JAX.
 
-Episode n of a seed starts from the same level whatever else is asked for, and every arena is
-computed on its own, so that a result does not depend on how the work is split up.
+Episode n of a seed always starts from the same level, and every arena is computed by itself. So a
+result does not depend on how the work is split up.
 """
 
 import copy
@@ -36,22 +36,22 @@ from swarmjax.task.level import Level
 
 
 class Arenas(NamedTuple):
-    """Arenas between two control steps. Of these, MuJoCo edits `data` in place.
+    """Arenas between two control steps. MuJoCo edits `data` in place.
 
     Attributes:
-        model: [A] of `MjModel`, all the same one unless robots or boxes differ between episodes.
+        model: [A] of `MjModel`, one for all unless robots or boxes differ between episodes.
         data: [A] of `MjData`, positions up to date.
-        factors: [A] of the episodes.
-        memory: [A] of the robots' electronics.
+        factors: [A] factors of the episodes' robots.
+        memory: [A] state of the robots' electronics.
         target: [A, R, 2] x (m), y (m).
         obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
-        level: [A] what the episodes started from.
+        level: [A] levels that the episodes started from.
         seed: [A] uint32 of the levels.
         pose: [A, R, 3] x (m), y (m), yaw (rad).
         observation: [A, R, O].
-        apart: [A, R, 3] for how long there was no contact of each kind, s.
-        anchor: [A, R, 2] place near which a robot has stayed of late, m.
-        outcome: Since the start.
+        apart: [A, R, 3] time since the last contact of each kind, s.
+        anchor: [A, R, 2] place near which a robot has recently stayed, m.
+        outcome: Outcome since the start.
     """
 
     model: np.ndarray
@@ -73,7 +73,7 @@ class Controller(Protocol):
     """Drives robots in a policy's place, with a memory that is passed in and returned."""
 
     def init(self, arenas: Arenas) -> Any:
-        """Returns the memory of arenas that start: tuples, however deep, of arrays [A, ...]."""
+        """Returns the memory of arenas that start: nested tuples of arrays [A, ...]."""
         ...
 
     def act(self, memory: Any, arenas: Arenas) -> tuple[Any, np.ndarray]:
@@ -82,7 +82,7 @@ class Controller(Protocol):
 
 
 class _ByPolicy(NamedTuple):
-    """The controller that a judge has unless it is told another: its policy."""
+    """The default controller of a judge: its policy."""
 
     judge: Judge
 
@@ -101,12 +101,12 @@ class _ByPolicy(NamedTuple):
 
 
 def by_policy(judge: Judge) -> Controller:
-    """Returns the controller that is the judge's policy.
+    """Returns a controller that follows the judge's policy.
 
-    What is drawn follows from the level and the clock.
+    Its random draws depend only on the level and the clock.
 
     Args:
-        judge: What the arenas share.
+        judge: Data that the arenas share.
     """
     return _ByPolicy(judge)
 
@@ -116,18 +116,18 @@ def simulate(
 ) -> Outcome:
     """Runs episodes side by side, each until all its robots have arrived or the time is out.
 
-    By `task.arrival=hold` they have arrived once all are within their targets.
+    With `task.arrival=hold` they have arrived once all robots are within their targets.
 
     Args:
-        judge: What the arenas share.
-        levels: What they start from.
-        controller: Who drives; None: the judge's policy.
+        judge: Data that the arenas share.
+        levels: Levels to start from.
+        controller: Controller of the robots; None: the judge's policy.
 
     Returns:
-        What they came to, in their order.
+        The outcomes of the episodes, in their order.
 
     Raises:
-        ConfigError: If the physics of an episode breaks down.
+        ConfigError: The physics of an episode breaks down.
     """
     rows, arenas = np.arange(len(levels)), start(judge, levels)
     driver = by_policy(judge) if controller is None else controller
@@ -147,7 +147,7 @@ def simulate(
 
 
 def _select(tree: Any, rows: Any) -> Any:
-    """Keeps some of the arenas, in tuples of arrays however deep."""
+    """Keeps some of the arenas, in nested tuples of arrays."""
     if tree is None:
         return None
     if isinstance(tree, np.ndarray):
@@ -159,11 +159,11 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     """Starts episodes.
 
     Args:
-        judge: What the arenas share.
-        levels: [A], with as many robots and boxes as the judge's stage has.
+        judge: Data that the arenas share.
+        levels: [A], with the judge's numbers of robots and boxes.
 
     Returns:
-        The arenas at rest, observed.
+        The arenas at rest, with their first observations.
     """
     begun = Level(*map(np.stack, zip(*levels, strict=True)))
     pose, target, obstacle = (
@@ -198,7 +198,7 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
 
 
 def _no_outcome(count: int, robots: int) -> Outcome:
-    """Returns what episodes have come to that have just begun."""
+    """Returns the outcome of episodes that have just begun."""
     none = np.zeros((count, robots), np.int64)
     by_kind = np.zeros((count, robots, len(gaps.KINDS)), np.int64)
     return Outcome(
@@ -228,13 +228,13 @@ def _models(judge: Judge, factors: Factors, half: np.ndarray) -> np.ndarray:
         changes = body.changes(mine, judge.ids.robots, judge.config.robot, judge.model)
         for name, (rows, values) in changes.items():
             getattr(models[i], name)[rows] = values
-        # What MuJoCo derives from them: it reads the inertia of a planar robot from there.
+        # Updates MuJoCo's derived constants, such as the inertia of a planar robot.
         mujoco.mj_setConst(models[i], mujoco.MjData(models[i]))
     return models
 
 
 def _with_boxes(judge: Judge, half: np.ndarray) -> np.ndarray:
-    """Returns models [A] with boxes of these half edges [A, M, 2]; one where they are alike."""
+    """Returns models [A] with boxes of these half edges [A, M, 2]; only one if all are alike."""
     models = np.full(len(half), judge.model, object)
     compiled = judge.model.geom_size[judge.ids.obstacle_geom, :2]
     for i in np.flatnonzero((half != compiled).any(axis=(1, 2))):
@@ -252,14 +252,14 @@ def place(
     """Sets an arena up, at rest.
 
     Args:
-        judge: What the arenas share.
-        model: Of the arena.
+        judge: Data that the arenas share.
+        model: Model of the arena.
         pose: [R, 3] x (m), y (m), yaw (rad).
-        obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m; those of the model).
-        side: Of the arena, m; the stage's if there is none.
+        obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m; equal to the model's).
+        side: Side of the arena, m; None: the stage's.
 
     Returns:
-        The arena, its positions up to date.
+        The arena, with positions up to date.
     """
     data = mujoco.MjData(model)
     length = np.float64(judge.stage.side if side is None else side)
@@ -272,23 +272,23 @@ def place(
 
 
 def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Arenas:
-    """Moves arenas on by one control step; what happens in it is what `task.env.step` says.
+    """Moves arenas by one control step, by the rules of `task.env.step`.
 
     Args:
-        judge: What the arenas share.
+        judge: Data that the arenas share.
         arenas: Their state before.
-        action: [A, R, U] of the robots, -1..1; None: those of a policy that remembers nothing.
+        action: [A, R, U] of the robots, -1..1; None: actions of a policy without memory.
 
     Returns:
         Their state after.
 
     Raises:
-        ConfigError: If a position is not finite.
+        ConfigError: A position is not finite.
     """
     task, before = judge.config.task, arenas.outcome.arrived
     if action is None:
         if judge.policy.carried:
-            raise PolicyError("the policy remembers: give the action, as `by_policy` chooses it.")
+            raise PolicyError("the policy has a memory: pass the action that `by_policy` chooses.")
         _, action = by_policy(judge).act(None, arenas)
     active = arrival.drives(task.arrival, before)
     memory, pose, impulse = _drive(judge, arenas, action[..., : sim_drive.COMMAND_SIZE], active)
@@ -317,7 +317,7 @@ def _look_by_extension(
     arrived: np.ndarray,
     clock: np.ndarray,
 ) -> Sight:
-    """Adds what the observations of an extension see."""
+    """Adds the observations of an extension."""
     if judge.own is None:
         return sight
     return sight._replace(own=judge.own(electronics.view(sight, pose, levels, arrived, clock)))
@@ -331,7 +331,7 @@ def _hear(
     obstacle: np.ndarray,
     said: np.ndarray | None,
 ) -> Sight:
-    """Adds who can be heard, with what they said [A, R, M]; None: nothing yet."""
+    """Adds the neighbours in range and their messages [A, R, M]; None: no messages yet."""
     settings = judge.electronics.neighbours
     if not settings.count:
         return sight
@@ -341,9 +341,9 @@ def _hear(
 
 
 class _Step(NamedTuple):
-    """What happened in a control step: [A, R], with three kinds of contact or K rays each.
+    """The events of a control step, [A, R] each, with three kinds of contact or K rays.
 
-    `arrived` are those that have arrived after it; `near` are the rays that met something.
+    `arrived` tells which robots have arrived after the step, and `near` which rays met something.
     """
 
     arrived: np.ndarray
@@ -354,7 +354,7 @@ class _Step(NamedTuple):
 
 
 def _tally(arenas: Arenas, pose: np.ndarray, step: _Step) -> tuple[np.ndarray, Outcome]:
-    """Adds a control step to what episodes have come to; returns it with the new anchors."""
+    """Adds a control step to the episodes' outcomes; returns the new anchors and outcomes."""
     before, clock = arenas.outcome, arenas.outcome.clock + 1
     under_way = ~before.arrived
     since = np.where(under_way, clock[:, None], before.arrival)
@@ -377,7 +377,7 @@ def _tally(arenas: Arenas, pose: np.ndarray, step: _Step) -> tuple[np.ndarray, O
 def _drive(
     judge: Judge, arenas: Arenas, action: np.ndarray, active: np.ndarray
 ) -> tuple[Memory, np.ndarray, np.ndarray]:
-    """Lets the robots that are active drive.
+    """Lets the active robots drive.
 
     Returns:
         Memory, new poses [A, R, 3], and impulses [A, R, 3] (N s) by kind of contact.
@@ -401,14 +401,14 @@ def _drive(
     qpos = np.stack([data.qpos for data in arenas.data])
     if not np.isfinite(qpos).all():
         raise ConfigError(
-            "the physics broke down, with positions that are not finite: give substeps of more "
-            f"than {judge.substeps}, or a robot nearer to the real one."
+            "the physics broke down, with positions that are not finite: give more than "
+            f"{judge.substeps} substeps, or a robot closer to the real one."
         )
     return memory, body.pose(qpos, np), _impulses(judge, pushes, len(arenas.data))
 
 
 class _Pushes(NamedTuple):
-    """Contacts [N] that push, of one arena in one physics step: geoms [N, 2], normal forces, N."""
+    """Pushing contacts [N] of an arena in a physics step: geoms [N, 2] and normal forces, N."""
 
     geom: np.ndarray
     force: np.ndarray
@@ -417,12 +417,12 @@ class _Pushes(NamedTuple):
 def _advance(
     judge: Judge, model: mujoco.MjModel, data: mujoco.MjData, ctrl: np.ndarray
 ) -> list[_Pushes]:
-    """Moves one arena on by a control step; returns the contacts of each physics step."""
+    """Moves one arena by a control step; returns the contacts of each physics step."""
     data.ctrl = ctrl
     pushes = []
-    # The halves of mj_step, the other way round: the positions that the rays of this control
-    # step need are those that the next one starts from. In between forces are those of the
-    # contacts that are listed.
+    # The two halves of mj_step, in reverse order: the rays of this control step then see the
+    # positions from which the next step starts. Between the halves, the forces belong to the listed
+    # contacts.
     for _ in range(judge.substeps):
         mujoco.mj_step2(model, data)
         pushes.append(_push(model, data))
@@ -431,13 +431,13 @@ def _advance(
 
 
 def _push(model: mujoco.MjModel, data: mujoco.MjData) -> _Pushes:
-    """Reads the normal forces of all contacts off the solver's rows.
+    """Reads the normal forces of all contacts from the solver's rows.
 
-    Without friction a contact has one row, its normal force; of an elliptic cone that is the first.
-    The edges of a pyramid all push along the normal, and their sum is the force.
+    A contact without friction has one row, its normal force. With an elliptic cone the first row is
+    the normal force. With a pyramid, all edges push along the normal, and their sum is the force.
     """
     contact = data.contact
-    # One at a distance of exactly 0 is listed, but not among those that are solved for.
+    # MuJoCo lists a contact at a distance of exactly 0, but does not solve for it.
     solved = contact.efc_address >= 0
     address, edges = contact.efc_address[solved], 2 * (contact.dim[solved] - 1)
     if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
@@ -450,15 +450,15 @@ def _push(model: mujoco.MjModel, data: mujoco.MjData) -> _Pushes:
 
 
 def _impulses(judge: Judge, pushes: list[_Pushes], arenas: int) -> np.ndarray:
-    """Adds forces of contacts up, [A, R, 3] N s, in the order of `gaps.KINDS`.
+    """Sums the impulses of contacts, [A, R, 3] N s, in the order of `gaps.KINDS`.
 
     Args:
-        judge: What the arenas share.
-        pushes: [A * substeps], those of an arena one after the other.
+        judge: Data that the arenas share.
+        pushes: [A * substeps], grouped by arena.
         arenas: A.
 
     Returns:
-        [A, R, 3]; robots that touch each other both have the impulse.
+        [A, R, 3]; when two robots touch each other, both have the impulse.
     """
     counts = [len(each.force) for each in pushes]
     arena = np.repeat(np.arange(len(pushes)) // judge.substeps, counts)
@@ -475,10 +475,10 @@ def _impulses(judge: Judge, pushes: list[_Pushes], arenas: int) -> np.ndarray:
 
 
 def touching(judge: Judge, data: np.ndarray) -> np.ndarray:
-    """Tells which robots touch anything, by the contacts that MuJoCo found.
+    """Tells which robots touch anything, from MuJoCo's contacts.
 
     Args:
-        judge: What the arenas share.
+        judge: Data that the arenas share.
         data: [A] of `MjData`, positions up to date.
 
     Returns:
@@ -502,10 +502,10 @@ def look(
     target: np.ndarray,
     obstacle: np.ndarray,
 ) -> Sight:
-    """Finds out what there is to be sensed.
+    """Finds what the sensors can see.
 
     Args:
-        judge: What the arenas share.
+        judge: Data that the arenas share.
         data: [A] of `MjData`, positions up to date.
         factors: [A] of the episodes.
         pose: [A, R, 3] x (m), y (m), yaw (rad).
@@ -513,7 +513,7 @@ def look(
         obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
-        What the sensors have before them.
+        The sensors' view: rays, and the target's distance and bearing.
     """
     mount, shades = electronics.mount(factors), electronics.reflectance(factors)
     ray, geom = rays.cast_rays(judge.scene, data, pose, obstacle, mount)

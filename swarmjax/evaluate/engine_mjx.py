@@ -1,9 +1,9 @@
-"""Judges policies where they are trained: many arenas at once, on the device.
+"""Judges policies on the device and in the engine that trains: many arenas at once.
 
-The levels are those of `swarmjax.evaluate`, drawn by the same function from the same seed, and so
-are the rules and the figures. The engine is not: this is the one that trained, with its analytic
-sensors and its few solver steps, and MuJoCo C stays the judge that results are published by. It
-costs little, which is what a study needs that asks again and again while its policies learn.
+The levels are those of `swarmjax.evaluate`, drawn by the same function from the same seed, and the
+rules and figures are the same. The engine differs: it is the training engine, with its analytic
+sensors and few solver steps. Published results come from MuJoCo C. This engine is cheap, which
+suits studies that judge their policies again and again while they learn.
 """
 
 import functools
@@ -41,19 +41,19 @@ from swarmjax.task.level import Level, Spacing
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import rollout
 
-LARGEST_BOX = 0.3  # m; the largest that a stage takes
+LARGEST_BOX = 0.3  # m; the largest that a stage allows
 _ACTIVATIONS = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}
 
 
 class Outcomes(NamedTuple):
-    """What episodes came to, [E] each; the first four as `measures.per_level` names them.
+    """The outcomes of episodes, [E] each; the first four have the names of `measures.per_level`.
 
     Attributes:
       targets_reached: share of targets reached, 0..1.
-      all_reached: 1 where every robot arrived, else 0.
-      contacts_per_robot: contacts of all kinds, a robot.
-      episode_time_s: until all robots arrived or the time was out, s.
-      broken: 1 where the physics ceased to be finite, which ended the episode there, else 0.
+      all_reached: 1 if every robot arrived, else 0.
+      contacts_per_robot: contacts of all kinds per robot.
+      episode_time_s: time until all robots arrived or the time was out, s.
+      broken: 1 if the physics stopped being finite, which ended the episode, else 0.
     """
 
     targets_reached: Array
@@ -64,19 +64,19 @@ class Outcomes(NamedTuple):
 
 
 def draw_levels(world: World, stage: StageConfig, seed: int, episodes: int) -> Level:
-    """Draws the levels that `swarmjax.evaluate` starts from, with room for the world's robots.
+    """Draws the levels of `swarmjax.evaluate`, padded to the world's robots and obstacles.
 
     Args:
-      world: the compiled environment, of a config with this stage or one of obstacles as large.
-      stage: of the levels.
-      seed: of the evaluation.
+      world: the compiled environment, from a config with this stage or one with obstacles as large.
+      stage: stage of the levels.
+      seed: seed of the evaluation.
       episodes: E.
 
     Returns:
-      [E] levels, as NumPy arrays; robots and obstacles that the stage lacks are parked outside.
+      [E] levels, as NumPy arrays. Robots and obstacles that the stage lacks are parked outside.
 
     Raises:
-      ConfigError: if the stage has more robots or obstacles than the world is compiled for.
+      ConfigError: the stage has more robots or obstacles than the world is compiled for.
     """
     for key in ("robots", "obstacles"):
         value, most = getattr(stage, key), getattr(world.spacing, key)
@@ -107,25 +107,25 @@ def _make_room(drawn: Level, spacing: Spacing) -> Level:
         start=widened(drawn.start, robots),
         target=widened(drawn.target, robots),
         obstacle_present=widened(drawn.obstacle_present, obstacles),
-        # Whatever is parked has edges too; these nobody meets.
+        # Parked obstacles need edges too; no robot meets them.
         obstacle=widened(drawn.obstacle, obstacles, (0, 0, 0, placement.MARGIN, placement.MARGIN)),
     )
     return level.park(wider, np)
 
 
 def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
-    """Compiles the environment for levels of one kind, in physics steps of the judge's length.
+    """Compiles the environment for levels of one kind, with the judge's physics step.
 
     Args:
-      config: of the evaluation.
+      config: settings of the evaluation.
       half: [M, 2] half edges of the boxes in the levels, m.
-      arenas: how many levels are judged together.
+      arenas: number of levels that are judged together.
 
     Returns:
-      The world; a policy's limits and encoding are not in it yet.
+      The world, still without a policy's limits and encoding.
 
     Raises:
-      ConfigError: if a box is larger than the engine may be compiled for.
+      ConfigError: a box is larger than the engine supports.
     """
     fits = half.max(initial=0.0) <= task_stage.largest_half([config.stage])
     stage = config.stage if fits else _largest(config.stage, half)
@@ -144,8 +144,8 @@ def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
 
 
 def _largest(stage: StageConfig, half: np.ndarray) -> StageConfig:
-    """A stage with as many robots and boxes as large: all that the program depends on."""
-    largest = 2.0 * float(half.max(initial=0.05))  # without boxes any will do
+    """Returns a stage with the same robot count and box size; the program needs only these."""
+    largest = 2.0 * float(half.max(initial=0.05))  # without boxes any size will do
     if largest > LARGEST_BOX:
         raise ConfigError(
             f"stage {stage.name}: a box is {largest:g} m long, but engine=mjx takes up to "
@@ -157,20 +157,20 @@ def _largest(stage: StageConfig, half: np.ndarray) -> StageConfig:
 def play(
     world: World, levels: Level, trained: Policy, steps: int, *, sampled: bool = True
 ) -> Outcome:
-    """Runs an episode of each level by a policy file's policy.
+    """Runs an episode of each level with the policy of a file.
 
     Args:
-      world: of `load`.
-      levels: [E] with all robots and obstacles that the world has room for.
+      world: result of `load`.
+      levels: [E] with all robots and obstacles of the world.
       trained: the policy.
       steps: control steps of an episode.
-      sampled: draw the actions from the policy; otherwise they are its mean.
+      sampled: whether to draw the actions from the policy; otherwise they are its means.
 
     Returns:
-      [E] what they came to, as NumPy arrays; impulses are nan, since contacts are analytic here.
+      [E] outcomes, as NumPy arrays; impulses are nan, since contacts are analytic here.
 
     Raises:
-      ConfigError: if the physics of an episode breaks down.
+      ConfigError: the physics of an episode breaks down.
     """
     run = _program(
         world,
@@ -188,7 +188,7 @@ def play(
     if np.any(broken):
         raise ConfigError(
             f"the physics of {int(np.sum(broken))} of {len(levels.side)} episodes broke down, with "
-            f"positions that are not finite: give substeps of more than {world.physics.substeps}."
+            f"positions that are not finite: give more than {world.physics.substeps} substeps."
         )
     return Outcome(**{name: np.asarray(field) for name, field in outcome.items()})
 
@@ -204,7 +204,7 @@ def _program(
     sampled: bool,
     network: Any,
 ) -> Callable[[Any, ArrayLike, Level], tuple[dict[str, Array], Array]]:
-    """The compiled program of policies that differ in their weights alone."""
+    """Compiles the program for policies that differ only in their weights."""
     (encoding, history, limit), (speed, turn_rate) = seen, limits
     mine = replace(
         world,
@@ -224,7 +224,7 @@ def _program(
 
 
 def _begin(memory: Any, shape: tuple[int, ...]) -> Array | None:
-    """What robots [*shape] of a policy remember before they see anything, [*shape, H]."""
+    """Returns the memory of robots [*shape] before they see anything, [*shape, H]."""
     return None if memory is None else jnp.zeros((*shape, memory[2].shape[1]), jnp.float32)
 
 
@@ -234,7 +234,7 @@ def _act(
     memory: Any,
     arenas: EnvState,
 ) -> tuple[Any, Array]:
-    """What the judge's robots do, [E, R, U]: drawn by the same numbers as there, if at all."""
+    """Returns the actions [E, R, U]; if they are drawn, from the judge's random numbers."""
     memory, action = mean(memory, arenas.observation)
     if log_std is None:
         return memory, action
@@ -252,7 +252,7 @@ def _mean_action(
     memory: Any,
     observation: Array,
 ) -> tuple[Any, Array]:
-    """What `policy.step` says without noise, [E, R, U]: in full precision, where a GPU has less."""
+    """Computes `policy.step` without noise, [E, R, U], in full precision on every device."""
     layers, mean, std, params, hearing, parts = weights
     robots = slice(observation.shape[-2])
     x = jnp.clip((observation - mean[robots]) / std[robots], -limit, limit)
@@ -271,7 +271,7 @@ def _mean_action(
 
 
 def _hear(activate: Callable[[Array], Array], layer: Any, count: int, x: Array) -> Array:
-    """What `policy.step` makes of the neighbours in x [E, R, O], in full precision."""
+    """Computes `policy.step`'s result for the neighbours in x [E, R, O], in full precision."""
     kernel, bias = (jnp.asarray(part)[: x.shape[-2]] for part in layer)
     first = x.shape[-1] - count * kernel.shape[1]
     rows = x[..., first:].reshape(*x.shape[:-1], count, kernel.shape[1])
@@ -280,7 +280,7 @@ def _hear(activate: Callable[[Array], Array], layer: Any, count: int, x: Array) 
 
 
 def _dense(x: Array, layer: tuple[ArrayLike, ArrayLike], robots: slice) -> Array:
-    """One dense layer [E, R, in] -> [E, R, out] of one learner, or of one for each robot."""
+    """Applies a dense layer [E, R, in] -> [E, R, out], of one learner or of one for each robot."""
     kernel, bias = (jnp.asarray(part)[robots] for part in layer)
     kernel = jnp.broadcast_to(kernel, (x.shape[-2], *kernel.shape[1:]))
     return jnp.einsum("eri,rio->ero", x, kernel, precision=jax.lax.Precision.HIGHEST) + bias
@@ -295,24 +295,23 @@ def outcomes(
     *,
     sampled: bool = False,
 ) -> Outcomes:
-    """Runs an episode of each level by policies in training.
+    """Runs an episode of each level with policies in training.
 
-    Pure: `jit` it with `world`, `config` and `steps` bound, and `vmap` it over the seeds of
-    `learners`. With `impl=warp` the world must be loaded for as many arenas as are judged together
-    (E, or E for every seed), since that is what MJX-Warp's memory of contacts is sized for. Its
-    `task.step_limit` is not read.
+    The function is pure: `jit` it with `world`, `config` and `steps` bound, and `vmap` it over the
+    seeds of `learners`. With `impl=warp`, load the world for the number of arenas that are judged
+    together (E, or E for every seed), because MJX-Warp sizes its memory of contacts for that
+    number. The world's `task.step_limit` is ignored.
 
     Args:
       world: the compiled environment.
-      config: that made the learners.
+      config: the config that made the learners.
       learners: [L].
       levels: [E].
       steps: control steps of an episode, at least 1.
-      sampled: draw the actions from the policies; otherwise they are their means.
+      sampled: whether to draw the actions from the policies; otherwise they are their means.
 
     Returns:
-      [E] what they came to. An episode whose physics breaks ends there, its robots where they
-      were.
+      [E] outcomes. An episode whose physics breaks ends there, with its robots where they were.
     """
     act = partial(_choose, config, learners, sampled=sampled)
     memory = networks.begin_memory(config, levels.present.shape)
@@ -324,7 +323,7 @@ def outcomes(
 def _choose(
     config: AlgoConfig, learners: LearnerState, memory: Any, arenas: EnvState, *, sampled: bool
 ) -> tuple[Any, Array]:
-    """The learners' actions [E, R, U], drawn as the judge draws them, or their means."""
+    """Returns the learners' actions [E, R, U], drawn as in the judge, or their means."""
     count = len(jax.tree.leaves(learners)[0])
     seen = rollout.to_learners(arenas.observation, count)
     mine = None if memory is None else rollout.to_learners(memory, count)
@@ -343,7 +342,7 @@ def _choose(
 
 
 class _Counts(NamedTuple):
-    """What `Outcome` has and training has no use for, [E, R, ...]; `anchor` as in the judge."""
+    """Counts of `Outcome` that training does not need, [E, R, ...]; `anchor` as in the judge."""
 
     arrival: Array
     touched: Array
@@ -352,14 +351,14 @@ class _Counts(NamedTuple):
     still: Array
 
 
-# Of a memory [E, R, H] or None, and arenas: the memory after, and actions.
+# Takes a memory [E, R, H] or None, and arenas; returns the memory after, and actions.
 _Actor = Callable[[Any, EnvState], tuple[Any, Array]]
 
 
 def _run(
     world: World, act: _Actor, levels: Level, steps: int, memory: Array | None
 ) -> tuple[EnvState, _Counts, Array]:
-    """Runs an episode of each level; returns how the arenas end, and which of them broke."""
+    """Runs an episode of each level; returns the final arenas, counts and which arenas broke."""
     robots, obstacles = world.spacing.robots, world.spacing.obstacles
     chex.assert_shape(levels.present, (None, robots))
     chex.assert_shape(levels.obstacle, (len(levels.side), obstacles, 5))
@@ -386,7 +385,7 @@ def _step(
     carry: _Carry,
     _: None,
 ) -> tuple[_Carry, None]:
-    """Moves the arenas [E] on by a control step whose episodes are not over."""
+    """Moves the arenas [E] whose episodes are not over by a control step."""
     arenas, counts, broken, memory = carry
     memory, action = act(memory, arenas)
     moved, came = jax.vmap(partial(env.step, world))(arenas, action)
@@ -405,7 +404,7 @@ def _step(
 
 
 def _count(world: World, counts: _Counts, before: EnvState, after: EnvState) -> _Counts:
-    """Adds a control step up, as the judge does."""
+    """Adds a control step to the counts, as the judge does."""
     poses = jax.vmap(partial(physics.poses, world.physics))
     start, place = poses(before.sim)[..., :2], poses(after.sim)[..., :2]
     driven = jnp.linalg.norm(place - start, axis=-1)
@@ -422,7 +421,7 @@ def _count(world: World, counts: _Counts, before: EnvState, after: EnvState) -> 
 
 
 def _outcome(arenas: EnvState, counts: _Counts) -> dict[str, Array]:
-    """Puts together what the judge's `Outcome` holds, of arenas whose robots are all present."""
+    """Builds the fields of the judge's `Outcome`, for arenas whose robots are all present."""
     return {
         "clock": arenas.clock,
         "arrived": arenas.arrived,
@@ -443,7 +442,7 @@ def _all_arrived(arenas: EnvState) -> Array:
 
 
 def _sum_up(arenas: EnvState, broken: Array, control_step: float) -> Outcomes:
-    """Sums episodes up as `measures.per_level` does."""
+    """Summarises episodes as `measures.per_level` does."""
     present = arenas.level.present
     robots = jnp.sum(present, axis=-1)
     reached = jnp.sum(present & arenas.arrived, axis=-1)

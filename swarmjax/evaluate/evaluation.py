@@ -1,4 +1,4 @@
-"""Judges policies on the levels of a suite or a stage: who, on which, and what came of it."""
+"""Judges policies on the levels of a suite or a stage, and summarises the outcome."""
 
 import os
 from collections.abc import Callable, Collection, Sequence
@@ -18,12 +18,12 @@ from swarmjax.evaluate.trials import Entrant, Trial
 
 
 class Evaluation(NamedTuple):
-    """What an evaluation found.
+    """The findings of an evaluation.
 
     Attributes:
         result: Plain data for JSON; docs/interface.md lists it.
-        entrants: The policies, those of both sides of a comparison.
-        trials: What they came to, a cell each; rows as `entrants`.
+        entrants: The policies, of both sides for a comparison.
+        trials: Results, one for each cell; rows as in `entrants`.
     """
 
     result: dict[str, Any]
@@ -40,20 +40,20 @@ def evaluate(
     """Judges policies.
 
     Args:
-        settings: Of the evaluation.
-        progress: To show how far it is; None shows nothing.
-        announce: Is called when all that was given is sound, before the first episode, with the
-            number of cells that were judged before, and of all.
-        keep: Folder for each cell that is over, from which the same evaluation goes on; None keeps
-            nothing.
+        settings: Settings of the evaluation.
+        progress: Progress display; None shows nothing.
+        announce: Called once all inputs are checked, before the first episode, with the number of
+            cells already judged, and the number of all cells.
+        keep: Folder to save each finished cell in, from which the same evaluation resumes; None
+            saves nothing.
 
     Returns:
-        What it found.
+        The findings.
 
     Raises:
-        PolicyError: If a policy is unsound, or does not fit the levels.
-        ConfigError: If a file is missing, a suite unsound, the physics breaks down, or what is kept
-            is of another evaluation.
+        PolicyError: A policy is unsound, or does not fit the levels.
+        ConfigError: A file is missing, a suite is unsound, the physics breaks down, or the saved
+            cells belong to another evaluation.
     """
     files = _sides(settings)
     sides = [evaluate_trials.read_policies(each, settings.extensions) for each in files]
@@ -64,15 +64,15 @@ def judge_entrants(settings: EvaluateConfig, entrants: list[Entrant]) -> Evaluat
     """Judges policies that have been read already, of one recipe.
 
     Args:
-        settings: Of the evaluation; its `policy` is not read.
+        settings: Settings of the evaluation; its `policy` is ignored.
         entrants: The policies.
 
     Returns:
-        What it found.
+        The findings.
 
     Raises:
-        PolicyError: If a policy does not fit the levels.
-        ConfigError: If a suite is unsound, or the physics breaks down.
+        PolicyError: A policy does not fit the levels.
+        ConfigError: A suite is unsound, or the physics breaks down.
     """
     return _judge(settings, [entrants], Progress(disable=True), lambda *_: None, None)
 
@@ -84,9 +84,9 @@ def _judge(
     announce: Callable[[int, int], object],
     keep: Path | None,
 ) -> Evaluation:
-    """Judges the policies of one side, or of the two that are compared."""
+    """Judges the policies of one side, or of two sides for a comparison."""
     entrants = [each for side in sides for each in side]
-    for stage in cells.stages(settings):  # before levels are drawn, which takes a while
+    for stage in cells.stages(settings):  # before drawing levels, which takes a while
         for path, trained in entrants:
             judge.check_policy(settings, stage, path, trained)
     suite = cells.load(settings)
@@ -109,7 +109,7 @@ def _judge(
 def _show_bars(
     progress: Progress, all_cells: Sequence[Cell], done: Collection[int], policies: int
 ) -> tuple[Callable[[int], None], Callable[[int], None]]:
-    """Shows how far an evaluation is; returns what moves on its episodes, and its cells."""
+    """Shows the progress; returns functions that advance the episodes and the cells."""
     episodes = [policies * len(cell.episodes) for cell in all_cells]
     before = sum(episodes[row] for row in done)
     bars = (
@@ -138,7 +138,7 @@ def _rows(trial: Trial, rows: slice) -> Trial:
 
 
 def _sides(settings: EvaluateConfig) -> list[list[str]]:
-    """Lists the files to judge: of one recipe, or of the two that are compared."""
+    """Lists the files to judge: of one recipe, or of the two recipes to compare."""
     if settings.policy is not None:
         return [list_files("policy", settings.policy)]
     parts = (settings.compare or "").split(",")
@@ -151,23 +151,23 @@ def _sides(settings: EvaluateConfig) -> list[list[str]]:
     if first != second:
         raise ConfigError(
             f"compare is {show(settings.compare)}, which is {first} against {second}: give as many "
-            "policies on both sides, those of the same seeds in the same order."
+            "policies on both sides, with the same seeds in the same order."
         )
     return sides
 
 
 def list_files(key: str, text: str) -> list[str]:
-    """Lists the files that a word of the command line names.
+    """Lists the files that a setting of the command line names.
 
     Args:
-        key: Of the word.
-        text: Paths and patterns such as `runs/a-seed*.npz`, with commas between them.
+        key: Key of the setting.
+        text: Paths and patterns such as `runs/a-seed*.npz`, separated by commas.
 
     Returns:
-        Paths, those of a pattern in alphabetical order.
+        The paths; those of a pattern in alphabetical order.
 
     Raises:
-        ConfigError: If a pattern matches nothing, or a file is named twice.
+        ConfigError: A pattern matches nothing, or a file is named twice.
     """
     found: list[str] = []
     for part in [text] if os.path.isfile(text) else text.split(","):

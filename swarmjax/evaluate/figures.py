@@ -12,21 +12,21 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from swarmjax.evaluate.trials import Trial
 
-_DOTS = 110  # an inch
+_DOTS = 110  # per inch
 _MARK, _WORST = "#0b4f9e", "#c04000"
-_ROW = 0.32  # inches of a cell
+_ROW = 0.32  # inches per cell
 
 
 def draw(result: Mapping[str, Any], trials: Sequence[Trial], limit: float) -> dict[str, bytes]:
     """Draws the plots of an evaluation.
 
     Args:
-        result: As `summary.result` makes it.
-        trials: What policies came to, a cell each.
+        result: Result of `summary.result`.
+        trials: Results of the policies, one for each cell.
         limit: Length of an episode, s.
 
     Returns:
-        PNG files by name, `measures` and `times`; the same evaluation gives the same files.
+        PNG files by name, `measures` and `times`. The same evaluation gives the same files.
     """
     files = {}
     for name, figure in (("measures", intervals(result)), ("times", times(trials, limit))):
@@ -37,7 +37,7 @@ def draw(result: Mapping[str, Any], trials: Sequence[Trial], limit: float) -> di
 
 
 def intervals(result: Mapping[str, Any]) -> Figure:
-    """Draws targets and contacts of each cell: the mean with its interval, and the worst levels."""
+    """Draws each cell's targets and contacts: the mean with its interval, and the worst levels."""
     cells = result["cells"]
     figure = Figure(figsize=(8.6, 1.5 + _ROW * len(cells)), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
@@ -60,7 +60,7 @@ def _mark(axes: Axes, cells: Sequence[Mapping[str, Any]], name: str) -> None:
     for key, mark, colour, shift in (("mean", "o", _MARK, -0.12), ("iqm", "|", "0.35", 0.12)):
         middle = np.array([each[key] for each in found])
         ends = np.array([each[f"{key}_interval"] or [each[key]] * 2 for each in found])
-        # An interval of percentiles need not hold the estimate: its bar is drawn by itself.
+        # A percentile interval need not contain the estimate, so its bar is drawn by itself.
         label = f"{key if key == 'mean' else 'IQM'}, 95 %"
         axes.hlines(rows + shift, ends[:, 0], ends[:, 1], color=colour)
         axes.plot(middle, rows + shift, mark, color=colour, label=label)
@@ -70,7 +70,7 @@ def _mark(axes: Axes, cells: Sequence[Mapping[str, Any]], name: str) -> None:
 
 
 def times(trials: Sequence[Trial], limit: float) -> Figure:
-    """Draws which share of the robots has arrived by when, a curve for each cell."""
+    """Draws the share of robots that have arrived over time, a curve for each cell."""
     figure = Figure(figsize=(8.6, 4.2), layout="constrained")
     axes = figure.subplots()
     colours = colormaps["viridis"](np.linspace(0.0, 0.9, len(trials)))

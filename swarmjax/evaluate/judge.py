@@ -1,4 +1,4 @@
-"""The judge: what all arenas of an evaluation in MuJoCo's C engine share. No JAX."""
+"""The judge: data that all arenas of an evaluation in MuJoCo's C engine share. No JAX."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -27,27 +27,28 @@ from swarmjax.task.electronics import Electronics
 from swarmjax.task.observation import View
 from swarmjax.task.stage_config import StageConfig
 
-SOLVER_ITERATIONS = 100  # MuJoCo's own default: until its tolerance of 1e-8 is met
+SOLVER_ITERATIONS = 100  # at most, MuJoCo's default; it stops at its tolerance of 1e-8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Judge:
-    """What all arenas of an evaluation share.
+    """Data that all arenas of an evaluation share.
 
     Attributes:
-        config: Of the evaluation.
-        policy: Who drives.
-        stage: Of the levels, fields [].
-        spacing: Sizes that levels are drawn with.
+        config: Settings of the evaluation.
+        policy: The policy that drives.
+        stage: Stage of the levels, fields [].
+        spacing: Sizes for drawing levels.
         drive: The robot's drive, with the range of commands that the policy was trained for.
-        electronics: What lies between policy and world; it observes as the policy was trained to.
-        model: One arena, compiled.
+        electronics: The electronics between policy and world, with the observations of the policy's
+            training.
+        model: The compiled arena.
         ids: Rows of its moving bodies.
-        scene: What infrared rays are cast in.
-        geom_robot: Of each of its geoms the robot whose contact geom it is, else -1.
-        geom_kind: Of each of its geoms the index in `gaps.KINDS` of what it belongs to.
+        scene: The scene for infrared rays.
+        geom_robot: For each geom, the robot whose contact geom it is, else -1.
+        geom_kind: For each geom, the index in `gaps.KINDS` of the thing that it belongs to.
         substeps: Physics steps of a control step.
-        own: Observations of an extension, [A, R, E] of a view [A]; None without any.
+        own: Observations of an extension, [A, R, E] from a view [A]; None without any.
     """
 
     config: EvaluateConfig
@@ -66,19 +67,19 @@ class Judge:
 
 
 def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None) -> Judge:
-    """Compiles the arena of a stage, with no more robots and obstacles than it has.
+    """Compiles the arena of a stage, with exactly its robots and obstacles.
 
     Args:
-        config: Of the evaluation.
+        config: Settings of the evaluation.
         trained: The policy to judge.
-        half: [M, 2] half edges of the boxes in the levels to come, m; None: as the stage and its
-            `shape` have them.
+        half: [M, 2] half edges of the boxes in the coming levels, m; None: those of the stage and
+            its `shape`.
 
     Returns:
         The judge.
 
     Raises:
-        PolicyError: If the policy observes something else, or has too few learners.
+        PolicyError: The policy has other observations, or too few learners.
     """
     check_policy(config, config.stage, config.policy, trained)
     extensions = extension.load(config.extensions)
@@ -119,15 +120,16 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
 
 
 def neighbours(trained: Policy) -> NeighboursConfig:
-    """Returns what a policy was trained to hear, and to broadcast."""
+    """Returns a policy's settings for hearing and broadcasting."""
     return build(NeighboursConfig, trained.neighbours, "meta.observation.neighbours.")
 
 
 def substeps(config: EvaluateConfig) -> int:
-    """Physics steps of a control step: half as long as in training, where nothing else is given.
+    """Returns the physics steps of a control step; by default they are half as long as in training.
 
-    A wheel that slips while its robot is blocked hops, since MuJoCo's contacts, like all convex
-    ones, separate surfaces that slide: by 1.3 mm in steps of 16 ms, by 0.8 mm from 8 ms down.
+    When a robot is blocked, its slipping wheels hop, because MuJoCo's contacts, like all convex
+    ones, separate sliding surfaces. They hop by 1.3 mm in steps of 16 ms, and by 0.8 mm in steps of
+    8 ms or less.
     """
     finer = 2 if config.robot.body == "wheeled" and config.substeps is None else 1
     return finer * physics_substeps(config.robot, config.substeps)
@@ -141,7 +143,7 @@ def _compile(config: EvaluateConfig, half: np.ndarray) -> tuple[mujoco.MjModel, 
     robot = task_factors.largest(config.robot, config.realism)
     spec = sim_model.build(robot, size, timestep, ray_geoms=True)
     spec.option.iterations = SOLVER_ITERATIONS
-    # Rather numbers that are not finite than a robot put back to where its world began.
+    # Numbers that are not finite are better than a robot silently reset to its first place.
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     # Compiled in rather than set later, so that MuJoCo derives its bounds from them.
     for i, edges in enumerate(half):
@@ -151,7 +153,7 @@ def _compile(config: EvaluateConfig, half: np.ndarray) -> tuple[mujoco.MjModel, 
 
 
 def _geoms(compiled: mujoco.MjModel, ids: sim_model.Ids) -> tuple[np.ndarray, np.ndarray]:
-    """Tells of each geom whose contact geom it is, and of what kind."""
+    """Returns each geom's robot, if it is a contact geom, and its kind of contact."""
     robot = np.full(compiled.ngeom, -1)
     kind = np.full(compiled.ngeom, gaps.KINDS.index("wall"))
     kind[ids.obstacle_geom] = gaps.KINDS.index("obstacle")
@@ -162,7 +164,7 @@ def _geoms(compiled: mujoco.MjModel, ids: sim_model.Ids) -> tuple[np.ndarray, np
 
 
 def _observations(extensions: Extensions, trained: Policy) -> tuple[Observation, ...]:
-    """Finds the observations of an extension that a policy sees, in its order."""
+    """Finds the observations of an extension that a policy uses, in the policy's order."""
     names = trained.meta.get("task", {}).get("observations", [])
     return tuple(each for name in names for each in extensions.observations if each.name == name)
 
@@ -171,7 +173,7 @@ def _look_by(own: tuple[Observation, ...]) -> Callable[[View], np.ndarray] | Non
     """Compiles observations of an extension, for arenas side by side."""
     if not own:
         return None
-    import jax  # for extensions alone
+    import jax  # only for extensions
 
     from swarmjax.task import extended
 
@@ -185,14 +187,14 @@ def check_policy(
     """Refuses a policy that does not fit a stage.
 
     Args:
-        config: Of the evaluation.
+        config: Settings of the evaluation.
         stage: The stage.
-        path: Of the policy.
+        path: Path of the policy.
         trained: The policy.
 
     Raises:
-        PolicyError: If it observes something else, or has too few learners.
-        ConfigError: If it needs a piece of an extension that is missing.
+        PolicyError: It has other observations, or too few learners.
+        ConfigError: A part of an extension that it needs is missing.
     """
     extensions, needs = extension.load(config.extensions), trained.meta.get("extensions", {})
     extension.check_needs(needs, extensions, str(path), ["observation", "network"])
@@ -216,7 +218,7 @@ def check_policy(
 
 
 def _list(values: Any) -> str:
-    """Writes a few values in a sentence."""
+    """Formats a few values for a sentence."""
     return ", ".join(map(str, values)) if isinstance(values, list | tuple) else str(values)
 
 
@@ -227,14 +229,14 @@ def draw_level(
     episode: int,
     drawings: Sequence[LevelDrawing] = (),
 ) -> level.Level:
-    """Draws the level that an episode starts from.
+    """Draws the level of an episode.
 
     Args:
         stage: Fields [].
         spacing: Sizes.
-        seed: Of the evaluation.
-        episode: Its number.
-        drawings: Ways of drawing levels of an extension, as `stage.drawing` counts them.
+        seed: Seed of the evaluation.
+        episode: Number of the episode.
+        drawings: An extension's ways of drawing levels, in the order of `stage.drawing`.
 
     Returns:
         The level, as NumPy arrays.
@@ -244,6 +246,6 @@ def draw_level(
     drawn = level.sample(uniforms, stage, spacing, np)
     if not stage.drawing:
         return drawn
-    from swarmjax.task import extended  # JAX, for extensions alone
+    from swarmjax.task import extended  # imports JAX, only for extensions
 
     return extended.redraw(drawings[int(stage.drawing) - 1], drawn)

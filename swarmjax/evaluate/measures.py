@@ -1,7 +1,7 @@
-"""What an episode comes to, and the figures by which policies are compared: NumPy only.
+"""The outcome of episodes, and the figures for comparing policies: NumPy only.
 
-Every measure is one number a level, defined with its formula in docs/evaluation.md. Engines count
-into an `Outcome`; nothing here knows which engine it was.
+Every measure is one number per level; docs/evaluation.md gives its formula. Engines count events
+into an `Outcome`. Nothing here depends on the engine.
 """
 
 from typing import NamedTuple
@@ -10,32 +10,34 @@ import numpy as np
 
 from swarmjax.sim import gaps
 
-# A robot that the time-out finds within STILL_RADIUS of where it was STILL_TIME before is in a
-# deadlock: it has not arrived and does not move (Grover, Liu & Sycara 2020, "Deadlock Analysis
-# and Resolution in Multi-Robot Systems"; there at speed 0, which a robot that turns on the spot
-# or pushes never has to the last bit). Both numbers are chosen: at full speed a robot drives
-# 0.63 m in that time.
+# A robot is in a deadlock if, at the time-out, it is within STILL_RADIUS of its place STILL_TIME
+# earlier: it has not arrived and does not move (Grover, Liu & Sycara 2020, "Deadlock Analysis and
+# Resolution in Multi-Robot Systems"). They require speed 0, but a robot that turns on the spot or
+# pushes never has exactly that speed. Both numbers are this project's choice: at full speed a robot
+# drives 0.63 m in that time.
 STILL_RADIUS = 0.02  # m
 STILL_TIME = 5.0  # s
 
 
 class Outcome(NamedTuple):
-    """What episodes came to, or have come to so far.
+    """The outcomes of episodes, final or so far.
 
     Attributes:
         clock: [A] control steps since the start.
-        arrived: [A, R] whether the robot has arrived; by `task.arrival=hold`, is within its target.
-        arrival: [A, R] control steps until it arrived, 0 if it has not; by `hold`, until it was
-            within its target and never outside since.
-        contacts: [A, R, 3] contacts of each kind of `gaps.KINDS`, also after arrival.
-        touched: [A, R, 3] control steps at whose end it touched something, likewise.
-        impulse: [A, R, 3] of the normal forces at these contacts, N s, likewise; nan where the
-            engine does not tell.
+        arrived: [A, R] whether the robot has arrived; with `task.arrival=hold`, whether it is
+            within its target.
+        arrival: [A, R] control steps until it arrived, 0 if it has not; with `hold`, until it was
+            within its target and stayed there.
+        contacts: [A, R, 3] contacts of each kind of `gaps.KINDS`, including those after arrival.
+        touched: [A, R, 3] control steps that ended in touch, including those after arrival.
+        impulse: [A, R, 3] normal impulse of these contacts, N s; nan if the engine does not compute
+            it.
         sensed: [A, R] control steps before arrival with an infrared ray shorter than its range.
-        moving: [A, R] control steps before arrival; by `hold`, those that began outside the target.
-        path: [A, R] driven before arrival, m; by `hold`, in these steps.
-        still: [A, R] control steps for which it has stayed within STILL_RADIUS of one place
-            without having arrived.
+        moving: [A, R] control steps before arrival; with `hold`, those that began outside the
+            target.
+        path: [A, R] distance driven before arrival, m; with `hold`, in the steps of `moving`.
+        still: [A, R] control steps for which it has stayed within STILL_RADIUS of one place without
+            having arrived.
     """
 
     clock: np.ndarray
@@ -51,12 +53,12 @@ class Outcome(NamedTuple):
 
 
 class Measure(NamedTuple):
-    """One number a level.
+    """A figure with one number per level.
 
     Attributes:
-        label: What a table calls it.
-        unit: Of the number; `%` is a share of 0 to 1, shown in per cent; none of a count.
-        is_good: Whether more of it is better.
+        label: Its name in a table.
+        unit: Unit of the number; `%` is a share of 0 to 1, shown in per cent; a count has none.
+        is_good: Whether larger numbers are better.
     """
 
     label: str
@@ -65,7 +67,7 @@ class Measure(NamedTuple):
 
 
 def _by_kind(name: str, label: str, unit: str) -> dict[str, Measure]:
-    """A measure over all kinds of contact, and one of each kind."""
+    """Makes a measure over all kinds of contact, and one for each kind."""
     kinds = {f"{name}_{kind}": Measure(f"  with {kind}", unit) for kind in gaps.KINDS}
     return {f"{name}_per_robot": Measure(label, unit), **kinds}
 
@@ -88,17 +90,17 @@ MEASURES: dict[str, Measure] = {
 def per_level(
     outcome: Outcome, control_step: float, steps: int, shortest: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
-    """What each episode came to.
+    """Computes the measures of each episode.
 
     Args:
-        outcome: Of episodes that are over.
-        control_step: s.
-        steps: Control steps after which the time is out.
-        shortest: [A, R] length of the shortest way from start to target, m, inf where there is
-            none; without it there is no path efficiency.
+        outcome: Outcome of finished episodes.
+        control_step: Length of a control step, s.
+        steps: Control steps until the time is out.
+        shortest: [A, R] length of the shortest way from start to target, m, inf if there is none.
+            Without `shortest` there is no path efficiency.
 
     Returns:
-        [A] of each of `MEASURES` that is known, in their order.
+        [A] of each of `MEASURES` that can be computed, in their order.
     """
     late = ~outcome.arrived
     arrival = np.where(late, steps, outcome.arrival) * control_step
@@ -121,17 +123,17 @@ def per_level(
 
 
 def _split(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
-    """Means over robots of values [A, R, 3]: of all kinds together, and of each."""
+    """Averages values [A, R, 3] over robots: for all kinds together, and for each kind."""
     kinds = values.mean(axis=1)
     each = {f"{name}_{kind}": kinds[:, i] for i, kind in enumerate(gaps.KINDS)}
     return {f"{name}_per_robot": kinds.sum(axis=-1), **each}
 
 
 def _efficiency(outcome: Outcome, shortest: np.ndarray) -> np.ndarray:
-    """Success weighted by path length of each robot [A, R], 0 to 1.
+    """Computes success weighted by path length for each robot, [A, R], 0 to 1.
 
     Anderson et al. 2018, "On Evaluation of Embodied Navigation Agents", equation 1: success times
-    shortest / max(driven, shortest). A way of no length is driven as well as can be.
+    shortest / max(driven, shortest). A way of length 0 counts as driven perfectly.
     """
     longer = np.maximum(outcome.path, shortest)
     known = np.isfinite(longer)

@@ -1,9 +1,9 @@
-"""Plans: proof that the robots of a level can all arrive, one moving at a time.
+"""Plans: proof that the robots of a level can all arrive if one moves at a time.
 
-A plan is found on a grid and holds for discs of the hull's radius; `check` tests it against the
-exact shapes, by other arithmetic. Where no robot can go to its target, one steps aside first, so
-that another can: into a bay, or off a place that is another's target. A robot stops for good as
-soon as it is within reach of its target. NumPy only.
+A plan is found on a grid, for discs of the hull's radius. `check` tests it against the exact
+shapes, with independent arithmetic. If no robot can reach its target, one robot first steps aside
+to let another pass: into a bay, or off another robot's target. A robot stops for good as soon as it
+has reached its target. NumPy only.
 """
 
 import itertools
@@ -14,20 +14,20 @@ import numpy as np
 
 from swarmjax.task.level import Level
 
-CELL = 0.015  # m; of the grid: the narrowest door, of 0.10 m, leaves a way of 0.023 m
-_SPARE = 0.0016  # m, beside the hull: a step between two cells comes nearer to a corner by 1.5 mm
+CELL = 0.015  # m, of the grid; the narrowest door, 0.10 m, leaves a hull's centre 0.023 m
+_SPARE = 0.0016  # m, added to the hull: between two cells a disc comes up to 1.5 mm nearer a corner
 _NEVER = np.iinfo(np.int32).max // 2
-_ORDERS = 30  # in which robots go that are tried: who parks first may bar the others' way
-_REFUGES = 400  # cells to step aside to that are tried, at most
+_ORDERS = 30  # orders of robots to try: a robot that parks first may block others
+_REFUGES = 400  # most cells to try for stepping aside
 _STEPS = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
 
 
 class Move(NamedTuple):
-    """One robot's way.
+    """The path of one robot.
 
     Attributes:
-        robot: Its number.
-        path: [P, 2] points that it drives along straight lines between, m.
+        robot: Number of the robot.
+        path: [P, 2] points that it visits along straight lines, m.
     """
 
     robot: int
@@ -38,10 +38,10 @@ class _Grid(NamedTuple):
     """Cells of an arena, [N, N] each.
 
     Attributes:
-        place: [N, N, 2] of their middles, m.
-        free: Whether the walls leave a hull room there.
-        apart: Distance that two robots keep, m.
-        reach: How near to its target a robot has arrived, m.
+        place: [N, N, 2] centres of the cells, m.
+        free: Whether the walls leave enough space for a hull there.
+        apart: Least distance between two robots, m.
+        reach: Distance from the target at which a robot has arrived, m.
     """
 
     place: np.ndarray
@@ -54,12 +54,12 @@ def find(level: Level, hull_radius: float, target_radius: float) -> list[Move] |
     """Finds a plan.
 
     Args:
-        level: Of one arena, NumPy; robots that are absent have no part.
-        hull_radius: Of the robots, m.
-        target_radius: Within which they have arrived, m.
+        level: Level of one arena, NumPy; absent robots are ignored.
+        hull_radius: Radius of the robots, m.
+        target_radius: Radius within which a robot has arrived, m.
 
     Returns:
-        Moves in their order; None if none was found, which proves nothing.
+        Moves in their order; None if none was found, which does not prove that none exists.
     """
     grid = _grid(level, hull_radius, target_radius)
     robots = np.flatnonzero(level.present)
@@ -69,7 +69,7 @@ def find(level: Level, hull_radius: float, target_radius: float) -> list[Move] |
 
 
 def _try(grid: _Grid, level: Level, order: np.ndarray) -> list[Move] | None:
-    """Finds a plan in which robots that come first in an order go first where they can."""
+    """Finds a plan in which the robots go in the given order where they can."""
     place = level.start[:, :2].astype(np.float64)
     left, moves = [int(i) for i in order], []
     while left:
@@ -86,7 +86,7 @@ def _try(grid: _Grid, level: Level, order: np.ndarray) -> list[Move] | None:
 def _next(
     grid: _Grid, level: Level, place: np.ndarray, robots: np.ndarray, left: list[int]
 ) -> list[Move] | None:
-    """Lets one robot arrive, which another may have to make way for."""
+    """Finds moves that let one robot arrive, if necessary past another that steps aside."""
     for robot in left:
         if (path := _arrive(grid, level, place, robots, robot)) is not None:
             return [Move(robot, path)]
@@ -105,7 +105,7 @@ def _pass(
     left: list[int],
     aside: Move,
 ) -> list[Move] | None:
-    """Lets another robot arrive past one that steps aside, and that can arrive after it."""
+    """Lets another robot arrive past one that steps aside, if that one can arrive later."""
     for other in left:
         if other == aside.robot:
             continue
@@ -122,7 +122,7 @@ def _pass(
 def _arrive(
     grid: _Grid, level: Level, place: np.ndarray, robots: np.ndarray, robot: int
 ) -> np.ndarray | None:
-    """Finds a robot's way to its target past all others where they are, [P, 2]."""
+    """Finds a robot's path to its target past all others in their places, [P, 2]."""
     free = _free(grid, place, robots, robot)
     away = np.linalg.norm(grid.place - level.target[robot], axis=-1)
     goal = free & (away <= grid.reach - _SPARE)
@@ -133,7 +133,7 @@ def _arrive(
 
 
 def _refuges(grid: _Grid, place: np.ndarray, robots: np.ndarray, robot: int) -> list[np.ndarray]:
-    """Lists ways of a robot to places that it can step aside to, the farthest from it first."""
+    """Lists paths of a robot to places where it can step aside, the farthest first."""
     free = _free(grid, place, robots, robot)
     near = _near(grid, free, place[robot])
     far = _spread(free, near, np.zeros_like(free))
@@ -158,7 +158,7 @@ def _grid(level: Level, hull: float, reach: float) -> _Grid:
 
 
 def _box_distance(place: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """Distance [...] of points [..., 2] from a turned rectangle [5]; 0 within, m."""
+    """Computes the distance [...] of points [..., 2] from a turned rectangle [5], m; 0 inside."""
     cos, sin = math.cos(box[2]), math.sin(box[2])
     x, y = place[..., 0] - box[0], place[..., 1] - box[1]
     across = np.abs(cos * x + sin * y) - box[3], np.abs(cos * y - sin * x) - box[4]
@@ -166,7 +166,7 @@ def _box_distance(place: np.ndarray, box: np.ndarray) -> np.ndarray:
 
 
 def _free(grid: _Grid, place: np.ndarray, robots: np.ndarray, robot: int) -> np.ndarray:
-    """Cells that neither the walls nor the other robots bar, [N, N]."""
+    """Returns the cells that neither walls nor other robots block, [N, N]."""
     free = grid.free.copy()
     for other in robots:
         if other != robot:
@@ -175,12 +175,12 @@ def _free(grid: _Grid, place: np.ndarray, robots: np.ndarray, robot: int) -> np.
 
 
 def _near(grid: _Grid, free: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Cells at which a robot can begin: those that are free and next to it, [N, N]."""
+    """Returns the free cells next to a robot, where its path can begin, [N, N]."""
     return free & (np.linalg.norm(grid.place - place, axis=-1) <= CELL)
 
 
 def _spread(free: np.ndarray, goal: np.ndarray, until: np.ndarray) -> np.ndarray:
-    """Counts steps from the nearest of the goals, [N, N], until a cell of `until` is met."""
+    """Counts steps from the nearest goal, [N, N], until it meets a cell of `until`."""
     far = np.where(goal, 0, _NEVER).astype(np.int32)
     edge, steps = goal, 0
     while edge.any() and not (far[until] < _NEVER).any():
@@ -195,7 +195,7 @@ def _spread(free: np.ndarray, goal: np.ndarray, until: np.ndarray) -> np.ndarray
 
 
 def _descend(grid: _Grid, far: np.ndarray, place: np.ndarray) -> np.ndarray | None:
-    """Follows the steps down from a robot's place to a goal, [P, 2]."""
+    """Follows decreasing steps from a robot's place to a goal, [P, 2]."""
     near = np.where(_near(grid, far < _NEVER, place), far, _NEVER)
     cell = np.unravel_index(int(np.argmin(near)), near.shape)
     if near[cell] == _NEVER:
@@ -205,7 +205,7 @@ def _descend(grid: _Grid, far: np.ndarray, place: np.ndarray) -> np.ndarray | No
 
 
 def _walk(far: np.ndarray, cell: tuple[int, ...], place: np.ndarray) -> list[np.ndarray]:
-    """Lists the places after a cell down to where `far` is 0."""
+    """Lists the places after a cell, down to where `far` is 0."""
     found = []
     while far[cell]:
         around = [(cell[0] + i, cell[1] + j) for i, j in _STEPS]
@@ -219,13 +219,13 @@ def check(level: Level, moves: list[Move], hull_radius: float, target_radius: fl
     """Tests a plan against the exact shapes.
 
     Args:
-        level: Of one arena.
+        level: Level of one arena.
         moves: The plan.
-        hull_radius: Of the robots, m.
-        target_radius: Within which they have arrived, m.
+        hull_radius: Radius of the robots, m.
+        target_radius: Radius within which a robot has arrived, m.
 
     Returns:
-        What is wrong with it; None if nothing is.
+        The plan's fault; None if there is none.
     """
     place = level.start[:, :2].astype(np.float64)
     robots = np.flatnonzero(level.present)
@@ -253,7 +253,7 @@ def check(level: Level, moves: list[Move], hull_radius: float, target_radius: fl
 
 
 def _between(path: np.ndarray) -> np.ndarray:
-    """Points [P, 2] along a path, 2 mm apart at most."""
+    """Returns points [P, 2] along a path, at most 2 mm apart."""
     parts = [path[:1]]
     for first, last in itertools.pairwise(path):
         count = max(1, math.ceil(float(np.linalg.norm(last - first)) / 0.002))

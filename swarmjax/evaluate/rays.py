@@ -1,4 +1,4 @@
-"""The judge's infrared rays: MuJoCo's own, cast on the real shapes. No JAX."""
+"""The judge's infrared rays: MuJoCo's rays, cast on the real shapes. No JAX."""
 
 from dataclasses import dataclass
 from typing import cast
@@ -17,14 +17,14 @@ _RAY_GROUPS = np.array([i not in (HULL_GROUP, FLOOR_GROUP) for i in range(6)], n
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RayScene:
-    """What rays are cast in.
+    """The scene that rays are cast in.
 
     Attributes:
-        model: One arena, compiled.
+        model: The compiled arena.
         ids: Rows of its moving bodies.
-        hull_radius: m.
-        side: Of the smallest arena, m.
-        reach: How far rays go, m.
+        hull_radius: Radius of the hulls, m.
+        side: Side of the smallest arena, m.
+        reach: Length of the rays, m.
     """
 
     model: mujoco.MjModel
@@ -41,23 +41,23 @@ def cast_rays(
     obstacle: np.ndarray,
     mount: infrared.Mount | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Casts the infrared sensors' rays by MuJoCo.
+    """Casts the infrared sensors' rays with MuJoCo.
 
-    A ray that starts inside something reads 0. MuJoCo reports where such a ray leaves, on a face
-    whose normal points along it; so of each sensor two rays are cast, ahead and back, and the
-    sensor is inside something if either of them leaves. Things overlap a little where robots
-    push, so that a single ray may enter a second thing before it leaves the first.
+    A ray that starts inside something reads 0. For such a ray MuJoCo reports where it leaves, on a
+    face whose normal points along the ray. So each sensor casts two rays, ahead and back, and is
+    inside something if either of them leaves. Pushing robots overlap a little, so a single ray may
+    enter a second thing before it leaves the first.
 
     Args:
-        scene: What rays are cast in.
-        data: [A] of `MjData`, positions up to date, each of a model whose boxes have its sizes.
+        scene: The scene.
+        data: [A] of `MjData`, positions up to date; each model's boxes have that arena's sizes.
         pose: [A, R, 3] x (m), y (m), yaw (rad).
         obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
-        mount: How far off the sensors sit.
+        mount: Deviations of the sensors' positions and directions.
 
     Returns:
-        [A, R, K] distance from the sensor's origin to the nearest surface, m, 0 to the reach of
-        the electronics; and the geom that is there, -1 where nothing is.
+        [A, R, K] distance from the sensor's origin to the nearest surface, m, from 0 to the reach
+        of the electronics; and the geom that the ray meets, -1 if none.
     """
     limit = scene.reach
     origin, direction = infrared.rays(pose, np, mount)
@@ -85,23 +85,23 @@ def cast_rays(
 def hidden(
     scene: RayScene, data: np.ndarray, pose: np.ndarray, obstacle: np.ndarray, reach: float
 ) -> np.ndarray:
-    """Tells by MuJoCo's rays whether a wall or a box is between two robots' centres.
+    """Tells whether a wall or a box is between two robots' centres, with MuJoCo's rays.
 
     Args:
-        scene: What rays are cast in.
-        data: [A] of `MjData`, positions up to date, each of a model whose boxes have its sizes.
+        scene: The scene.
+        data: [A] of `MjData`, positions up to date; each model's boxes have that arena's sizes.
         pose: [A, R, 3] x (m), y (m), yaw (rad).
         obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
-        reach: Farthest that two robots hear each other, m.
+        reach: Greatest distance at which two robots hear each other, m.
 
     Returns:
-        [A, R, R] bool; False of pairs beyond reach.
+        [A, R, R] bool; False for pairs beyond reach.
     """
     place, half = pose[..., :2], np.linalg.norm(obstacle[..., 3:], axis=-1)
     along = place[:, None] - place[:, :, None]
     distance = np.linalg.norm(along, axis=-1)
     middle = 0.5 * (place[:, None] + place[:, :, None])
-    # Circles about the line and the box: most pairs have no box that they need a ray for.
+    # Compares circles around the line and the box: most pairs need no ray for any box.
     near = _apart(middle, obstacle[..., :2]) <= half[:, None, None] + 0.5 * distance[..., None]
     asked = (distance <= reach) & np.triu(np.ones(distance.shape[1:], bool), 1)
     found = np.zeros(distance.shape, bool)
@@ -112,21 +112,21 @@ def hidden(
         frame = (where.geom_xpos[geom], where.geom_xmat[geom], where.model.geom_size[geom])
         kind = where.model.geom_type[geom]
         share = mujoco.mju_rayGeom(*frame, start, toward, kind)
-        # Beyond the far face is -1 too, and a start inside tells where the ray leaves.
+        # -1 means no hit. A line that starts inside a box gives the place where it leaves.
         found[arena, i, j] |= 0.0 <= share < 1.0
     return found | found.swapaxes(1, 2)
 
 
 def brightness(scene: RayScene, shades: infrared.Reflectance, geom: np.ndarray) -> np.ndarray:
-    """Tells how bright the geoms are that rays meet.
+    """Returns the brightness of the geoms that rays meet.
 
     Args:
-        scene: What rays are cast in.
-        shades: Of things, [A, ...].
-        geom: [A, R, K] as `cast_rays` found them.
+        scene: The scene.
+        shades: Reflectance of things, [A, ...].
+        geom: [A, R, K] from `cast_rays`.
 
     Returns:
-        [A, R, K] reflectance; 1 of nothing.
+        [A, R, K] reflectance; 1 where a ray meets nothing.
     """
     model, table = scene.model, np.ones((len(geom), scene.model.ngeom + 1))  # the last: nothing
     obstacles = scene.ids.obstacle_geom
@@ -143,15 +143,15 @@ def brightness(scene: RayScene, shades: infrared.Reflectance, geom: np.ndarray) 
 def _near(
     scene: RayScene, middle: np.ndarray, place: np.ndarray, obstacle: np.ndarray
 ) -> np.ndarray:
-    """Tells [A, R, K] whether a ray may meet anything, by circles about it and all things.
+    """Tells [A, R, K] whether a ray may meet anything, by circles around the ray and all things.
 
-    Casting a ray costs more than all else, and most have nothing to meet. The walls are taken to
-    stand where those of the stage's smallest arena do.
+    Casting rays is the slowest part, and most rays meet nothing. For the walls, the stage's
+    smallest arena is assumed.
 
     Args:
-        scene: What rays are cast in.
-        middle: [A, R, K, 2] of the rays, m.
-        place: [A, R, 2] of the robots, m.
+        scene: The scene.
+        middle: [A, R, K, 2] middles of the rays, m.
+        place: [A, R, 2] places of the robots, m.
         obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
@@ -168,6 +168,6 @@ def _near(
 
 
 def _apart(ray: np.ndarray, thing: np.ndarray) -> np.ndarray:
-    """Distances [A, R, K, N] from points [A, R, K, 2] to points [A, N, 2], m."""
+    """Computes distances [A, R, K, N] from points [A, R, K, 2] to points [A, N, 2], m."""
     offset = ray[..., None, :] - thing[:, None, None]
     return np.sqrt(np.einsum("...i,...i", offset, offset))

@@ -1,12 +1,12 @@
-"""Shortest ways of a robot's disc past obstacles: what path efficiency is measured by.
+"""Shortest paths of a robot's disc past obstacles, the reference for path efficiency.
 
-Where the straight line is free and ends inside the walls, it is the way. Elsewhere the way leads
-along the outlines of obstacles, widened by the disc's radius, whose round corners are replaced by
-`CORNER` points outside of them: that makes a way longer by 0.8 mm at most for each right angle that
-it turns (tan(x) / x - 1 = 1.3 % of a quarter circle of 0.037 m, x = 11.25 degrees). NumPy only.
+If the straight line is free and ends inside the walls, it is the path. Otherwise the path follows
+the outlines of obstacles, widened by the disc's radius. `CORNER` points outside each round corner
+replace the arc. They lengthen a path by at most 0.8 mm for each right angle that it turns (tan(x) /
+x - 1 = 1.3 % of a quarter circle of 0.037 m, x = 11.25 degrees). NumPy only.
 
-The robots of an arena share these points. Whether a line between two of them is free is found out
-once, and only if a way as short as the shortest may lead along it.
+The robots of an arena share these points. Each line between two points is tested at most once, and
+only if it could be part of a shortest path.
 """
 
 import math
@@ -15,22 +15,22 @@ from typing import NamedTuple
 import numpy as np
 
 CORNER = 4  # points for each round corner
-GOAL = 24  # points on the circle about a target, where the way straight to its centre is barred
-_SLACK = 1e-6  # m; what touches is not barred
+GOAL = 24  # points on the circle around a target, used if the straight way to its centre is blocked
+_SLACK = 1e-6  # m; touching does not block
 _SIGNS = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
-# Three numbers that change how long it takes, never what is found.
-_DETOUR = 1.1  # times the straight line: ways that are looked for first, the most common ones
-_NEAREST = 8  # boxes that lines from a point are held against first: among walls few lines get past
-_MANY = 1000  # pairs of a line and a box from which on that pays
+# These three numbers change the computing time, never the result.
+_DETOUR = 1.1  # times the straight line: paths up to this length are tried first; most are shorter
+_NEAREST = 8  # nearest boxes to test a line against first: few lines get past them among walls
+_MANY = 1000  # pairs of a line and a box above which this is faster
 
 
 class _Boxes(NamedTuple):
-    """Boxes of an arena, and how near the centre of the disc may come to them.
+    """The boxes of an arena, with the least distance of the disc's centre.
 
     Attributes:
         box: [M, 5] x (m), y (m), yaw (rad), half edges (m).
         half: [2, M] the half edges, m.
-        radius: Of the disc, less the slack, m.
+        radius: Radius of the disc, less the slack, m.
     """
 
     box: np.ndarray
@@ -39,13 +39,13 @@ class _Boxes(NamedTuple):
 
 
 class _Points(NamedTuple):
-    """Points of an arena, and where its boxes have them.
+    """Points of an arena, with their places relative to its boxes.
 
     Attributes:
         place: [V, 2] m.
         local: [2, V, M] x and y in the frames of the boxes, m.
-        beyond: [V, M] which sides of each widened box a point lies beyond, a bit each. No line
-            meets a box if both of its ends lie beyond the same side.
+        beyond: [V, M] the sides of each widened box that a point lies beyond, one bit for each
+            side. No line meets a box if both of its ends lie beyond the same side.
     """
 
     place: np.ndarray
@@ -54,7 +54,7 @@ class _Points(NamedTuple):
 
 
 class _Lines(NamedTuple):
-    """Straight lines, L of them, from rows [L] of the first points to rows [L] of the second."""
+    """L straight lines, from rows [L] of the first points to rows [L] of the second points."""
 
     first: _Points
     begin: np.ndarray
@@ -63,16 +63,16 @@ class _Lines(NamedTuple):
 
 
 class _Arena(NamedTuple):
-    """What the robots of an arena share.
+    """The data that the robots of an arena share.
 
     Attributes:
-        inside: Half edge of the square that the centre of the disc keeps to, m.
-        boxes: Those that are not far away.
-        outline: V points about the boxes, clear of all boxes and walls.
-        legs: [V, V] lengths of the straight lines between these points, m; inf where barred, NaN
-            where nobody has asked yet. `_are_free` fills it in.
-        part: [V] numbers, the same for points that are joined by free lines; -1 where nobody has
-            asked yet. `_divide` fills it in.
+        inside: Half edge of the square within which the disc's centre stays, m.
+        boxes: The boxes that are not far away.
+        outline: V points around the boxes, clear of all boxes and walls.
+        legs: [V, V] lengths of the straight lines between these points, m; inf if blocked, NaN if
+            not yet tested. `_are_free` fills it in.
+        part: [V] numbers, equal for points that free lines connect; -1 if not yet known. `_divide`
+            fills it in.
     """
 
     inside: float
@@ -90,18 +90,18 @@ def shortest(
     hull_radius: float,
     target_radius: float,
 ) -> np.ndarray:
-    """Finds the lengths of the shortest ways that robots could drive, each alone in its arena.
+    """Finds the lengths of the shortest paths of robots, each alone in its arena.
 
     Args:
-        side: [A] of the square arenas, m.
+        side: [A] sides of the square arenas, m.
         start: [A, R, 2] m.
         target: [A, R, 2] m.
         obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m); absent ones stand far away.
-        hull_radius: Of the disc, m.
-        target_radius: How near its centre must come to the target, m.
+        hull_radius: Radius of the disc, m.
+        target_radius: Required distance of its centre from the target, m.
 
     Returns:
-        [A, R] m; inf where there is no way at all.
+        [A, R] m; inf where there is no path.
     """
     start, target, obstacle = (np.asarray(x, np.float64) for x in (start, target, obstacle))
     offset = target - start
@@ -121,7 +121,7 @@ def shortest(
 
 
 def _arena(inside: float, obstacle: np.ndarray, hull: float) -> _Arena:
-    """Finds the points about obstacles [M, 5] that ways may lead through."""
+    """Finds the points around obstacles [M, 5] that paths may lead through."""
     nearest = np.abs(obstacle[:, :2]).max(axis=-1) - np.hypot(*obstacle[:, 3:].T)
     box = obstacle[nearest <= inside + hull]
     boxes = _Boxes(box, box[:, 3:].T, hull - _SLACK)
@@ -131,10 +131,11 @@ def _arena(inside: float, obstacle: np.ndarray, hull: float) -> _Arena:
 
 
 def _way(arena: _Arena, start: np.ndarray, target: np.ndarray, reach: float) -> float:
-    """Length of the shortest way of one robot, m.
+    """Computes the length of the shortest path of one robot, m.
 
-    A way of some length keeps to the ellipse of points from which start and target are that far
-    in all. So the points in a small ellipse will do, if they give a way that is no longer.
+    A path of a given length stays within an ellipse: the points whose distances to start and target
+    add up to at most that length. So the points in a small ellipse suffice if they give a path that
+    is no longer.
     """
     boxes, place = arena.boxes, arena.outline.place
     begin = _see(start[None], boxes)
@@ -154,7 +155,7 @@ def _way(arena: _Arena, start: np.ndarray, target: np.ndarray, reach: float) -> 
 def _is_joined(
     arena: _Arena, begin: _Points, circle: _Points, target: np.ndarray, reach: float
 ) -> bool:
-    """Whether any way leads from the start to the target: much less work than the shortest."""
+    """Tells whether any path leads from start to target; faster than finding the shortest."""
     _divide(arena)
     seen = arena.part[np.isfinite(_legs(arena.boxes, _fan(begin, arena.outline)))]
     points = _join(begin, _take(arena.outline, np.isin(arena.part, seen)))
@@ -165,14 +166,14 @@ def _is_joined(
 
 
 def _divide(arena: _Arena) -> None:
-    """Finds out which points of an arena are joined, unless that is known."""
+    """Finds which points of an arena are connected, unless that is known."""
     for first in range(len(arena.part)):
         if arena.part[first] < 0:
             _flood(arena, first)
 
 
 def _flood(arena: _Arena, first: int) -> None:
-    """Gives the number of a point to all that are joined with it."""
+    """Marks all points that are connected to a point with its number."""
     arena.part[first], waiting = first, [first]
     while waiting:
         here, others = waiting.pop(), np.flatnonzero(arena.part < 0)
@@ -189,7 +190,7 @@ def _way_through(
     target: np.ndarray,
     reach: float,
 ) -> float:
-    """Length of the shortest way through these rows [W] of the points of an arena, m."""
+    """Computes the length of the shortest path through the rows [W] of an arena's points, m."""
     boxes, some = arena.boxes, _take(arena.outline, rows)
     points = _join(begin, some)
     rest = np.maximum(np.linalg.norm(target - some.place, axis=-1) - reach, 0.0)
@@ -197,7 +198,7 @@ def _way_through(
     first = _legs(boxes, _fan(begin, some))
     length = np.concatenate([[0.0], _search(arena, rows, first, rest, last)])
     best = (length + last).min()
-    # The shortest way to the other points of the circle, from where the straight line is barred.
+    # Where the straight line is blocked, paths to the other points of the circle may be shortest.
     far = np.linalg.norm(points.place[:, None] - circle.place, axis=-1) + length[:, None]
     row, column = np.nonzero((far < best) & np.isinf(last)[:, None])
     around = length[row] + _legs(boxes, _Lines(points, row, circle, column))
@@ -205,7 +206,7 @@ def _way_through(
 
 
 def _straight(arena: _Arena, points: _Points, target: np.ndarray, reach: float) -> np.ndarray:
-    """Lengths [V] of the ways from points straight to a target, m; inf where barred."""
+    """Computes the lengths [V] of straight lines from points to a target, m; inf if blocked."""
     offset = target - points.place
     apart = np.linalg.norm(offset, axis=-1)
     share = np.maximum(apart - reach, 0.0) / np.maximum(apart, reach)
@@ -218,22 +219,22 @@ def _straight(arena: _Arena, points: _Points, target: np.ndarray, reach: float) 
 def _search(
     arena: _Arena, rows: np.ndarray, first: np.ndarray, rest: np.ndarray, last: np.ndarray
 ) -> np.ndarray:
-    """Lengths [W] of the shortest ways from the start to points of an arena, m.
+    """Computes the lengths [W] of the shortest paths from the start to points of an arena, m.
 
-    A* on the visibility graph: the algorithm of Dijkstra 1959, "A note on two problems in connexion
-    with graphs", which leaves out points that are too far away even if the way leads straight on
-    from there (Hart, Nilsson & Raphael 1968, "A formal basis for the heuristic determination of
+    This is A* on the visibility graph: the algorithm of Dijkstra 1959, "A note on two problems in
+    connexion with graphs". It leaves out points that are too far away even if a straight line led
+    on from there (Hart, Nilsson & Raphael 1968, "A formal basis for the heuristic determination of
     minimum cost paths").
 
     Args:
-        arena: Theirs; what is found out of the lines between its points is kept there.
-        rows: [W] of the points.
-        first: [W] straight from the start, inf where barred.
-        rest: [W] to the target at least.
-        last: [1 + W] straight to the target from the start and from the points, inf where barred.
+        arena: Arena of the points; it stores the results for the lines between them.
+        rows: [W] rows of the points.
+        first: [W] straight from the start, inf if blocked.
+        rest: [W] lower bounds of the distances to the target.
+        last: [1 + W] straight to the target from the start and from the points, inf if blocked.
 
     Returns:
-        The lengths. Those may be too long from where no way is shorter than the shortest found.
+        The lengths. A length may be too long if no path through its point is the shortest.
     """
     length, least, best = first.copy(), first + rest, last[0]
     place = arena.outline.place[rows]
@@ -249,7 +250,7 @@ def _search(
 
 
 def _are_free(arena: _Arena, point: int, others: np.ndarray) -> np.ndarray:
-    """Whether the straight lines from a point of an arena to others [L] are free."""
+    """Tells whether the straight lines from one point of an arena to others [L] are free."""
     new = others[np.isnan(arena.legs[point, others])]
     if new.size:
         one, some = _take(arena.outline, [point]), _take(arena.outline, new)
@@ -259,7 +260,7 @@ def _are_free(arena: _Arena, point: int, others: np.ndarray) -> np.ndarray:
 
 
 def _circle(target: np.ndarray, reach: float, inside: float) -> np.ndarray:
-    """Points [V, 2] around a target: `GOAL` of them, and those where the walls stop the disc."""
+    """Returns points [V, 2] around a target: `GOAL` points, and those where walls stop the disc."""
     angle = np.arange(GOAL) * (2.0 * math.pi / GOAL)
     around = [reach * np.stack([np.cos(angle), np.sin(angle)], axis=-1)]
     for axis, wall in ((axis, wall) for axis in (0, 1) for wall in (-inside, inside)):
@@ -272,13 +273,13 @@ def _circle(target: np.ndarray, reach: float, inside: float) -> np.ndarray:
 
 
 def _fan(one: _Points, others: _Points) -> _Lines:
-    """Lines from a single point [1] to others [L]."""
+    """Makes lines from a single point [1] to others [L]."""
     each = np.arange(len(others.place))
     return _Lines(one, np.zeros_like(each), others, each)
 
 
 def _legs(boxes: _Boxes, lines: _Lines) -> np.ndarray:
-    """Lengths [L] of straight lines, m; inf where barred."""
+    """Computes the lengths [L] of straight lines, m; inf if blocked."""
     first, begin, second, end = lines
     length = np.linalg.norm(second.place[end] - first.place[begin], axis=-1)
     near = (first.beyond[begin] & second.beyond[end]) == 0
@@ -292,7 +293,7 @@ def _legs(boxes: _Boxes, lines: _Lines) -> np.ndarray:
 
 
 def _nearest(boxes: _Boxes, points: _Points) -> np.ndarray:
-    """Which boxes are the nearest to points, [V, M]."""
+    """Returns the nearest boxes of each point, [V, M]."""
     x, y = np.maximum(np.abs(points.local) - boxes.half[:, None], 0.0)
     order = np.argpartition(x * x + y * y, _NEAREST, axis=-1)
     found = np.zeros(order.shape, bool)
@@ -301,7 +302,7 @@ def _nearest(boxes: _Boxes, points: _Points) -> np.ndarray:
 
 
 def _are_barred(boxes: _Boxes, lines: _Lines, pairs: np.ndarray) -> np.ndarray:
-    """Whether any of the boxes that each line is paired with [L, M] bars it, [L]."""
+    """Tells whether any of its paired boxes [L, M] blocks each line, [L]."""
     line, box = np.nonzero(pairs)
     start = lines.first.local[:, lines.begin[line], box]
     way = lines.second.local[:, lines.end[line], box] - start
@@ -311,7 +312,7 @@ def _are_barred(boxes: _Boxes, lines: _Lines, pairs: np.ndarray) -> np.ndarray:
 
 
 def _outlines(boxes: np.ndarray, hull: float) -> np.ndarray:
-    """Points [M, 4 * CORNER, 2] around boxes [M, 5], just outside their widened outlines."""
+    """Returns points [M, 4 * CORNER, 2] around boxes [M, 5], just outside the widened outlines."""
     half_step = 0.25 * math.pi / CORNER
     angle = (2.0 * np.arange(CORNER) + 1.0) * half_step
     turned = angle + 0.5 * math.pi * np.arange(4)[:, None]
@@ -323,7 +324,7 @@ def _outlines(boxes: np.ndarray, hull: float) -> np.ndarray:
 
 
 def _see(place: np.ndarray, boxes: _Boxes) -> _Points:
-    """Finds where boxes have points [V, 2]."""
+    """Computes the places of points [V, 2] relative to the boxes."""
     x, y = local = _into(place[:, None] - boxes.box[:, :2], boxes.box)
     length, width = boxes.half + boxes.radius
     sides = np.stack([x >= length, x <= -length, y >= width, y <= -width], axis=-1)
@@ -331,7 +332,7 @@ def _see(place: np.ndarray, boxes: _Boxes) -> _Points:
 
 
 def _free(points: _Points, boxes: _Boxes, inside: float) -> _Points:
-    """Keeps the points where the disc stands clear of boxes and walls."""
+    """Keeps the points where the disc is clear of boxes and walls."""
     x, y = np.maximum(np.abs(points.local) - boxes.half[:, None], 0.0)
     free = (x * x + y * y >= boxes.radius**2).all(axis=-1) & _within(points.place, inside)
     return _take(points, free)
@@ -343,26 +344,27 @@ def _take(points: _Points, rows: np.ndarray | list[int]) -> _Points:
 
 
 def _join(first: _Points, second: _Points) -> _Points:
-    """Puts points one after the other."""
+    """Concatenates points."""
     return _Points(*(np.concatenate(pair, axis=-2) for pair in zip(first, second, strict=True)))
 
 
 def _within(points: np.ndarray, inside: float | np.ndarray) -> np.ndarray:
-    """Whether [...] points [..., 2] lie in the square of half edge `inside`."""
+    """Tells whether points [..., 2] lie in the square of half edge `inside`, [...]."""
     return np.abs(points).max(axis=-1) <= inside + _SLACK
 
 
 def _barred(first: np.ndarray, second: np.ndarray, box: np.ndarray, hull: float) -> np.ndarray:
-    """Whether [...] boxes [..., 5] bar the straight ways of a disc between points [..., 2]."""
+    """Tells whether boxes [..., 5] block a disc's straight ways between points [..., 2], [...]."""
     start, way = _into(first - box[..., :2], box), _into(second - first, box)
     return _meets(start, way, np.moveaxis(box[..., 3:], -1, 0), hull - _SLACK)
 
 
 def _meets(start: np.ndarray, way: np.ndarray, half: np.ndarray, radius: float) -> np.ndarray:
-    """Whether lines from `start` by `way` [2, ...] come nearer than a radius to boxes about 0.
+    """Tells whether lines from `start` by `way` [2, ...] come nearer than a radius to boxes at 0.
 
-    They do where they enter the box of half edges [2, ...] widened by the radius: two boxes, each
-    longer by the radius at both ends of one axis, and a circle about each corner.
+    They do if they enter the box of half edges [2, ...] widened by the radius. That shape consists
+    of two boxes, each longer by the radius at both ends of one axis, and a circle around each
+    corner.
     """
     wide = half[:, None] + radius * np.eye(2).reshape(2, 2, *[1] * (half.ndim - 1))
     pace = np.where(np.abs(way) < 1e-12, 1e-12, way)[:, None]

@@ -1,12 +1,12 @@
-"""Point estimates and their intervals, with NumPy alone (of learning curves: `curves.py`).
+"""Point estimates and their intervals, with NumPy alone (`curves.py` has learning curves).
 
-What evaluation, benchmarks and studies report is worked out here, after Agarwal et al. 2021, "Deep
-Reinforcement Learning at the Edge of the Statistical Precipice": interquartile means (section 4.3)
-with percentile intervals of a bootstrap (section 4.1). Values are [runs, tasks]: a run is a seed
-of the training, a task is a level or a stage that its policy was judged on.
+Evaluation, benchmarks and studies compute their reported figures here, after Agarwal et al. 2021,
+"Deep Reinforcement Learning at the Edge of the Statistical Precipice": interquartile means (section
+4.3) with percentile intervals of a bootstrap (section 4.1). Values are [runs, tasks]: a run is a
+training seed, and a task is a level or a stage on which its policy was judged.
 
-A bootstrap draws anew, with replacement, what its interval speaks of; the rest is taken as given.
-Which draw fits depends on how the values came about:
+A bootstrap draws with replacement the part of the data that its interval is about, and takes the
+rest as given. The right draw depends on how the values were produced:
 
 =================  ==========================================  ==================================
 draw               each resample                               the interval is about
@@ -25,15 +25,15 @@ draw               each resample                               the interval is a
                                                                tasks
 =================  ==========================================  ==================================
 
-To draw apart what hangs together makes an interval too narrow: where all runs meet the same
-levels, a hard one is hard for all, and `tasks_per_run` would let that average out over the runs.
-The last two err on the wide side: they meet the spread of single values twice (Davison & Hinkley
-1997, "Bootstrap Methods and their Application", section 3.8; Owen 2007, "The pigeonhole
-bootstrap"), which matters little where tasks are many.
+Drawing dependent values independently makes an interval too narrow. For example, if all runs meet
+the same levels, a hard level is hard for all of them, but `tasks_per_run` would average that out
+over the runs. The last two draws err on the wide side, because they count the spread of single
+values twice (Davison & Hinkley 1997, "Bootstrap Methods and their Application", section 3.8; Owen
+2007, "The pigeonhole bootstrap"). This matters little if there are many tasks.
 
-Values may be inf, as the steps to a threshold are that was never reached. It sorts after every
-number, a mean with it is inf, and an end of an interval is inf where too many resamples are.
-Nothing here turns inf into nan; what would have to is refused, as are nan and -inf.
+Values may be inf, for example the steps to a threshold that was never reached. It sorts after every
+number. A mean that includes inf is inf, and an end of an interval is inf if too many resamples are.
+Nothing here turns inf into nan: calls that would have to are refused, and so are nan and -inf.
 """
 
 import math
@@ -44,14 +44,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 BLOCK = 2**20  # values resampled at once: 8 MiB, and a few times as much for their indices
-# Half of all resamples of two runs are one of them twice: the interval would just span the two.
+# Half of all resamples of two runs are one run twice: the interval would just span the two.
 LEAST_DRAWN = 3
 _LAST_TWO = (-2, -1)
 
 type RunDraw = Literal["runs_per_task", "runs"]
 type SharedDraw = Literal["tasks", "runs_and_tasks"]
 type Draw = RunDraw | SharedDraw | Literal["tasks_per_run", "runs_then_tasks"]
-# How runs and tasks are taken: kept as they are, drawn whole, or drawn for each of the other.
+# How a draw treats runs and tasks: keeps them, draws them whole, or draws them for each of the
+# other.
 _DRAWS = {
     "runs_per_task": ("each", "kept"),
     "runs": ("whole", "kept"),
@@ -63,7 +64,7 @@ _DRAWS = {
 
 
 class Statistic(Protocol):
-    """What a bootstrap can judge: `iqm`, `cvar`, `np.mean`, `np.median`, or a partial of such."""
+    """A statistic for a bootstrap: `iqm`, `cvar`, `np.mean`, `np.median`, or a partial of these."""
 
     def __call__(self, x: np.ndarray, /, *, axis: tuple[int, int]) -> Any:
         """Reduces two axes of x [..., runs, tasks]; returns [...]."""
@@ -85,20 +86,20 @@ class Interval[T](NamedTuple):
 
 
 def iqm(x: ArrayLike, axis: int | tuple[int, ...] | None = None) -> np.float64 | np.ndarray:
-    """Interquartile mean: what is left without the lowest and the highest quarter, in the mean.
+    """Computes the interquartile mean: the mean without the lowest and the highest quarter.
 
-    A quarter is rounded down to whole values, as in `scipy.stats.trim_mean(x, 0.25)`, which is
-    what rliable calls the IQM. Three values or fewer are thus not trimmed.
+    A quarter is rounded down to whole values, as in `scipy.stats.trim_mean(x, 0.25)`, which rliable
+    calls the IQM. Three values or fewer are therefore not trimmed.
 
     Args:
-      x: [...] of any unit; with inf in more than a quarter of it, the result is inf.
-      axis: to reduce, several as if they were one; None for all.
+      x: [...] of any unit; if more than a quarter of it is inf, the result is inf.
+      axis: axes to reduce, several as if they were one; None for all.
 
     Returns:
-      [...] without the axes, in the unit of x.
+      [...] without the reduced axes, in the unit of x.
 
     Raises:
-      ValueError: If x is empty, or holds nan or -inf.
+      ValueError: x is empty, or holds nan or -inf.
     """
     values = _flat(x, axis)
     count = values.shape[-1]
@@ -114,29 +115,29 @@ def cvar(
     *,
     lowest: bool = True,
 ) -> np.float64 | np.ndarray:
-    """Conditional value at risk: the mean of the worst share of the values.
+    """Computes the conditional value at risk: the mean of the worst share of the values.
 
-    Rockafellar & Uryasev 2000, "Optimization of conditional value-at-risk", of a sample whose
-    share is rounded up to whole values, so that it is never empty. It takes in the luck of each
-    value too: over levels that were tried once, it lies below that of the levels' expectations.
+    It follows Rockafellar & Uryasev 2000, "Optimization of conditional value-at-risk". The share is
+    rounded up to whole values, so it is never empty. The result includes the luck of each value:
+    over levels that were tried once, it is worse than over the levels' expected values.
 
     Args:
       x: [...] of any unit.
-      share: of the values, above 0 to 1.
-      axis: to reduce, several as if they were one; None for all.
-      lowest: whether low values are the bad ones; else high ones.
+      share: share of the values, above 0 and at most 1.
+      axis: axes to reduce, several as if they were one; None for all.
+      lowest: whether low values are the bad ones; otherwise high values are.
 
     Returns:
-      [...] without the axes, in the unit of x.
+      [...] without the reduced axes, in the unit of x.
 
     Raises:
-      ValueError: If share is out of range, or x is empty or holds nan or -inf.
+      ValueError: share is out of range, or x is empty or holds nan or -inf.
     """
     if not 0 < share <= 1:
         raise ValueError(f"share is {share}: give more than 0, to 1.")
     values = _flat(x, axis)
     count = values.shape[-1]
-    # Rounded first: 0.07 * 100 is 7.000000000000001, and no more than seven values.
+    # Rounded first: 0.07 * 100 is 7.000000000000001, but means seven values.
     worst = math.ceil(round(share * count, 9)) or 1
     if lowest:
         return np.partition(values, worst - 1, axis=-1)[..., :worst].mean(axis=-1)
@@ -153,29 +154,29 @@ def bootstrap(
     resamples: int = 2000,
     seed: int = 0,
 ) -> Interval[float]:
-    """Percentile interval of a statistic of [runs, tasks] (Efron & Tibshirani 1993, chapter 13).
+    """Computes a percentile interval of a statistic (Efron & Tibshirani 1993, chapter 13).
 
-    Drawn anew, with replacement, is what `draw` names; see the table at the top of the module.
+    `draw` names the part that is drawn with replacement; see the table at the top of the module.
 
-    With few runs the interval is too narrow: about the mean of 3, 5 or 10 normal values, one of
-    95 % holds the truth in 75, 84 or 90 % of cases. Its ends are statistics of resamples, the
-    outer one where a percentile falls between two.
+    With few runs the interval is too narrow: an interval of 95 % for the mean of 3, 5 or 10 normal
+    values holds the truth in 75, 84 or 90 % of cases. Its ends are statistics of resamples; if a
+    percentile falls between two resamples, the outer one is used.
 
     Args:
       values: [runs, tasks] of any unit, at least three of what is drawn.
       statistic: called as `statistic(x, axis=(-2, -1))` on x [..., runs, tasks].
-      draw: what is drawn, and so what the interval is about.
-      strata: numbers of tasks, in their order, among which tasks are drawn (Efron & Tibshirani
-        1993, section 8.3); None draws among all of them.
-      confidence: of the interval, above 0 and below 1.
-      resamples: how many, enough for one beyond either end of the interval.
-      seed: of the draws.
+      draw: the part to draw, and therefore what the interval is about.
+      strata: sizes of groups of consecutive tasks; tasks are drawn within each group (Efron &
+        Tibshirani 1993, section 8.3). None draws among all tasks.
+      confidence: confidence of the interval, above 0 and below 1.
+      resamples: number of resamples, enough for one beyond either end of the interval.
+      seed: seed of the draws.
 
     Returns:
       Estimate and interval, in the unit of the statistic.
 
     Raises:
-      ValueError: If any of these is refused, or the statistic gives nan or another shape.
+      ValueError: an argument is refused, or the statistic gives nan or another shape.
     """
     table = checked_table("values", values, draw)
     _check_resampling(confidence, resamples)
@@ -195,30 +196,30 @@ def paired(
     resamples: int = 2000,
     seed: int = 0,
 ) -> Interval[float]:
-    """Interval of how much larger a statistic of b is than that of a: b - a.
+    """Computes the interval of a difference: the statistic of b minus that of a.
 
-    Both are resampled by the same draws, so that what they share (a level, a policy) drops out
-    of the difference. Values are the same pair by the same place.
+    Both are resampled by the same draws, so that shared influences (a level, a policy) cancel in
+    the difference. Values at the same place form a pair.
 
     Args:
       a: [runs, tasks] of any unit, finite.
-      b: [runs, tasks] of the same, in the same order.
-      statistic: as of `bootstrap`.
-      draw: as of `bootstrap`.
-      strata: as of `bootstrap`.
-      confidence: as of `bootstrap`.
-      resamples: as of `bootstrap`.
-      seed: of the draws.
+      b: [runs, tasks] of the same unit, in the same order.
+      statistic: as in `bootstrap`.
+      draw: as in `bootstrap`.
+      strata: as in `bootstrap`.
+      confidence: as in `bootstrap`.
+      resamples: as in `bootstrap`.
+      seed: seed of the draws.
 
     Returns:
       Difference and interval, in the unit of the statistic.
 
     Raises:
-      ValueError: As of `bootstrap`, and if the shapes differ or a value is inf.
+      ValueError: as in `bootstrap`, and if the shapes differ or a value is inf.
     """
     before, after = checked_table("a", a, draw), checked_table("b", b, draw)
     if before.shape != after.shape:
-        raise ValueError(f"a is {before.shape} and b is {after.shape}: pairs take equal shapes.")
+        raise ValueError(f"a is {before.shape} and b is {after.shape}: give pairs of equal shapes.")
     for name, table in (("a", before), ("b", after)):
         if np.isinf(table).any():
             raise ValueError(
@@ -241,27 +242,27 @@ def probability_of_improvement(
     resamples: int = 2000,
     seed: int = 0,
 ) -> Interval[float]:
-    """Interval of how likely a run of a is to beat one of b: P(a > b) + P(a = b) / 2.
+    """Computes the interval of the probability that a beats b: P(a > b) + P(a = b) / 2.
 
-    Averaged over tasks. On each it is U / (n m) of the Mann-Whitney test, as in Agarwal et al.
-    2021, section 4.3; resamples of the runs of a and b are independent, tasks that are drawn are
-    the same for both. Only the order of values counts, so that inf is a value like any other.
-    Where small is good, exchange a and b.
+    The probability is averaged over tasks. On each task it is U / (n m) of the Mann-Whitney test,
+    as in Agarwal et al. 2021, section 4.3. The runs of a and b are resampled independently; drawn
+    tasks are the same for both. Only the order of values matters, so inf is a value like any other.
+    If small values are good, exchange a and b.
 
     Args:
       a: [n, tasks] of any unit, at least three of what is drawn.
-      b: [m, tasks] of the same.
-      draw: `runs_per_task`, `runs`, `tasks` or `runs_and_tasks`, as of `bootstrap`.
-      strata: as of `bootstrap`.
-      confidence: as of `bootstrap`.
-      resamples: as of `bootstrap`.
-      seed: of the draws.
+      b: [m, tasks] of the same unit.
+      draw: `runs_per_task`, `runs`, `tasks` or `runs_and_tasks`, as in `bootstrap`.
+      strata: as in `bootstrap`.
+      confidence: as in `bootstrap`.
+      resamples: as in `bootstrap`.
+      seed: seed of the draws.
 
     Returns:
       Probability and interval, 0 to 1.
 
     Raises:
-      ValueError: As of `bootstrap`, and if tasks differ in number or are drawn for each run.
+      ValueError: as in `bootstrap`, and if tasks differ in number or are drawn for each run.
     """
     if draw not in ("runs_per_task", "runs", "tasks", "runs_and_tasks"):
         raise ValueError(f"draw is '{draw}': give runs_per_task, runs, tasks or runs_and_tasks.")
@@ -276,14 +277,14 @@ def probability_of_improvement(
     for count in _blocks(resamples, wins.size):
         mine, tasks = _indices(random, draw, count, ours.shape, strata)
         other, _ = _indices(random, draw, count, theirs.shape, strata)
-        # Axes: resamples, runs of a, runs of b, tasks; one that is not drawn has one resample.
+        # Axes: resamples, runs of a, runs of b, tasks. An axis that is not drawn has one resample.
         found = wins[mine[..., :, None, :], other[..., None, :, :], _widen(tasks)]
         draws.append(found.mean(axis=(1, 2, 3)))
     return _interval(float(wins.mean()), np.concatenate(draws), confidence)
 
 
 def checked(name: str, x: ArrayLike) -> np.ndarray:
-    """Takes numbers in double precision; refuses none at all, nan and -inf."""
+    """Converts numbers to double precision; refuses empty arrays, nan and -inf."""
     values = np.asarray(x, np.float64)
     if not values.size:
         raise ValueError(f"{name} is empty: its shape is {values.shape}.")
@@ -295,7 +296,7 @@ def checked(name: str, x: ArrayLike) -> np.ndarray:
 
 
 def _flat(x: ArrayLike, axis: int | tuple[int, ...] | None) -> np.ndarray:
-    """Takes numbers, with the axes that are to be reduced as the last one."""
+    """Converts numbers, and merges the axes to reduce into a last one."""
     values = checked("x", x)
     if axis is None:
         return values.ravel()
@@ -305,7 +306,7 @@ def _flat(x: ArrayLike, axis: int | tuple[int, ...] | None) -> np.ndarray:
 
 
 def checked_table(name: str, x: ArrayLike, draw: str) -> np.ndarray:
-    """Takes numbers [runs, tasks]; refuses too few of what is to be drawn."""
+    """Converts numbers [runs, tasks]; refuses too few runs or tasks to draw from."""
     if draw not in _DRAWS:
         raise ValueError(f"draw is '{draw}': give one of {', '.join(_DRAWS)}.")
     values = checked(name, x)
@@ -322,13 +323,13 @@ def checked_table(name: str, x: ArrayLike, draw: str) -> np.ndarray:
 def _check_resampling(confidence: float, resamples: int) -> None:
     if not 0 < confidence < 1:
         raise ValueError(f"confidence is {confidence}: give more than 0 and less than 1.")
-    # The small number is for what rounding takes: 20 * (1 - 0.9) is 1.9999999999999996.
+    # The small number allows for rounding: 20 * (1 - 0.9) is 1.9999999999999996.
     if resamples * (1 - confidence) < 2 - 1e-9:
         raise ValueError(f"resamples is {resamples}: too few for confidence {confidence}.")
 
 
 def _blocks(resamples: int, cells: int) -> Iterator[int]:
-    """Splits resamples of so many values each into numbers of them that memory holds."""
+    """Splits resamples, with the given number of values each, into blocks that fit the memory."""
     block = max(1, BLOCK // cells)
     for first in range(0, resamples, block):
         yield min(block, resamples - first)
@@ -341,7 +342,7 @@ def _indices(
     shape: tuple[int, ...],
     strata: Sequence[int] | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draws where to take values [runs, tasks] from: two indices that fit [count, runs, tasks]."""
+    """Draws indices of values [runs, tasks]: two arrays that broadcast to [count, runs, tasks]."""
     by_run, by_task = _DRAWS[draw]
     runs, tasks = shape
     row, column = np.arange(runs)[:, None], np.arange(tasks)
@@ -355,7 +356,7 @@ def _indices(
 
 
 def _bounds(strata: Sequence[int] | None, tasks: int) -> tuple[Any, Any]:
-    """From where to where each of the tasks is drawn."""
+    """Returns the bounds of the group that each task is drawn from."""
     if strata is None:
         return 0, tasks
     ends = np.cumsum(strata)
@@ -371,7 +372,7 @@ def _check_strata(strata: Sequence[int] | None, tasks: int) -> None:
 
 
 def _widen(tasks: np.ndarray) -> np.ndarray:
-    """Gives indices of tasks [tasks] or [count, 1, tasks] an axis for the runs of another table."""
+    """Adds an axis for another table's runs to indices of tasks [tasks] or [count, 1, tasks]."""
     return tasks if tasks.ndim == 1 else tasks[:, :, None]
 
 
@@ -383,7 +384,7 @@ def _distributions(
     seed: int,
     strata: Sequence[int] | None = None,
 ) -> np.ndarray:
-    """Statistics [tables, resamples] of tables of one shape, resampled by the same draws."""
+    """Computes statistics [tables, resamples] of tables of one shape, resampled alike."""
     random = np.random.default_rng(seed)
     found = []
     for count in _blocks(resamples, tables[0].size):
@@ -393,19 +394,19 @@ def _distributions(
 
 
 def _apply(statistic: Statistic, x: np.ndarray) -> np.ndarray:
-    """Statistics [...] of x [..., runs, tasks]."""
+    """Computes statistics [...] of x [..., runs, tasks]."""
     found = np.asarray(statistic(x, axis=_LAST_TWO))
     if found.shape != x.shape[:-2]:
         raise ValueError(f"statistic of {x.shape} has shape {found.shape}: give {x.shape[:-2]}.")
     if np.isnan(found).any():
-        raise ValueError("statistic gives nan of values that hold none.")
+        raise ValueError("statistic gives nan for values without nan.")
     return found
 
 
 def _interval(estimate: float, draws: np.ndarray, confidence: float) -> Interval[float]:
-    """Percentile interval of draws [resamples].
+    """Computes the percentile interval of draws [resamples].
 
-    Its ends are draws, rather than mixtures of two, which between inf and inf are nan.
+    Its ends are draws. Mixtures of two draws would be nan between inf and inf.
     """
     last = len(draws) - 1
     low = math.floor((1 - confidence) / 2 * last)

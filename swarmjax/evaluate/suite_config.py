@@ -13,14 +13,14 @@ from swarmjax.task import stage_files
 from swarmjax.task.shapes import Shape
 from swarmjax.task.stage_config import StageConfig, complete
 
-# Seeds of a suite's levels begin here, so that none is drawn by hand, or by a benchmark, which
-# take small ones. Training draws from another generator altogether, JAX's.
+# Seeds of a suite's levels begin here. People and benchmarks choose small seeds, so they draw other
+# levels. Training uses another generator altogether, JAX's.
 SUITE_SEED = 1_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class CellConfig(Section):
-    """Levels of one kind that a suite judges policies on."""
+    """Levels of one kind in a suite."""
 
     name: str = field(metadata=about("of the cell"))
     stage: StageConfig
@@ -28,18 +28,18 @@ class CellConfig(Section):
     seed: int = field(metadata=about("of the levels", SUITE_SEED, MAX_COUNT))
     episodes: tuple[int, ...] = field(
         default=(),
-        metadata=about("numbers of the levels; none: from 0 on, as many as levels", 0, MAX_COUNT),
+        metadata=about("numbers of the levels; none: 0 to levels - 1", 0, MAX_COUNT),
     )
     realism: Literal["ideal", "webots", "real"] | None = field(
-        default=None, metadata=about("preset; null: that of the command")
+        default=None, metadata=about("preset; null: the command's")
     )
     steps: int | None = field(
         default=None,
-        metadata=about("control steps of an episode; null: those of the command", 1, MOST_STEPS),
+        metadata=about("control steps of an episode; null: the command's", 1, MOST_STEPS),
     )
     hull_friction: float | None = field(
         default=None,
-        metadata=about("of the robots; null: that of the command", 0.0, MOST_HULL_FRICTION),
+        metadata=about("of the robots; null: the command's", 0.0, MOST_HULL_FRICTION),
     )
     shape: Shape = field(default="box", metadata=about("of the obstacles"))
     digest: str | None = field(
@@ -56,7 +56,9 @@ class CellConfig(Section):
         if len(set(self.episodes)) != len(self.episodes):
             raise ConfigError("episodes holds a number twice: give each once.")
         if self.hull_friction is not None:
-            build(RobotConfig, {"hull_friction": self.hull_friction})  # has a least one, too
+            build(
+                RobotConfig, {"hull_friction": self.hull_friction}
+            )  # which also has a lower bound
         if self.digest is not None and not re.fullmatch(r"[0-9a-f]{64}", self.digest):
             raise ConfigError(f"digest is {show(self.digest)}: give 64 hexadecimal digits.")
         if self.shape != "box" and self.stage.level == "fixed":
@@ -67,9 +69,9 @@ class CellConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteFileConfig(Section):
-    """A suite: levels to judge policies on, never trained on."""
+    """A suite: levels for judging policies, never for training."""
 
-    name: str = field(metadata=about("of the suite, that of its file"))
+    name: str = field(metadata=about("of the suite, equal to its file's"))
     cells: tuple[CellConfig, ...]
 
     def _check(self) -> None:
@@ -82,13 +84,13 @@ class SuiteFileConfig(Section):
 
 
 def read_suite(choice: str) -> SuiteFileConfig:
-    """Read the file of a suite.
+    """Reads the file of a suite.
 
     Args:
-        choice: a name of configs/suites/, or the path of a .yaml file.
+        choice: A name in configs/suites/, or the path of a .yaml file.
 
     Raises:
-        ConfigError: there is no such file, or it is unsound.
+        ConfigError: There is no such file, or it is unsound.
     """
     path = files.suite_path(choice)
     mapping = files.read_yaml(path)
@@ -102,7 +104,7 @@ def read_suite(choice: str) -> SuiteFileConfig:
 
 
 def _cell(cell: Any) -> Any:
-    """Give a cell of a suite's file the numbers of the stage that it names."""
+    """Fills in the numbers of the stage that a cell names."""
     stage = cell.get("stage") if isinstance(cell, Mapping) else None
     if isinstance(stage, str):
         return {**cell, "stage": stage_files.pick_one(stage_files.read_stage(stage), stage)}

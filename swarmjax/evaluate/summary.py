@@ -1,4 +1,4 @@
-"""Sums an evaluation up: means, interquartile means, worst levels, each with its interval."""
+"""Summarises an evaluation: means, interquartile means, worst levels, each with its interval."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -17,20 +17,20 @@ from swarmjax.evaluate.measures import MEASURES, Measure
 from swarmjax.evaluate.statistics import LEAST_DRAWN, Interval, SharedDraw, Statistic
 from swarmjax.evaluate.trials import Entrant, Trial, specialise
 
-WORST = 0.05  # share of the levels that CVaR is the mean of
+WORST = 0.05  # share of the levels that CVaR averages
 Found = Mapping[str, np.ndarray]
 
 
 def result(
     config: EvaluateConfig, suite: str | None, entrants: Sequence[Entrant], trials: Sequence[Trial]
 ) -> dict[str, Any]:
-    """Puts everything that an evaluation found into plain data for JSON.
+    """Collects all findings of an evaluation as plain data for JSON.
 
     Args:
-        config: Of the evaluation.
+        config: Settings of the evaluation.
         suite: Its name, or None.
         entrants: Policies of one recipe.
-        trials: What they came to, a cell each.
+        trials: Their results, one for each cell.
 
     Returns:
         The result; docs/interface.md lists it.
@@ -51,13 +51,13 @@ def comparison(
     entrants: tuple[Sequence[Entrant], Sequence[Entrant]],
     trials: tuple[Sequence[Trial], Sequence[Trial]],
 ) -> dict[str, Any]:
-    """Puts a comparison of two recipes on the same levels into plain data for JSON.
+    """Collects a comparison of two recipes on the same levels as plain data for JSON.
 
     Args:
-        config: Of the evaluation.
+        config: Settings of the evaluation.
         suite: Its name, or None.
-        entrants: Policies of the first and of the second.
-        trials: What they came to, a cell each.
+        entrants: Policies of the first and of the second recipe.
+        trials: Their results, one for each cell.
 
     Returns:
         The result; docs/interface.md lists it.
@@ -90,11 +90,11 @@ def _about(config: EvaluateConfig, suite: str | None) -> dict[str, Any]:
 
 
 def about_cell(config: EvaluateConfig, trial: Trial) -> dict[str, Any]:
-    """Says which levels a trial was on, and how many of them nobody could solve.
+    """Describes the levels of a trial, and counts those that no robot could solve.
 
     Args:
-        config: Of the evaluation.
-        trial: On one cell.
+        config: Settings of the evaluation.
+        trial: Trial on one cell.
 
     Returns:
         Plain data for JSON.
@@ -115,15 +115,15 @@ def about_cell(config: EvaluateConfig, trial: Trial) -> dict[str, Any]:
 
 
 def summarize(found: Found, strata: Sequence[int] | None = None) -> dict[str, dict[str, Any]]:
-    """Sums measures up.
+    """Summarises measures.
 
     Args:
-        found: [P, E] of each measure: policies of one recipe on the same levels.
-        strata: Numbers of levels, in their order, that stay together when levels are drawn anew.
+        found: [P, E] of each measure, from policies of one recipe on the same levels.
+        strata: Sizes of groups of consecutive levels; levels are drawn within each group.
 
     Returns:
-        Of each measure `mean`, `iqm` and `cvar` (mean over the worst 5 % of the levels and
-        policies), each with `_interval`, null where there is too little for one.
+        For each measure `mean`, `iqm` and `cvar` (mean over the worst 5 % of the levels and
+        policies), each with `_interval`, null if there are too few values for one.
     """
     return {name: _summary(table, MEASURES[name], strata) for name, table in found.items()}
 
@@ -145,25 +145,25 @@ def _summary(table: np.ndarray, measure: Measure, strata: Sequence[int] | None) 
 
 
 def _are_enough(table: np.ndarray, strata: Sequence[int] | None) -> bool:
-    """Whether levels [P, E] can be drawn anew: of a stratum of one nothing would spread."""
+    """Tells whether levels [P, E] can be drawn: a group of one level has no spread."""
     return min(strata or [table.shape[1]]) >= LEAST_DRAWN
 
 
 def _draw(table: np.ndarray) -> SharedDraw:
-    """What is drawn anew: all policies meet the same levels; of few, these policies are meant."""
+    """Chooses what to draw. Policies share their levels; few policies are not drawn themselves."""
     return "runs_and_tasks" if len(table) >= LEAST_DRAWN else "tasks"
 
 
 def _join(found: Sequence[Found]) -> dict[str, np.ndarray]:
-    """Puts the levels of all cells side by side, of measures that all of them have."""
+    """Joins the levels of all cells, for measures that all cells have."""
     return {name: np.concatenate([each[name] for each in found], axis=1) for name in found[0]}
 
 
 def _pool(*sides: Sequence[Trial]) -> dict[str, Any] | None:
-    """Sums the levels of all cells up together, of one side or of two that are compared.
+    """Summarises the levels of all cells together, of one side or of two for a comparison.
 
-    None of one cell, and where cells share levels: their figures are not independent, as intervals
-    of levels drawn in each cell by itself would have it.
+    Returns None for a single cell, and if cells share levels. Their figures are then not
+    independent, but the intervals draw the levels of each cell independently.
     """
     cells = [trial.cell for trial in sides[0]]
     if len(cells) < 2 or any(_share(*pair) for pair in combinations(cells, 2)):
@@ -176,7 +176,7 @@ def _pool(*sides: Sequence[Trial]) -> dict[str, Any] | None:
 
 
 def _share(a: Cell, b: Cell) -> bool:
-    """Whether cells have a level in common, whatever its obstacles' shape and the realism are."""
+    """Tells whether cells share a level, apart from the obstacles' shape and the realism."""
     alike = a.seed == b.seed and replace(a.stage, name=b.stage.name) == b.stage
     return alike and bool(np.isin(a.episodes, b.episodes).any())
 
@@ -185,14 +185,14 @@ def compare(a: Found, b: Found, strata: Sequence[int] | None = None) -> dict[str
     """Compares two recipes level by level.
 
     Args:
-        a: [P, E] of each measure of the first.
-        b: [P, E] of the second, on the same levels; the same row is the same seed.
-        strata: As of `summarize`.
+        a: [P, E] of each measure of the first recipe.
+        b: [P, E] of the second recipe, on the same levels; the same row is the same seed.
+        strata: As in `summarize`.
 
     Returns:
-        Of each measure that both have: the means `a` and `b`, `difference` of the means and
-        `difference_iqm` of the interquartile means (b - a), and `improvement`, how likely b is the
-        better one on a level; each of the last three with `_interval`.
+        For each measure that both have: the means `a` and `b`, `difference` of the means and
+        `difference_iqm` of the interquartile means (b - a), and `improvement`, the probability that
+        b is better on a level. The last three each have `_interval`.
     """
     return {name: _comparison(name, a[name], b[name], strata) for name in a if name in b}
 

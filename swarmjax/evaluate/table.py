@@ -1,4 +1,4 @@
-"""An evaluation as tables for a terminal, and level by level as CSV."""
+"""Tables of an evaluation, for a terminal and, level by level, as CSV."""
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,10 +13,10 @@ from swarmjax.config import ConfigError
 from swarmjax.evaluate.measures import MEASURES, Measure
 from swarmjax.evaluate.trials import Entrant, Trial
 
-PLAIN_WIDTH = 160  # columns of a table that goes to a file
+PLAIN_WIDTH = 160  # columns of a table in a file
 
-# What a table of several cells has room for: its heading, the measure, the statistic, and whether
-# its interval is shown.
+# Columns of a table with several cells: heading, measure, statistic, and whether to show the
+# interval.
 _COLUMNS = (
     ("targets, %", "targets_reached", "mean", True),
     ("worst 5 %", "targets_reached", "cvar", False),
@@ -30,11 +30,11 @@ _COLUMNS = (
 
 
 def show(console: Console, result: Mapping[str, Any]) -> None:
-    """Prints a result, plain where it is not for a terminal.
+    """Prints a result; without styles unless the output is a terminal.
 
     Args:
-        console: To print on.
-        result: As `summary` makes it, of policies or of a comparison.
+        console: Console to print on.
+        result: Result of `summary`, for policies or for a comparison.
     """
     cells = result["cells"]
     sides = result.get("compared", [result.get("policies")])
@@ -78,7 +78,7 @@ def _table(console: Console, *heads: str) -> Table:
 
 
 def _show_cell(console: Console, cell: Mapping[str, Any]) -> None:
-    """One cell: a row for each measure."""
+    """Prints one cell: a row for each measure."""
     table = _table(console, "", "mean", "95 %", "IQM", "95 %", "worst 5 %")
     for name, found in cell["measures"].items():
         measure = MEASURES[name]
@@ -89,7 +89,7 @@ def _show_cell(console: Console, cell: Mapping[str, Any]) -> None:
 
 
 def _show_cells(console: Console, result: Mapping[str, Any]) -> None:
-    """Several cells: a row for each, and one for all if they can be pooled."""
+    """Prints several cells: a row for each, and one for all if they can be pooled."""
     table = _table(console, "", "levels", *(column[0] for column in _COLUMNS))
     pooled = [] if result["pooled"] is None else [{"cell": "all", **result["pooled"]}]
     for cell in (*result["cells"], *pooled):
@@ -105,7 +105,7 @@ def _shown(found: Mapping[str, Any], name: str, key: str, with_ends: bool) -> st
 
 
 def _show_comparison(console: Console, cell: Mapping[str, Any]) -> None:
-    """One cell of a comparison: a row for each measure."""
+    """Prints one cell of a comparison: a row for each measure."""
     heads = ("a", "b", "b - a", "95 %", "b better, %", "95 %")
     table = _table(console, f"{cell['cell']}, {cell['episodes']:,} levels", *heads)
     for name, found in cell["measures"].items():
@@ -142,12 +142,12 @@ def write_levels(path: Path, entrants: Sequence[Entrant], trials: Sequence[Trial
     """Writes a row for each policy and level.
 
     Args:
-        path: Of the CSV file.
+        path: Path of the CSV file.
         entrants: The policies, in the order of the trials' rows.
-        trials: What they came to, a cell each.
+        trials: Their results, one for each cell.
 
     Raises:
-        ConfigError: If it cannot be written.
+        ConfigError: The file cannot be written.
     """
     names = [name for name in MEASURES if name in trials[0].found]
     try:

@@ -1,4 +1,4 @@
-"""Runs evaluations: cells times policies, split over processes, or by the engine that trains."""
+"""Runs evaluations: cells times policies, split over processes, or in the training engine."""
 
 import math
 import os
@@ -24,23 +24,23 @@ from swarmjax.policy import Policy
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.level import Level
 
-BATCH = 64  # arenas that share NumPy's cost per call; more gain little
+BATCH = 64  # arenas that share NumPy's cost per call; larger batches gain little
 
 
 class Entrant(NamedTuple):
-    """A policy that is judged, and the path of its file."""
+    """A policy to judge, and the path of its file."""
 
     path: str
     policy: Policy
 
 
 class Trial(NamedTuple):
-    """What became of policies on the levels of a cell.
+    """The results of policies on the levels of a cell.
 
     Attributes:
-        cell: The levels, E of them.
-        shortest: [E, R] lengths of the shortest ways, m; inf where a target cannot be reached.
-        found: [P, E] of each measure that the engine tells.
+        cell: Cell with E levels.
+        shortest: [E, R] lengths of the shortest paths, m; inf if a target cannot be reached.
+        found: [P, E] of each measure that the engine computes.
         arrival: [P, E, R] when robots arrived, s; inf if they did not.
     """
 
@@ -51,7 +51,7 @@ class Trial(NamedTuple):
 
 
 class _Job(NamedTuple):
-    """Levels that one process runs by one policy, and whether it also finds their ways."""
+    """Levels for one process and one policy, and whether the process also finds the paths."""
 
     config: EvaluateConfig
     policy: Policy
@@ -60,7 +60,7 @@ class _Job(NamedTuple):
     find_ways: bool
 
 
-# The row of a cell, what each policy came to on it, and the lengths of its shortest ways.
+# The row of a cell, the outcome of each policy on it, and the lengths of its shortest paths.
 type _Result = tuple[int, list[Outcome], np.ndarray]
 
 
@@ -69,10 +69,10 @@ def read_policies(files: Sequence[str], extensions: str | None = None) -> list[E
 
     Args:
         files: Their paths.
-        extensions: As the key of that name.
+        extensions: Value of the key with that name.
 
     Raises:
-        PolicyError: If one of them is unsound.
+        PolicyError: A file is unsound.
     """
     return [Entrant(file, policy_file.read(file, extensions)) for file in files]
 
@@ -86,17 +86,17 @@ def run(
     """Judges policies on cells.
 
     Args:
-        config: Of the evaluation.
-        cells: Whose levels they are.
+        config: Settings of the evaluation.
+        cells: Cells with the levels.
         entrants: The policies.
-        report: Told how many more episodes are over, now and then.
+        report: Called from time to time with the number of episodes finished since the last call.
 
     Returns:
-        One for each cell.
+        A trial for each cell.
 
     Raises:
-        PolicyError: If a policy does not fit a cell.
-        ConfigError: If the physics breaks down.
+        PolicyError: A policy does not fit a cell.
+        ConfigError: The physics breaks down.
     """
     found = dict(run_each(config, cells, entrants, report))
     return [found[row] for row in range(len(cells))]
@@ -108,41 +108,41 @@ def run_each(
     entrants: Sequence[Entrant],
     report: Callable[[int], None] = lambda _: None,
 ) -> Iterator[tuple[int, Trial]]:
-    """Judges policies on cells, as `run`, and yields each trial as soon as it is over.
+    """Judges policies on cells as `run` does, and yields each trial as soon as it is finished.
 
     Args:
-        config: Of the evaluation.
-        cells: Whose levels they are.
+        config: Settings of the evaluation.
+        cells: Cells with the levels.
         entrants: The policies.
-        report: Told how many more episodes are over, now and then.
+        report: Called from time to time with the number of episodes finished since the last call.
 
     Yields:
-        The row of a cell, and what became of the policies on it.
+        The row of a cell, and the results of the policies on it.
 
     Raises:
-        PolicyError: If a policy does not fit a cell.
-        ConfigError: If the physics breaks down.
+        PolicyError: A policy does not fit a cell.
+        ConfigError: The physics breaks down.
     """
     for cell in cells:
         for each in entrants:
             evaluate_judge.check_policy(config, cell.stage, *each)
-    configs = [specialise(config, cell) for cell in cells]  # all are sound before the first runs
+    configs = [specialise(config, cell) for cell in cells]  # checks all before the first runs
     play = _by_mjx if config.engine == "mjx" else _by_c
     for row, outcomes, shortest in play(config, cells, entrants, report):
         yield row, _try(configs[row], cells[row], outcomes, shortest)
 
 
 def specialise(config: EvaluateConfig, cell: Cell, path: str | None = None) -> EvaluateConfig:
-    """Makes the configuration of one cell, and of one policy.
+    """Makes the settings for one cell, and for one policy.
 
     Args:
-        config: Of the evaluation.
-        cell: Its stage, shape and seed are taken, its realism and friction of hulls if it has them,
-            and its step limit if it has one and the configuration has none.
-        path: Of the policy.
+        config: Settings of the evaluation.
+        cell: Cell that sets the stage, shape and seed. It also sets the realism and the hulls'
+            friction if it has them, and the step limit if it has one and `config` has none.
+        path: Path of the policy.
 
     Returns:
-        The configuration.
+        The settings.
     """
     realism = config.realism
     if cell.realism is not None:
@@ -169,7 +169,7 @@ def specialise(config: EvaluateConfig, cell: Cell, path: str | None = None) -> E
 def _try(
     config: EvaluateConfig, cell: Cell, outcomes: Sequence[Outcome], shortest: np.ndarray
 ) -> Trial:
-    """Puts what policies came to on a cell together."""
+    """Builds a trial from the policies' outcomes on a cell."""
     second = config.task.control_step
     rows = [measures.per_level(each, second, config.step_limit, shortest) for each in outcomes]
     arrival = [np.where(each.arrived, each.arrival * second, np.inf) for each in outcomes]
@@ -183,9 +183,9 @@ def _by_mjx(
     entrants: Sequence[Entrant],
     report: Callable[[int], None],
 ) -> Iterator[_Result]:
-    """Runs each cell at once by the engine that trains."""
+    """Runs each cell at once in the training engine."""
     from swarmjax.evaluate import engine_mjx
-    from swarmjax.run import compile_cache  # those that need JAX
+    from swarmjax.run import compile_cache  # these modules need JAX
 
     for row, cell in enumerate(cells):
         mine, outcomes = specialise(config, cell, entrants[0].path), []
@@ -210,7 +210,7 @@ def _by_c(
     entrants: Sequence[Entrant],
     report: Callable[[int], None],
 ) -> Iterator[_Result]:
-    """Runs all episodes in batches, by as many processes as are useful."""
+    """Runs all episodes in batches, in as many processes as are useful."""
     workers = config.workers or provenance.cores()
     jobs = [
         (row, job)
@@ -233,7 +233,7 @@ def _by_c(
 def _put_together(
     parts: Sequence[tuple[Outcome, np.ndarray | None]], policies: int
 ) -> tuple[list[Outcome], np.ndarray]:
-    """Puts the batches of a cell together, those of the first policy first."""
+    """Joins the batches of a cell, policy by policy."""
     size = len(parts) // policies
     outcomes = [outcome for outcome, _ in parts]
     found = [outcomes[first : first + size] for first in range(0, len(parts), size)]
@@ -256,12 +256,12 @@ def _jobs(
 def work[Job, Result](
     function: Callable[[Job], Result], jobs: Sequence[Job], workers: int
 ) -> Iterator[Result]:
-    """Does jobs, yielding what comes of them in their order.
+    """Runs jobs in order, and yields their results in the same order.
 
     Args:
-        function: Of a module, so that other processes find it.
-        jobs: What it takes.
-        workers: Processes; with one there is no other than this.
+        function: Function of a module, so that other processes find it.
+        jobs: Its arguments.
+        workers: Number of processes; 1 means this process alone.
     """
     if workers == 1:
         yield from map(function, jobs)
@@ -273,12 +273,12 @@ def work[Job, Result](
 def work_each[Job, Result](
     function: Callable[[Job], Result], jobs: Sequence[Job], workers: int
 ) -> Iterator[tuple[int, Result]]:
-    """Does jobs, yielding the number of each with what came of it as soon as it is done.
+    """Runs jobs, and yields the number and the result of each as soon as it is done.
 
     Args:
-        function: Of a module, so that other processes find it.
-        jobs: What it takes; they are begun in their order.
-        workers: Processes; with one there is no other than this.
+        function: Function of a module, so that other processes find it.
+        jobs: Its arguments; they are begun in order.
+        workers: Number of processes; 1 means this process alone.
     """
     if workers <= 1:
         yield from enumerate(map(function, jobs))
@@ -294,17 +294,17 @@ def work_each[Job, Result](
 
 def _begin_worker() -> None:
     """Prepares a process that judges."""
-    # Ctrl-C ends it at once and without a word; its parent says what happened.
+    # Ctrl-C ends the process at once and silently; its parent prints the message.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    # Pieces of extensions run on JAX; on a GPU each process would take most of its memory.
+    # Extensions run on JAX. On a GPU, each process would reserve most of its memory.
     os.environ["JAX_PLATFORMS"] = "cpu"
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """Ends this process when its parent dies, which would otherwise leave it running."""
+    """Ends this process when its parent dies; otherwise it would go on running."""
     parent = parent_process()
-    assert parent is not None  # this one was spawned
+    assert parent is not None  # this process was spawned
     parent.join()
     os._exit(1)
 
@@ -316,14 +316,14 @@ def _simulate(job: _Job) -> tuple[Outcome, np.ndarray | None]:
 
 
 def ways(config: EvaluateConfig, levels: Level) -> np.ndarray:
-    """Finds the lengths of the shortest ways from starts to targets.
+    """Finds the lengths of the shortest paths from starts to targets.
 
     Args:
-        config: Read for the radii of robots and targets.
+        config: Settings with the radii of robots and targets.
         levels: [E].
 
     Returns:
-        [E, R] m; inf where there is no way, whoever drives.
+        [E, R] m; inf where there is no path for any robot.
     """
     start, hull, reach = levels.start[..., :2], config.robot.hull_radius, config.task.target_radius
     return shortest_path.shortest(levels.side, start, levels.target, levels.obstacle, hull, reach)

@@ -1,7 +1,8 @@
-"""What an evaluation has found so far, a file for each cell, kept until its result is written.
+"""The finished cells of an evaluation, a file for each, kept until the result is written.
 
-The files lie in a folder in that of the result, with `evaluation.json`, which says what is judged.
-The same command goes on from them; another one is refused, so that no hours are lost by a slip.
+The files lie in a folder inside the result's folder, with `evaluation.json`, which describes the
+evaluation. The same command resumes from them. Another command is refused, so that a slip does not
+lose hours of work.
 """
 
 import hashlib
@@ -22,13 +23,13 @@ from swarmjax.evaluate.trials import Entrant, Trial, specialise
 
 _NAME = "unfinished"
 _ABOUT = "evaluation.json"
-# Keys that say where files are and how many processes work, which changes no figure. Of files that
-# count, digests are compared.
+# Keys for places of files and numbers of processes, which change no figure. For files that matter,
+# digests are compared.
 _ELSEWHERE = ("policy", "compare", "suite", "out", "workers", "extensions")
 
 
 def place(out: Path) -> Path:
-    """Says where what is unfinished of a result lies.
+    """Returns the folder for a result's finished cells.
 
     Args:
         out: Folder of the result, or its file .json.
@@ -39,10 +40,10 @@ def place(out: Path) -> Path:
 def about(
     config: EvaluateConfig, cells: Sequence[Cell], entrants: Sequence[Entrant]
 ) -> dict[str, Any]:
-    """Says what is judged: all that the figures of an evaluation depend on.
+    """Describes an evaluation: everything that its figures depend on.
 
     Args:
-        config: Of the evaluation.
+        config: Settings of the evaluation.
         cells: Its levels.
         entrants: The policies, in their order.
 
@@ -66,7 +67,7 @@ def about(
             for cell in cells
         },
     }
-    return json.loads(json.dumps(found))  # as it comes back from the file
+    return json.loads(json.dumps(found))  # the same types as when read from the file
 
 
 def _digest(path: Path) -> str:
@@ -74,18 +75,18 @@ def _digest(path: Path) -> str:
 
 
 def read(folder: Path, judged: Mapping[str, Any], cells: Sequence[Cell]) -> dict[int, Trial]:
-    """Reads the cells that are over.
+    """Reads the finished cells.
 
     Args:
-        folder: As `place` names it; it need not be there.
-        judged: What is judged, as `about` says it.
-        cells: Of the evaluation.
+        folder: Result of `place`; it need not exist.
+        judged: Result of `about`.
+        cells: Cells of the evaluation.
 
     Returns:
-        By their row, what policies came to on cells.
+        The policies' results, by the row of their cell.
 
     Raises:
-        ConfigError: If they are of another evaluation, or cannot be read.
+        ConfigError: They belong to another evaluation, or cannot be read.
     """
     paths = {row: _path(folder, row) for row in range(len(cells))}
     paths = {row: path for row, path in paths.items() if path.exists()}
@@ -95,23 +96,23 @@ def read(folder: Path, judged: Mapping[str, Any], cells: Sequence[Cell]) -> dict
     key = _first_difference(before, judged)
     if key is not None:
         raise ConfigError(
-            f"out has {folder}, where an evaluation was stopped that differs from this one in "
-            f"{key}: give the command that was stopped, give another out, or remove that folder."
+            f"out has {folder}, from an unfinished evaluation that differs from this one in "
+            f"{key}: repeat its command, give another out, or remove that folder."
         )
     return {row: _read_trial(path, cells[row]) for row, path in paths.items()}
 
 
 def write(folder: Path, judged: Mapping[str, Any], row: int, trial: Trial) -> None:
-    """Writes a cell that is over, whole or not at all.
+    """Writes a finished cell, whole or not at all.
 
     Args:
-        folder: As `place` names it; it is made if it is missing.
-        judged: What is judged, as `about` says it.
-        row: Of the cell.
-        trial: What policies came to on it.
+        folder: Result of `place`; it is made if it is missing.
+        judged: Result of `about`.
+        row: Row of the cell.
+        trial: The policies' results on it.
 
     Raises:
-        ConfigError: If it cannot be written.
+        ConfigError: The files cannot be written.
     """
     arrays = {"shortest": trial.shortest, "arrival": trial.arrival}
     arrays |= {f"found/{name}": table for name, table in trial.found.items()}
@@ -125,12 +126,12 @@ def write(folder: Path, judged: Mapping[str, Any], row: int, trial: Trial) -> No
 
 
 def remove(folder: Path) -> None:
-    """Removes what was kept, once the result is written."""
+    """Removes the saved cells, once the result is written."""
     shutil.rmtree(folder, ignore_errors=True)
 
 
 def count(folder: Path) -> int:
-    """Counts the cells that are kept."""
+    """Counts the saved cells."""
     return len(list(folder.glob("cell*.npz")))
 
 
@@ -143,7 +144,7 @@ def _read_trial(path: Path, cell: Cell) -> Trial:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         shortest, arrival = arrays.pop("shortest"), arrays.pop("arrival")
-    except Exception as error:  # whatever a damaged file makes zipfile and NumPy raise
+    except Exception as error:  # zipfile and NumPy raise many kinds for a damaged file
         raise ConfigError(
             f"{path} cannot be read: {str(error).rstrip('.')}. Remove it; its cell is judged again."
         ) from None
@@ -152,7 +153,7 @@ def _read_trial(path: Path, cell: Cell) -> Trial:
 
 
 def _first_difference(one: Any, other: Any, key: str = "") -> str | None:
-    """Names the first key in which plain data differ; None if there is none."""
+    """Names the first key at which two pieces of plain data differ; None if they are equal."""
     if not (isinstance(one, Mapping) and isinstance(other, Mapping)):
         return None if one == other else key
     for name in dict.fromkeys([*one, *other]):

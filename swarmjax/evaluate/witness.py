@@ -1,7 +1,7 @@
-"""What a policy says of the robot and the task that it was trained with.
+"""The robot and the task that a policy was trained with, from its file.
 
-Commands that run a policy take hull, sensors, speeds, task, realism and stage from its file unless
-their words say otherwise. The judge's body stays what the command says: wheels.
+Commands that run a policy take hull, sensors, speeds, task, realism and stage from its file, unless
+the command line sets them. The judge's body does not come from the file: it has wheels by default.
 """
 
 import operator
@@ -19,22 +19,22 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import stage_files
 from swarmjax.task.config import TaskConfig, describe
 
-# Of the task, what a judge asks for too; rewards and step limit are those of training.
+# Keys of the task that a judge needs too; rewards and step limit matter only in training.
 _TASK = ("control_step", "target_radius", "arrival", "observations")
-BODY = "wheeled"  # of a judge, unless a word or a file names another
-_TOLD = ("robot", "task", "realism")  # what a line names that a word set otherwise
-# Each policy brings its own, as it does its network; whom it hears is part of what it takes.
+BODY = "wheeled"  # of a judge, unless the command line or a robot file names another
+_TOLD = ("robot", "task", "realism")  # sections whose keys the printed line repeats if typed
+# Each policy has its own values of these, as it has its own network: they fix its inputs.
 _OWN = ("task.history", *(f"task.neighbours.{key}" for key in ("count", "range", "message_size")))
 
 
 class Trained(NamedTuple):
-    """What a policy was trained with.
+    """The conditions of a policy's training.
 
     Attributes:
-        robot: Its numbers.
-        task: What a judge asks for too.
-        realism: Of sensors and bodies.
-        stages: Plain data of its stages, the last one last; none if the file names none.
+        robot: Settings of the robot.
+        task: Settings of the task that a judge needs too.
+        realism: Realism of sensors and bodies.
+        stages: Plain data of its stages in order; none if the file names none.
     """
 
     robot: RobotConfig
@@ -44,11 +44,11 @@ class Trained(NamedTuple):
 
 
 def trained(meta: Mapping[str, Any], path: str) -> Trained:
-    """Reads what a policy file says of its training; of a file of an older version what it has.
+    """Reads the conditions of training from a policy file; older files have fewer of them.
 
     Args:
-        meta: Of the file.
-        path: Of the file.
+        meta: Contents of the file's `meta`.
+        path: Path of the file.
 
     Raises:
         ConfigError: A number is unsound.
@@ -89,19 +89,19 @@ def load[C: Section](
     entrants: Sequence[Entrant] | None = None,
     stage: dict[str, Any] | None = None,
 ) -> tuple[C, str]:
-    """Makes the settings of a command that runs policies: as they were trained, unless it is told.
+    """Makes the settings of a command that runs policies: as in training, unless set otherwise.
 
     Args:
         cls: The command's dataclass, with `policy` and perhaps `compare`.
-        typed: `key=value` words.
-        entrants: The policies, if they have been read already; None: those that the words name.
-        stage: Plain data of the stage, where no word names one; None: the policies' last one.
+        typed: `key=value` arguments.
+        entrants: The policies, if they have been read already; None: those that `typed` names.
+        stage: Plain data of the stage if `typed` names none; None: the policies' last stage.
 
     Returns:
-        The settings, and one line that says what was taken from the policies.
+        The settings, and one line that describes what comes from the policies.
 
     Raises:
-        ConfigError: A word is unsound, or policies were trained differently and no word decides.
+        ConfigError: An argument is unsound, or policies were trained differently and none decides.
         PolicyError: A policy is unsound.
     """
     if entrants is None:
@@ -120,7 +120,7 @@ def load[C: Section](
 
 
 def _paths(cls: type[Section], typed: Sequence[str]) -> list[str]:
-    """Lists the policy files that the words name."""
+    """Lists the policy files that the arguments name."""
     given = files.values(files.split_words(cls, typed))
     policy, compare = (given.get(key) or "" for key in ("policy", "compare"))
     sides = [("policy", policy), *(("compare", part) for part in str(compare).split(","))]
@@ -129,7 +129,7 @@ def _paths(cls: type[Section], typed: Sequence[str]) -> list[str]:
 
 
 def _words(cls: type[Section], found: Trained, typed: Sequence[str]) -> list[str]:
-    """Writes what was trained as words; a robot file that says no body leaves the judge's."""
+    """Converts the training's settings to arguments; a robot file without a body keeps wheels."""
     choice = files.split_words(cls, typed).get("robot")
     own = {"body": BODY} if choice is None else files.read_choice("robot", files.choice_of(choice))
     return [
@@ -143,7 +143,7 @@ def _words(cls: type[Section], found: Trained, typed: Sequence[str]) -> list[str
 def _check_alike(
     cls: type[Section], paths: list[str], words: list[list[str]], typed: Sequence[str]
 ) -> None:
-    """Refuses policies that were trained differently where no word says what counts."""
+    """Refuses policies that were trained differently, unless an argument decides."""
     told = files.split_words(cls, typed)
     for path, mine in zip(paths[1:], words[1:], strict=True):
         for word in sorted(set(mine) ^ set(words[0])):
@@ -152,14 +152,14 @@ def _check_alike(
                 first, other = (_value(each, key) for each in (words[0], mine))
                 raise ConfigError(
                     f"{paths[0]} and {path} were trained differently, with {key} {first} and "
-                    f"{other}: say by which to judge them, as in {word}."
+                    f"{other}: choose the one to judge them with, as in {word}."
                 )
 
 
 def _check_own(settings: Any, found: Mapping[str, Trained]) -> None:
-    """Refuses another history or hearing than the first policy's, which the settings have.
+    """Refuses settings with another history or hearing than the first policy's.
 
-    Each policy is judged with its own: its network takes that one and no other.
+    Each policy is judged with its own values, since its network accepts no others.
     """
     for path, each in list(found.items())[:1]:
         for key in _OWN:
@@ -173,13 +173,13 @@ def _check_own(settings: Any, found: Mapping[str, Trained]) -> None:
 
 
 def _value(words: list[str], key: str) -> str:
-    """Finds the value that words give a key."""
+    """Finds the value of a key in arguments."""
     found = [word.partition("=")[2] for word in words if word.partition("=")[0] == key]
     return found[0] if found else "its default"
 
 
 def _say(settings: Any, typed: Sequence[str]) -> str:
-    """Says in one line what robot and task the policies are run with."""
+    """Describes in one line the robot and task that the policies run with."""
     told = [word for word in typed if word.partition("=")[0].partition(".")[0] in _TOLD]
     levels = f"suite {settings.suite}" if settings.suite else f"stage {settings.stage.name}"
     found = describe(settings.robot, settings.task, settings.realism)

@@ -1,5 +1,5 @@
-"""Proximal policy optimisation of one learner: pure functions, without an idea of what it learns.
+"""Proximal policy optimisation of one learner: pure functions that know nothing about the task.
 
-Imports `config` alone. `learner.py` is plain PPO; `dispatch.py` is the only module that knows the
+Of this project it imports only `config`. `learner.py` is plain PPO. `dispatch.py` alone knows the
 faster ways of `fast/`, and everything works without them. Start with `learner.update`.
 """

@@ -8,7 +8,7 @@ from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.extension import Network
 
-# The options of the algorithm that belong to one choice: whose, which, and what null stands for.
+# Options that exist for one choice only: the key and value of the choice, and the meaning of null.
 _ALGO_OPTIONS: dict[str, tuple[str, str, float | int]] = {
     "gae_lambda": ("advantage", "gae", 0.95),
     "memory_size": ("memory", "gru", 64),
@@ -18,20 +18,20 @@ _ALGO_OPTIONS: dict[str, tuple[str, str, float | int]] = {
 }
 
 
-# Control steps of a rollout through which a memory is trained: a quarter of a second, in which a
-# robot drives about as far as it sees.
+# Fewest control steps of a rollout that train a memory: a quarter of a second, in which a robot
+# drives about as far as it sees.
 LEAST_SEQUENCE = 8
 
-# What the step limit may be to a return, the default first.
+# How a return may treat the step limit, the default first.
 _TIME_OUTS = {"gae": ("bootstrap", "terminal"), "monte_carlo": ("terminal", "leak")}
 
 
 @dataclass(frozen=True, kw_only=True)
 class AlgoConfig(Section):
-    """PPO; what stands in Table 1 of the paper has its name from there in quotes.
+    """PPO; quotes hold the names that Table 1 of the paper uses.
 
-    An option of one choice only, as its meaning says, is null with the others and may be null with
-    its own, where it then takes its default.
+    Some options belong to one choice of another key, as their meanings say. Such an option is null
+    with the other choices. With its own choice, null means its default.
     """
 
     removed: ClassVar[Mapping[str, str]] = dict.fromkeys(
@@ -49,14 +49,16 @@ class AlgoConfig(Section):
     }
 
     name: Literal["ppo", "paper"] = field(
-        default="ppo", metadata=about("preset that the numbers started from", derived=True)
+        default="ppo", metadata=about("preset that gave the first values", derived=True)
     )
     policy: Literal["shared", "independent"] = field(
         default="shared", metadata=about("one policy for all agents, or one for each")
     )
     network: str | None = field(
         default=None,
-        metadata=about("of actor and critic: mlp, or a name of extensions; null: theirs, if any"),
+        metadata=about(
+            "network of actor and critic: mlp or an extension's; null: the extension's, if any"
+        ),
     )
     torso: Any = field(
         default=None, metadata=about("module of an extension's network", derived=True, stored=False)
@@ -70,11 +72,11 @@ class AlgoConfig(Section):
     )
     memory: Literal["none", "gru"] = field(
         default="none",
-        metadata=about("what robots remember; gru: a gated recurrent unit behind the layers"),
+        metadata=about("memory of the robots; gru: a gated recurrent unit behind the layers"),
     )
     memory_size: int | None = field(
         default=None,
-        metadata=about("numbers that are remembered; null: 64 [memory=gru]", 1, 1024),
+        metadata=about("size of the memory; null: 64 [memory=gru]", 1, 1024),
     )
     memory_kernels: Any = field(
         default=None,
@@ -83,23 +85,26 @@ class AlgoConfig(Section):
     critic: Literal["observation", "state"] = field(
         default="observation",
         metadata=about(
-            "what the critic sees; state: also where targets, robots and walls are, which the "
-            "policy never does"
+            "what the critic sees; state: also targets, other robots and walls, which the policy "
+            "never sees"
         ),
     )
     activation: Literal["tanh", "relu", "swish"] = field(
         default="tanh", metadata=about("activation of the hidden layers")
     )
     mean_activation: Literal["linear", "tanh"] = field(
-        default="linear", metadata=about("of the mean action; tanh: within the range of commands")
+        default="linear",
+        metadata=about("for the mean action; tanh: within the commands' range"),
     )
     initialization: Literal["orthogonal", "uniform"] = field(
         default="orthogonal",
-        metadata=about("of the layers; uniform: within 1 / sqrt(inputs), biases too, as PyTorch's"),
+        metadata=about(
+            "first weights; uniform: within 1 / sqrt(inputs), biases too, as in PyTorch"
+        ),
     )
     normalize_observations: bool = field(
         default=True,
-        metadata=about("by running mean and deviation; false: as they are, within +-10"),
+        metadata=about("scale by running mean and deviation; false: raw, clipped to +-10"),
     )
     rollout_length: int = field(
         default=32, metadata=about("control steps per update", 1, MAX_COUNT)
@@ -111,37 +116,39 @@ class AlgoConfig(Section):
         default=8, metadata=about("gradient steps per pass; divides arenas", 1, MAX_COUNT)
     )
     discount: float = field(
-        default=0.998, metadata=about("per control step: 'discount factor (gamma)'", 0.0, 1.0)
+        default=0.998,
+        metadata=about("each control step: 'discount factor (gamma)'", 0.0, 1.0),
     )
     advantage: Literal["gae", "monte_carlo"] = field(
         default="gae",
         metadata=about(
-            "gae: bootstrapped; monte_carlo: summed to the end of episode or rollout and "
-            "normalised, for the critic and for advantages"
+            "gae: bootstrapped; monte_carlo: returns to the end of the episode or rollout, "
+            "normalised, for both critic and advantages"
         ),
     )
     gae_lambda: float | None = field(
-        default=None, metadata=about("of the advantages; null: 0.95 [advantage=gae]", 0.0, 1.0)
+        default=None, metadata=about("GAE's lambda; null: 0.95 [advantage=gae]", 0.0, 1.0)
     )
     normalize_advantages: bool = field(
         default=True,
-        metadata=about("those of gae, to mean 0 and deviation 1 over the rollout"),
+        metadata=about("scale gae's advantages to mean 0 and deviation 1 over the rollout"),
     )
     time_out: Literal["bootstrap", "terminal", "leak"] | None = field(
         default=None,
         metadata=about(
-            "a return at the step limit; bootstrap: goes on with the value [gae], terminal: ends, "
-            "leak: goes on into the next episode [monte_carlo]; null: the first that is possible"
+            "a return at the step limit; bootstrap: adds the critic's value [gae], terminal: ends, "
+            "leak: goes on into the next episode [monte_carlo]; null: bootstrap or terminal"
         ),
     )
     clip_epsilon: float = field(
-        default=0.2, metadata=about("of the probability ratio: 'PPO epsilon clip'", above=0.0)
+        default=0.2,
+        metadata=about("range of the probability ratio: 'PPO epsilon clip'", above=0.0),
     )
     actor_learning_rate: float | None = field(
         default=None,
         metadata=about(
-            "of the policy: 'optimizer learning rate actor'; null: 3e-4, and less in proportion "
-            "in a run of more than 15000 gradient steps",
+            "rate of the policy: 'optimizer learning rate actor'; null: 3e-4, reduced in "
+            "proportion in a run of more than 15000 gradient steps",
             above=0.0,
             high=1.0,
         ),
@@ -149,7 +156,7 @@ class AlgoConfig(Section):
     critic_learning_rate: float | None = field(
         default=None,
         metadata=about(
-            "of the value: 'optimizer learning rate critic'; null: 1e-3, and less likewise",
+            "rate of the critic: 'optimizer learning rate critic'; null: 1e-3, reduced likewise",
             above=0.0,
             high=1.0,
         ),
@@ -162,7 +169,7 @@ class AlgoConfig(Section):
     )
     max_grad_norm: float | None = field(
         default=0.5,
-        metadata=about("norm at which gradients are clipped; null: they are not", above=0.0),
+        metadata=about("norm at which gradients are clipped; null: no clipping", above=0.0),
     )
     value_cost: float = field(
         default=0.5, metadata=about("weight of the value loss, half the mean squared error", 0.0)
@@ -175,31 +182,31 @@ class AlgoConfig(Section):
     update_backend: Literal["auto", "autodiff", "fused"] = field(
         default="auto",
         metadata=about(
-            "how gradients are computed; fused: also, minibatches of tiles of valid samples; "
-            "auto: fused on an NVIDIA GPU where the layers fit it; with memory, autodiff of the "
-            "rollouts of robots that something is learned from"
+            "how to compute gradients; fused: GPU kernels, with minibatches of tiles of valid "
+            "samples; auto: fused on an NVIDIA GPU that fits the layers; with a memory, autodiff "
+            "without the rollouts of absent robots"
         ),
     )
     exploration: Literal["learned", "scheduled"] = field(
         default="learned",
-        metadata=about("deviation of the action: learned, or falling in steps whatever is learned"),
+        metadata=about("deviation of the action: learned, or falling in steps by a schedule"),
     )
     initial_std: float = field(
         default=0.6,
-        metadata=about("at first: 'starting std of action distribution'", above=0.0),
+        metadata=about("first deviation: 'starting std of action distribution'", above=0.0),
     )
     std_decrement: float | None = field(
         default=None,
         metadata=about(
-            "what a step takes off: 'the decay rate of std of action distribution'; null: 0.05 "
-            "[exploration=scheduled]",
+            "decrease at each step down: 'the decay rate of std of action distribution'; null: "
+            "0.05 [exploration=scheduled]",
             above=0.0,
         ),
     )
     std_interval: int | None = field(
         default=None,
         metadata=about(
-            "control steps of all arenas together between two: 'decay frequency of std of action "
+            "control steps of all arenas between steps down: 'decay frequency of std of action "
             "distribution'; null: 250000 [exploration=scheduled]",
             1,
             MAX_COUNT,
@@ -208,7 +215,7 @@ class AlgoConfig(Section):
     std_floor: float | None = field(
         default=None,
         metadata=about(
-            "where it stops: 'minimum std of action distribution'; null: 0.1 "
+            "least deviation: 'minimum std of action distribution'; null: 0.1 "
             "[exploration=scheduled]",
             above=0.0,
         ),
@@ -241,7 +248,7 @@ class AlgoConfig(Section):
             )
 
     def _check_memory(self) -> None:
-        """Refuses what a memory does not go with."""
+        """Refuses settings that a memory does not support."""
         if self.memory == "none":
             return
         if self.rollout_length < LEAST_SEQUENCE:
@@ -266,7 +273,7 @@ class AlgoConfig(Section):
             )
 
     def _check_critic(self) -> None:
-        """Refuses what a critic that sees the state does not go with."""
+        """Refuses settings that a critic of the state does not support."""
         if self.critic == "state" and self.update_backend == "fused":
             raise ConfigError(
                 "update_backend is fused, but critic is state: give auto or autodiff, or "
@@ -285,14 +292,14 @@ class AlgoConfig(Section):
 
 
 def resolve(config: AlgoConfig, networks: Sequence[Network]) -> str:
-    """Return the name of the network that a config means.
+    """Returns the name of the network that a config means.
 
     Args:
-        config: names a network, or leaves it to the extension.
-        networks: of an extension.
+        config: Names a network, or leaves the choice to the extension.
+        networks: Networks of an extension.
 
     Raises:
-        ConfigError: there is none of that name, or several to choose from.
+        ConfigError: The name is unknown, or the extension has several networks and none is named.
     """
     names = [piece.name for piece in networks]
     if config.network is None and len(names) > 1:

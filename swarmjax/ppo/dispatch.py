@@ -13,13 +13,13 @@ from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.optimizer import Progress
 from swarmjax.shards import Shards
 
-# XLA takes Triton's kernels from this generation on (Ampere, compute capability 8).
+# XLA runs Triton's kernels from this generation on (Ampere, compute capability 8).
 _LEAST_GENERATION = 8
-# Names that JAX has for products without tensor cores (`jax.default_matmul_precision`).
+# JAX's names for products without tensor cores (`jax.default_matmul_precision`).
 _FULL = ("highest", "float32", "F32_F32_F32")
 
-# autodiff: `learner` alone; blocks: autodiff of a whole batch, block by block; fused: kernels;
-# sequences: autodiff of the sequences of robots that remember, without those of absent ones.
+# autodiff: `learner` alone. blocks: autodiff of a whole batch, block by block. fused: kernels.
+# sequences: autodiff of a policy with memory, without the sequences of absent robots.
 Backend = Literal["autodiff", "blocks", "fused", "sequences"]
 Learn = Callable[
     [AlgoConfig, int, Progress, Minibatch, jax.Array, Shards], tuple[Progress, Metrics]
@@ -29,23 +29,23 @@ Learn = Callable[
 def resolve(config: AlgoConfig, observation_size: int, action_size: int) -> Backend:
     """Chooses how updates are computed on the device that JAX computes on.
 
-    `auto` is `fused` on an NVIDIA GPU where the layers fit it, unless JAX's matrix products are to
-    be in full precision: without tensor cores the kernels are slower than what XLA makes. A whole
-    batch on a CPU is taken in `blocks`; an accelerator has it all at once. A policy with memory is
-    trained in `sequences`, on any device.
+    `auto` means `fused` on an NVIDIA GPU that supports the layers, unless JAX computes matrix
+    products in full precision: without tensor cores the kernels are slower than XLA's code. A CPU
+    processes a whole batch in `blocks`; an accelerator processes it at once. A policy with memory
+    is trained in `sequences` on any device.
 
     Args:
-        config: Of the learner.
+        config: Settings of the learner.
         observation_size: O.
         action_size: U.
 
     Returns:
-        The backend, as `learner.update` takes it.
+        The backend for `learner.update`.
 
     Raises:
-        ConfigError: `fused` is asked for where there is no such GPU, or of layers that do not fit.
+        ConfigError: The config asks for `fused`, but there is no such GPU or the layers do not fit.
     """
-    if config.memory != "none":  # the other faster ways take samples one by one
+    if config.memory != "none":  # the other faster ways handle single samples
         left = config.update_backend == "auto"
         return "sequences" if left and _has_fast() else "autodiff"
     if _fuses(config, observation_size, action_size):
@@ -55,13 +55,13 @@ def resolve(config: AlgoConfig, observation_size: int, action_size: int) -> Back
 
 
 def bind_memory(config: AlgoConfig) -> AlgoConfig:
-    """Gives a config the kernels that compute its memory, on a GPU that takes them.
+    """Gives a config the kernels that compute its memory, on a GPU that supports them.
 
     Args:
-        config: Of the learner.
+        config: Settings of the learner.
 
     Returns:
-        The config; as it is without memory, or where `resolve` would not choose kernels.
+        The config with the kernels; unchanged without memory, or where `resolve` avoids kernels.
     """
     asked = config.memory != "none" and config.update_backend == "auto" and _has_fast()
     if not asked or not _has_tensor_cores() or _is_full_precision():
@@ -73,7 +73,7 @@ def bind_memory(config: AlgoConfig) -> AlgoConfig:
 
 
 def find(backend: Backend) -> Learn | None:
-    """Returns what learns by a backend; None for autodiff, which `learner` does itself."""
+    """Returns the function that learns with a backend; None for autodiff, which `learner` does."""
     if backend == "fused":
         from swarmjax.ppo.fast import tiles
 
@@ -90,7 +90,7 @@ def find(backend: Backend) -> Learn | None:
 
 
 def _has_fast() -> bool:
-    """Whether the faster ways can be imported."""
+    """Tells whether the faster ways can be imported."""
     try:
         import swarmjax.ppo.fast  # noqa: F401
     except ImportError:
@@ -99,10 +99,10 @@ def _has_fast() -> bool:
 
 
 def _fuses(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
-    """Whether the kernels compute the gradient; refuses them where they cannot be had."""
+    """Tells whether to use the kernels; refuses `fused` where they are not available."""
     if config.update_backend == "autodiff" or config.critic == "state":
         return False
-    if config.hearing is not None:  # the kernels know no layer in front of the hidden ones
+    if config.hearing is not None:  # the kernels support no layer in front of the hidden ones
         return False
     if not _has_fast():
         if config.update_backend == "auto":
@@ -126,7 +126,7 @@ def _fuses(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
 
 
 def _unfit(config: AlgoConfig, observation_size: int, action_size: int) -> ConfigError:
-    """Says what does not fit the chip: the layers, or already what is observed."""
+    """Builds the error that names what does not fit the chip: the layers or the observation."""
     narrow = replace(config, hidden_sizes=(16, 16))
     if config.torso is None and not _fits(narrow, observation_size, action_size):
         return ConfigError(
@@ -142,21 +142,21 @@ def _unfit(config: AlgoConfig, observation_size: int, action_size: int) -> Confi
 
 
 def _fits(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
-    """Whether the kernels take networks of this size."""
+    """Tells whether the kernels support networks of this size."""
     from swarmjax.ppo.fast import fused
 
-    if config.torso is not None:  # the kernels know hidden layers alone
+    if config.torso is not None:  # the kernels support hidden layers only
         return False
     return fused.fits(config, observation_size, action_size)
 
 
 def _is_full_precision() -> bool:
-    """Whether products are to be computed without tensor cores, where kernels are slower."""
+    """Tells whether JAX avoids tensor cores in matrix products; the kernels are slower then."""
     return jax.config.jax_default_matmul_precision in _FULL
 
 
 def _has_tensor_cores() -> bool:
-    """Whether JAX computes on an NVIDIA GPU whose tensor cores Triton knows."""
+    """Tells whether JAX computes on an NVIDIA GPU whose tensor cores Triton supports."""
     capability = str(getattr(jax.devices()[0], "compute_capability", ""))
     generation = re.fullmatch(r"(\d+)\.\d+", capability)
     return generation is not None and int(generation[1]) >= _LEAST_GENERATION

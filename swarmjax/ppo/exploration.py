@@ -9,11 +9,11 @@ from swarmjax.ppo.config import AlgoConfig
 
 
 def levels(config: AlgoConfig) -> tuple[float, ...]:
-    """Lists the deviations of the schedule, from `initial_std` to where it stays.
+    """Lists the deviations of the schedule, from `initial_std` to the last one.
 
-    Each is the one before less `std_decrement`, rounded to four digits, and `std_floor` as soon as
-    it would not be above that: PPO-PyTorch (nikhilbarhate99, commit 728cce8),
-    `PPO.decay_action_std`.
+    Each deviation is the one before less `std_decrement`, rounded to four digits. It is `std_floor`
+    as soon as it would fall to that or below. This is `PPO.decay_action_std` of PPO-PyTorch
+    (nikhilbarhate99, commit 728cce8).
 
     Args:
         config: With `exploration` scheduled.
@@ -31,7 +31,7 @@ def _fall(config: AlgoConfig) -> Iterator[float]:
     yield std
     while std > config.std_floor:
         lower = round(std - config.std_decrement, 4)
-        # A decrement that rounding undoes is none: theirs would go on for ever without moving.
+        # Rounding can undo a small decrement: PPO-PyTorch's schedule would then never move.
         if lower == std:
             return
         std = config.std_floor if lower <= config.std_floor else lower
@@ -39,14 +39,14 @@ def _fall(config: AlgoConfig) -> Iterator[float]:
 
 
 def scheduled_std(config: AlgoConfig, step: jax.Array) -> jax.Array:
-    """Looks up with which deviation a control step is made.
+    """Looks up the deviation of a control step.
 
     Args:
         config: With `exploration` scheduled.
-        step: [...], int32, how many control steps were made before, at least 0.
+        step: [...], int32, how many control steps came before, at least 0.
 
     Returns:
-        The deviation, [...]: the first level for the steps 0 to `std_interval` - 1, and so on.
+        The deviation, [...]: the first level for steps 0 to `std_interval` - 1, and so on.
     """
     assert config.std_interval is not None
     table = jnp.asarray(levels(config), dtype=float)

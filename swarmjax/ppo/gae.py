@@ -18,14 +18,14 @@ def generalized_advantages(
     """Computes advantages and returns of a rollout, time first.
 
     Schulman et al. 2016, "High-Dimensional Continuous Control Using Generalized Advantage
-    Estimation", equation 16, with the sum cut at the end of each episode and of the rollout.
-    Whatever follows an end, NaN included, reaches nothing before it.
+    Estimation", equation 16. The sum is cut at the end of each episode and of the rollout. Values
+    after an end, NaN included, never affect steps before it.
 
     Args:
         rewards: [T, ...], reward of step t.
-        values: [T, ...], value of the observation that step t acted on.
-        next_values: [T, ...], value of the observation that step t reached, before any reset;
-            not read where `terminated`.
+        values: [T, ...], value of the observation before step t.
+        next_values: [T, ...], value of the observation after step t, before any reset; ignored
+            where `terminated`.
         terminated: [T, ...], bool: the task ended here and nothing more can be earned.
         truncated: [T, ...], bool: the episode was cut here and would have gone on.
         discount: Per step, 0..1.

@@ -1,7 +1,8 @@
 """One PPO learner: its state, how it acts and how it learns.
 
-All functions are pure and serve a single learner; `jax.vmap` over state, batch and key serves L.
-G stands for groups of samples, N for the samples of a group. Minibatches are of whole groups.
+All functions are pure and handle one learner; for L learners, apply `jax.vmap` over state, batch
+and key. G stands for groups of samples, N for the samples of a group. Minibatches consist of whole
+groups.
 """
 
 import functools
@@ -24,21 +25,21 @@ from swarmjax.ppo.normalizer import Normalizer
 from swarmjax.ppo.optimizer import Progress
 from swarmjax.shards import ALONE, Shards
 
-# Huang et al. 2022, "The 37 Implementation Details of Proximal Policy Optimization":
-# bound of normalised observations, continuous-action detail 7.
+# Huang et al. 2022, "The 37 Implementation Details of Proximal Policy Optimization",
+# continuous-action detail 7: bound of normalised observations.
 OBSERVATION_LIMIT = 10.0
 _ADVANTAGE_EPSILON = 1e-8
 
 
 @struct.dataclass(kw_only=True)
 class LearnerState:
-    """All that a learner remembers.
+    """The complete state of a learner.
 
     Attributes:
         params: `{"actor": .., "critic": ..}`.
-        optimizer_state: Of the optimiser that `init` was given.
-        normalizer: Moments of the valid observations of all updates so far; those of a learner
-            that does not normalise stay 0 and 1.
+        optimizer_state: State of the optimiser that `init` made.
+        normalizer: Moments of the valid observations of all updates so far. A learner that does not
+            normalise keeps the initial ones.
         explored: [], int32, control steps that the schedule of exploration has counted; None if
             exploration is learned.
     """
@@ -51,20 +52,20 @@ class LearnerState:
 
 @struct.dataclass(kw_only=True)
 class Batch:
-    """What one update learns from. Invalid samples may hold anything, NaN included.
+    """The samples of one update. Invalid samples may hold anything, NaN included.
 
     Attributes:
         observation: [G, N, O], raw.
         action: [G, N, U], as drawn.
         log_prob: [G, N], as `act` returned it.
-        advantage: [G, N]; normalised over the valid samples before use if the config says so,
-            but not those of Monte-Carlo returns, which are normalised themselves.
+        advantage: [G, N]. If the config says so, the update normalises it over the valid samples,
+            except for Monte-Carlo returns, which are normalised already.
         return_: [G, N], target of the critic.
         valid: [G, N], bool or 0/1.
-        memory: [G, S, H] before the rollout of the S robots of a group, whose N samples are ordered
-            by step, [T S]; None without memory.
+        memory: [G, S, H], memory of the S robots of a group before the rollout; None without
+            memory. The N samples of a group are then ordered by step, [T S].
         begins: [G, N], whether an episode begins with the step; None without memory.
-        state: [G, N, P], of order 1, what the critic sees besides; None if nothing.
+        state: [G, N, P], of order 1, what the critic sees in addition; None if nothing.
     """
 
     observation: jax.Array
@@ -86,15 +87,15 @@ def init(
     updates: int,
     state_size: int = 0,
 ) -> LearnerState:
-    """Makes a learner that has seen nothing.
+    """Makes a new learner.
 
     Args:
         key: Random key, consumed.
-        config: Of networks and optimiser.
+        config: Settings of networks and optimiser.
         observation_size: O.
         action_size: U.
         updates: Number of updates of the whole run, at least 1: the learning rate's horizon.
-        state_size: P, what the critic sees besides.
+        state_size: P, how many numbers the critic sees in addition.
 
     Returns:
         The learner's first state.
@@ -109,15 +110,15 @@ def init(
 
 
 def explore(learner: LearnerState, config: AlgoConfig, steps: jax.Array | int) -> LearnerState:
-    """Moves a learner on along the schedule of exploration, if there is one.
+    """Moves a learner along the schedule of exploration, if there is one.
 
     Args:
-        learner: Before.
+        learner: The learner before these steps.
         config: The config that made the learner.
-        steps: [], how many control steps are made, at least 1.
+        steps: [], how many control steps follow, at least 1.
 
     Returns:
-        The learner with the deviation of the last of these steps; itself if exploration is
+        The learner with the deviation of the last of these steps; unchanged if exploration is
         learned.
     """
     if learner.explored is None:
@@ -128,10 +129,10 @@ def explore(learner: LearnerState, config: AlgoConfig, steps: jax.Array | int) -
 
 
 def explore_anew(learner: LearnerState, config: AlgoConfig) -> LearnerState:
-    """Sets the policy's deviation to the initial one, and a schedule of it to its beginning.
+    """Resets the policy's deviation to the initial one, and its schedule to the beginning.
 
     Args:
-        learner: Before, with any leading axes.
+        learner: The learner, with any leading axes.
         config: The config that made the learner.
 
     Returns:
@@ -148,7 +149,7 @@ def _with_log_std(learner: LearnerState, log_std: jax.Array | float) -> LearnerS
 
 
 def normalize(learner: LearnerState, observation: jax.Array) -> jax.Array:
-    """Normalises raw observations [..., O] to what the networks take, within +-10."""
+    """Normalises raw observations [..., O] for the networks, within +-10."""
     return normalizer.normalize(learner.normalizer, observation, OBSERVATION_LIMIT)
 
 
@@ -158,7 +159,7 @@ def act(
     """Draws actions from a policy without memory.
 
     Args:
-        learner: Whose policy.
+        learner: The learner with the policy.
         config: The config that made the learner.
         observation: [..., O], raw.
         noise: [..., U], standard normal.
@@ -170,12 +171,12 @@ def act(
 
 
 def mode(learner: LearnerState, config: AlgoConfig, observation: jax.Array) -> jax.Array:
-    """Returns the most likely action, [..., U], of a policy without memory; `observation` raw."""
+    """Returns the most likely actions [..., U] of a policy without memory; observations are raw."""
     return recall_mode(learner, config, observation, None)[0]
 
 
 def values(learner: LearnerState, config: AlgoConfig, observation: jax.Array) -> jax.Array:
-    """Returns the expected discounted return, [...], of a critic of raw observations alone."""
+    """Returns the values [...] of raw observations, from a critic without memory or state."""
     return recall_values(learner, config, observation, None)[0]
 
 
@@ -186,14 +187,14 @@ def recall_act(
     noise: jax.Array,
     memory: jax.Array | None,
 ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
-    """Draws actions from the policy, and remembers.
+    """Draws actions from the policy, and updates its memory.
 
     Args:
-        learner: Whose policy.
+        learner: The learner with the policy.
         config: The config that made the learner.
         observation: [..., O], raw.
         noise: [..., U], standard normal.
-        memory: [..., H] of the actor before; None without memory.
+        memory: [..., H], memory of the actor before; None without memory.
 
     Returns:
         The action mean + std * noise, [..., U], unbounded, its log density, [...], and the memory
@@ -209,7 +210,7 @@ def recall_act(
 def recall_mode(
     learner: LearnerState, config: AlgoConfig, observation: jax.Array, memory: jax.Array | None
 ) -> tuple[jax.Array, jax.Array | None]:
-    """Returns the policy's most likely action, [..., U], and the memory after, as `recall_act`."""
+    """Returns the most likely action, [..., U], and the memory after; arguments as `recall_act`."""
     seen = normalize(learner, observation)
     mean, _, after = networks.recall_action(learner.params, config, seen, memory)
     return mean, after
@@ -222,14 +223,14 @@ def recall_values(
     memory: jax.Array | None,
     state: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array | None]:
-    """Computes the critic's values, and remembers.
+    """Computes the critic's values, and updates its memory.
 
     Args:
-        learner: Whose critic.
+        learner: The learner with the critic.
         config: The config that made the learner.
         observation: [..., O], raw.
-        memory: [..., H] of the critic before; None without memory.
-        state: [..., P], of order 1, what the critic sees besides; None if nothing.
+        memory: [..., H], memory of the critic before; None without memory.
+        state: [..., P], of order 1, what the critic sees in addition; None if nothing.
 
     Returns:
         The expected discounted return, [...], and the memory after.
@@ -249,24 +250,24 @@ def update(
 ) -> tuple[LearnerState, Metrics]:
     """Learns from one batch: `config.epochs` passes in `config.num_minibatches` steps each.
 
-    The batch's observations were normalised, and its log densities computed, by the normalizer as
-    it is before this update. All epochs keep to that one, so that the ratio of new to old density
-    starts at 1; only then does the normalizer take in the batch. A minibatch without a valid sample
-    is no step: it moves neither the parameters nor the learning rate's schedule.
+    The normalizer before this update normalised the batch's observations and gave its log
+    densities. All epochs keep it, so that the ratio of new to old density starts at 1. Only then
+    does the normalizer take in the batch. A minibatch without a valid sample is skipped: it changes
+    neither the parameters nor the learning rate's schedule.
 
     Args:
-        learner: State before.
+        learner: The learner before the update.
         config: The config that made the learner.
         batch: G groups of N samples; `config.num_minibatches` divides G.
         key: Random key, consumed.
-        updates: As given to `init`.
-        backend: How the update is computed; `dispatch.resolve` chooses.
-        shards: How the groups are spread over devices. All devices come to the same state.
+        updates: The value given to `init`.
+        backend: How to compute the update; `dispatch.resolve` chooses.
+        shards: How the groups are spread over devices. All devices reach the same state.
 
     Returns:
-        The state after, and metrics, each []: those of `losses.ppo_loss` and `grad_norm` (before
-        clipping), as means over the minibatches that were learned from, the number of
-        `skipped_steps`, which were not finite, and the policy's mean `std` after the update.
+        The state after, and metrics, each []. The metrics of `losses.ppo_loss` and `grad_norm`
+        (before clipping) are means over the steps taken. `skipped_steps` counts the steps that were
+        not finite. `std` is the policy's mean deviation after the update.
     """
     _check(config, batch, shards)
     counted = batch.valid.astype(bool)
@@ -275,7 +276,7 @@ def update(
     begun = (learner.params, learner.optimizer_state)
     learn = dispatch.find(backend) or _learn
     (params, optimizer_state), metrics = learn(config, updates, begun, samples, key, shards)
-    # If no sample is finite, nor is any step.
+    # Without a finite sample no step is finite either.
     lost = shards.any(jnp.any(counted)) & ~shards.any(jnp.any(batch.valid))
     metrics["skipped_steps"] = jnp.where(lost, 1.0, metrics["skipped_steps"])
     metrics = optimizer.mean_of_taken(metrics)
@@ -289,7 +290,7 @@ def update(
 
 
 def _leave_neighbours(moments: Normalizer, config: AlgoConfig) -> Normalizer:
-    """Leaves what is heard as it is: it is scaled already, and its order must not matter."""
+    """Leaves neighbours' entries unnormalised: they are scaled, and their order must not matter."""
     if config.hearing is None:
         return moments
     heard = slice(config.hearing.first, config.hearing.last)
@@ -301,7 +302,7 @@ def _leave_neighbours(moments: Normalizer, config: AlgoConfig) -> Normalizer:
 
 
 def _is_finite(batch: Batch) -> jax.Array:
-    """Tells which samples, [G, N], hold finite numbers alone."""
+    """Tells which samples, [G, N], hold only finite numbers."""
     numbers = (batch.log_prob, batch.advantage, batch.return_)
     vectors = [batch.observation, batch.action]
     vectors += [] if batch.state is None else [batch.state]
@@ -319,7 +320,7 @@ def _check(config: AlgoConfig, batch: Batch, shards: Shards) -> None:
 
 
 def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Shards) -> Minibatch:
-    """What the loss takes, still [G, N, ...]: normalised, and zero where not valid."""
+    """Prepares samples for the loss, still [G, N, ...]: normalised, and zero where not valid."""
     valid, advantage = batch.valid.astype(bool), batch.advantage
     if config.advantage == "gae" and config.normalize_advantages:
         advantage = _normalize_advantages(advantage, valid, shards)
@@ -332,7 +333,7 @@ def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Sh
         valid=valid,
         state=batch.state,
     )
-    # A NaN in an invalid sample would pass through the networks into every gradient.
+    # Otherwise a NaN in an invalid sample would spread through the networks into every gradient.
     masked = jax.tree.map(
         lambda x: jnp.where(valid.reshape(valid.shape + (1,) * (x.ndim - 2)), x, 0), samples
     )
@@ -341,7 +342,7 @@ def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Sh
 
 
 def _normalize_advantages(advantage: jax.Array, valid: jax.Array, shards: Shards) -> jax.Array:
-    """Advantages with mean 0 and standard deviation 1 over the valid samples, [G, N]."""
+    """Scales advantages to mean 0 and standard deviation 1 over the valid samples, [G, N]."""
     count = jnp.maximum(shards.sum(jnp.sum(valid)), 1)
     mean = shards.sum(jnp.sum(jnp.where(valid, advantage, 0.0))) / count
     variance = shards.sum(jnp.sum(jnp.where(valid, (advantage - mean) ** 2, 0.0))) / count
@@ -356,7 +357,7 @@ def _learn(
     key: jax.Array,
     shards: Shards,
 ) -> tuple[Progress, Metrics]:
-    """All epochs, in minibatches; the metrics of each are [epochs, minibatches]."""
+    """Runs all epochs, in minibatches; the metrics of each are [epochs, minibatches]."""
     expected_valid = shards.sum(jnp.sum(samples.valid)) / config.num_minibatches
     step = functools.partial(_step, config, updates, expected_valid, shards)
     epoch = functools.partial(_epoch, config, step, samples, shards)
@@ -371,7 +372,7 @@ def _epoch(
     progress: Progress,
     key: jax.Array,
 ) -> tuple[Progress, Metrics]:
-    """One pass over all samples. Whole groups are shuffled: rows to gather, not single samples."""
+    """Runs one pass over all samples. It shuffles whole groups, which are faster to gather."""
     order = _shuffle(key, samples.valid.shape[0], config.num_minibatches, shards)
 
     def learn(progress: Progress, rows: jax.Array) -> tuple[Progress, Metrics]:
@@ -381,7 +382,7 @@ def _epoch(
 
 
 def _gather(samples: Minibatch, rows: jax.Array, config: AlgoConfig) -> Minibatch:
-    """Takes whole groups [G, N, ...] as samples [B, ...]; those that remember, step by step."""
+    """Takes whole groups [G, N, ...] as samples [B, ...], ordered by step if there is a memory."""
     if samples.memory is None:
         return jax.tree.map(lambda x: x[rows].reshape(-1, *x.shape[2:]), samples)
 
@@ -395,7 +396,7 @@ def _gather(samples: Minibatch, rows: jax.Array, config: AlgoConfig) -> Minibatc
 
 
 def _shuffle(key: jax.Array, groups: int, minibatches: int, shards: Shards) -> jax.Array:
-    """Deals the groups [G] of this device out to M minibatches, [M, G / M]; each stream apart."""
+    """Deals this device's groups [G] out to M minibatches, [M, G / M], each stream by itself."""
     streams = shards.local_streams
     size = groups // streams
 
@@ -414,7 +415,7 @@ def _step(
     progress: Progress,
     minibatch: Minibatch,
 ) -> tuple[Progress, Metrics]:
-    """One step of the optimiser on a minibatch."""
+    """Takes one step of the optimiser on a minibatch."""
     gradient = jax.grad(losses.ppo_loss, has_aux=True)
     found = gradient(progress[0], minibatch, config, expected_valid)
     return optimizer.take(config, updates, progress, found, jnp.any(minibatch.valid), shards)

@@ -1,4 +1,4 @@
-"""The PPO loss of one minibatch, B samples of which some may be invalid."""
+"""The PPO loss of one minibatch of B samples, some of which may be invalid."""
 
 import chex
 import jax
@@ -15,7 +15,7 @@ Metrics = dict[str, jax.Array]
 
 @struct.dataclass(kw_only=True)
 class Minibatch:
-    """Samples to learn from. Invalid ones must be finite; they count for nothing.
+    """The samples of a minibatch. Invalid ones must be finite; they do not count.
 
     Attributes:
         observation: [B, O], normalised.
@@ -24,10 +24,10 @@ class Minibatch:
         advantage: [B].
         return_: [B], target of the critic.
         valid: [B], bool or 0/1.
-        memory: [B', H] before the first step of B' sequences; None without memory. Samples are then
-            ordered by step, [T B'].
+        memory: [B', H], memory before the first step of B' sequences; None without memory. Samples
+            are then ordered by step, [T B'].
         begins: [B], whether an episode begins with the step; None without memory.
-        state: [B, P], of order 1, what the critic sees besides; None if nothing.
+        state: [B, P], of order 1, what the critic sees in addition; None if nothing.
     """
 
     observation: jax.Array
@@ -48,22 +48,28 @@ def ppo_loss(
 
     It is policy + value_cost * value - entropy_cost * entropy + bound_cost * bound.
 
-    Policy: the clipped surrogate of Schulman et al. 2017, "Proximal Policy Optimization
-    Algorithms", equation 7, negated. Value: half the squared error against the return, not
-    clipped (Andrychowicz et al. 2021, "What Matters in On-Policy Reinforcement Learning?", section
-    3.4: clipping it hurts). Bound: the squared distance of the mean action from -1..1, summed over
-    the action, after `bounds_loss` of rl_games, which begins at 1.1: from a mean that lies
-    deviations beyond, all that is drawn does the same, so that nothing is learned there. Each term
-    is a sum over the valid samples divided by `expected_valid`, so that every valid sample of a
-    batch weighs the same however unevenly its minibatches are filled, and the mean over the
-    minibatches is exactly the mean over the batch.
+    The policy term is the clipped surrogate of Schulman et al. 2017, "Proximal Policy Optimization
+    Algorithms", equation 7, negated.
+
+    The value term is half the squared error against the return. It is not clipped, because clipping
+    hurts (Andrychowicz et al. 2021, "What Matters in On-Policy Reinforcement Learning?", section
+    3.4).
+
+    The bound term is the squared distance of the mean action from -1..1, summed over the action. It
+    follows `bounds_loss` of rl_games, which begins at 1.1. If the mean lies several deviations
+    beyond the range, all drawn actions have the same effect, and the policy learns nothing from
+    them.
+
+    Each term is a sum over the valid samples divided by `expected_valid`. Every valid sample of a
+    batch then has the same weight however unevenly its minibatches are filled, and the mean over
+    the minibatches is exactly the mean over the batch.
 
     Args:
-        params: Of actor and critic.
+        params: Parameters of the actor and the critic.
         minibatch: B samples.
         config: Clip range and costs.
-        expected_valid: [], valid samples of the whole batch / number of minibatches; taken as 1
-            if less.
+        expected_valid: [], valid samples of the whole batch / number of minibatches; at least 1 is
+            used.
 
     Returns:
         The loss [] and its parts, each [] and weighted in the same way: `policy_loss`,
@@ -81,7 +87,7 @@ def ppo_loss(
 
     action_mean, std, value = evaluate(params, config, minibatch)
     log_prob = networks.log_prob(action_mean, std, minibatch.action)
-    # Masked before exp: an overflow there would turn the zero gradient of a mask into NaN.
+    # Masked before exp: an overflow there would turn the masked zero gradient into NaN.
     log_ratio = jnp.where(valid, log_prob - minibatch.log_prob, 0.0)
     ratio = jnp.exp(log_ratio)
     metrics = {
@@ -105,10 +111,10 @@ def ppo_loss(
 def evaluate(
     params: Params, config: AlgoConfig, minibatch: Minibatch
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Computes what actor and critic make of samples; of sequences, through time.
+    """Runs actor and critic on samples; with memory, step by step.
 
     Args:
-        params: Of actor and critic.
+        params: Parameters of the actor and the critic.
         minibatch: B samples.
         config: The config that made `params`.
 

@@ -1,9 +1,9 @@
-"""What robots remember: a gated recurrent unit (GRU) between the hidden layers and the heads.
+"""The memory of a policy: a gated recurrent unit (GRU) between the hidden layers and the heads.
 
-Cho et al. 2014, "Learning Phrase Representations using RNN Encoder-Decoder", section 2.3, with the
-reset gate behind the recurrent product, as in cuDNN, PyTorch, Flax and ONNX
-(`linear_before_reset=1`). The heads see the hidden layers' features beside the memory, which they
-can therefore ignore.
+Cho et al. 2014, "Learning Phrase Representations using RNN Encoder-Decoder", section 2.3. The reset
+gate comes after the recurrent product, as in cuDNN, PyTorch, Flax and ONNX
+(`linear_before_reset=1`). The heads see both the hidden layers' features and the memory, so they
+can ignore the memory.
 
 B stands for any number of leading axes, T for control steps, F for features, H for the memory.
 """
@@ -17,17 +17,18 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-# `algo.initialization=orthogonal` means Flax's own choice for its GRU: LeCun's for what is seen,
-# orthogonal for what is recalled, no bias.
+# `algo.initialization=orthogonal` means Flax's own choice for its GRU: LeCun's for input weights,
+# orthogonal for recurrent weights, no bias.
 _INPUT = nn.initializers.lecun_normal()
 
-# Steps of a sequence in one round of its loop: on a GPU a round has launches of its own. By 4 an
-# update compiles within half a second of what it does by 1, by 8 a second longer.
+# Steps of a sequence in one iteration of its loop: on a GPU each iteration launches its own
+# kernels. With 4 an update compiles at most half a second slower than with 1, with 8 a second
+# slower.
 _UNROLL = 4
 
 
 class Recall(NamedTuple):
-    """What actor and critic remember before they see an observation, [B, H] each."""
+    """The memories of actor and critic before an observation, [B, H] each."""
 
     actor: Any
     critic: Any
@@ -39,11 +40,11 @@ def begin(shape: tuple[int, ...]) -> Recall:
 
 
 class Gru(nn.Module):
-    """A GRU with its three gates side by side: reset, update, candidate.
+    """A GRU whose three gates lie side by side: reset, update, candidate.
 
     Attributes:
         size: H.
-        uniform: Whether kernels and biases begin within 1 / sqrt(H), as those of PyTorch's GRU
+        uniform: Whether weights and biases begin within 1 / sqrt(H), as in PyTorch's GRU
             (`torch.nn.RNNBase.reset_parameters`).
         kernels: Module whose `remember` and `remember_all` compute the same on a GPU; None: XLA.
     """
@@ -56,17 +57,17 @@ class Gru(nn.Module):
     def __call__(
         self, features: jax.Array, memory: jax.Array, begins: jax.Array | None = None
     ) -> tuple[jax.Array, jax.Array]:
-        """Remembers one observation, or a sequence of them.
+        """Updates the memory with one observation, or with a sequence of them.
 
         Args:
             features: [B, F], or [T, B, F] of a sequence.
             memory: [B, H] before.
-            begins: [T, B] of a sequence, whether an episode begins with this step, which then
-                remembers nothing of what was before.
+            begins: [T, B] of a sequence, whether an episode begins with this step. The memory is
+                then cleared first.
 
         Returns:
-            What the heads take beside the features, the memory [.., H] after each observation,
-            and the memory [B, H] after the last.
+            The memory [.., H] after each observation, for the heads, and the memory [B, H] after
+            the last one.
         """
         if self.kernels is not None and not self.is_initializing():
             return self._by_kernels(features, memory, begins)
@@ -76,7 +77,7 @@ class Gru(nn.Module):
             memory = remember(seen, recurrent(memory), memory)
             return memory, memory
         chex.assert_equal_shape_prefix([features, begins], begins.ndim)
-        recurrent(memory)  # has its weights from here on, also while they are drawn
+        recurrent(memory)  # creates the weights, also during initialisation
         weights = recurrent.variables["params"]
         every = remember_all(weights["kernel"], weights["bias"], seen, begins, memory)
         return every, every[-1]
@@ -84,7 +85,7 @@ class Gru(nn.Module):
     def _by_kernels(
         self, features: jax.Array, memory: jax.Array, begins: jax.Array | None
     ) -> tuple[jax.Array, jax.Array]:
-        """Does what a call does, by the kernels."""
+        """Does the same as a call, with the kernels."""
         layers = self.variables["params"]
         if begins is None:
             memory = self.kernels.remember(layers, features, memory)
@@ -93,7 +94,7 @@ class Gru(nn.Module):
         return every, every[-1]
 
     def _layer(self, kernel: Any, name: str) -> nn.Dense:
-        """Makes what the three gates add up to, side by side."""
+        """Makes one layer for all three gates, side by side."""
         if not self.uniform:
             return nn.Dense(3 * self.size, kernel_init=kernel, name=name)
         within = functools.partial(uniform, bound=1.0 / math.sqrt(self.size))
@@ -103,16 +104,16 @@ class Gru(nn.Module):
 def uniform(
     key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32, *, bound: float
 ) -> jax.Array:
-    """Draws numbers within +-`bound`, as Flax calls what initialises."""
+    """Draws numbers within +-`bound`, with the signature of Flax's initialisers."""
     return jax.random.uniform(key, shape, dtype, -bound, bound)
 
 
 def remember(seen: jax.Array, recalled: jax.Array, memory: jax.Array) -> jax.Array:
-    """Computes what is remembered after an observation.
+    """Computes the memory after an observation.
 
     Args:
-        seen: [B, 3 H], features times the kernel of what is seen, and its bias.
-        recalled: [B, 3 H], the memory times the kernel of what is recalled, and its bias.
+        seen: [B, 3 H], input weights times features, with their bias.
+        recalled: [B, 3 H], recurrent weights times memory, with their bias.
         memory: [B, H] before.
 
     Returns:
@@ -129,18 +130,18 @@ def remember(seen: jax.Array, recalled: jax.Array, memory: jax.Array) -> jax.Arr
 def remember_all(
     kernel: jax.Array, bias: jax.Array, seen: jax.Array, begins: jax.Array, memory: jax.Array
 ) -> jax.Array:
-    """Computes what is remembered after each observation of sequences.
+    """Computes the memory after each observation of sequences.
 
-    Its gradient is that of `remember`, step by step. Only what one step needs of the next is
-    computed in turn; autodiff would also add the kernel's gradient up in turn, from products that
+    Its gradient follows that of `remember`. Only terms that depend on the next step are computed
+    step by step. Autodiff would also sum the gradient of `kernel` step by step, from products that
     fill a small part of a GPU.
 
     Args:
-        kernel: [H, 3 H] of what is recalled.
-        bias: [3 H] likewise.
-        seen: [T, B, 3 H], as `remember` takes it.
+        kernel: [H, 3 H], recurrent weights.
+        bias: [3 H], recurrent bias.
+        seen: [T, B, 3 H], as for `remember`.
         begins: [T, B], whether an episode begins with the step.
-        memory: [B, H] before the first.
+        memory: [B, H] before the first step.
 
     Returns:
         The memory [T, B, H] after each step.
@@ -164,7 +165,7 @@ def _remember_forward(
 
 
 def _remember_backward(kept: tuple[jax.Array, ...], slope: jax.Array) -> tuple[Any, ...]:
-    """Takes the gradient [T, B, H] by what is remembered back to all that it came from."""
+    """Backpropagates from the memories [T, B, H] to all arguments."""
     kernel, bias, seen, begins, memory, every = kept
     before = jnp.concatenate([memory[None], every[:-1]])
     before = jnp.where(begins[..., None], 0.0, before)
@@ -192,7 +193,7 @@ remember_all.defvjp(_remember_forward, _remember_backward)
 
 
 def _recurrent(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
-    """Draws one orthogonal matrix [H, H] a gate, side by side."""
+    """Draws one orthogonal matrix [H, H] for each gate, side by side."""
     rows, columns = shape
     make = nn.initializers.orthogonal()
     gates = [make(each, (rows, columns // 3), dtype) for each in jax.random.split(key, 3)]

@@ -1,4 +1,4 @@
-"""Monte-Carlo returns, as PPO-PyTorch (nikhilbarhate99, commit 728cce8, `PPO.update`) has them."""
+"""Monte-Carlo returns, as in PPO-PyTorch (nikhilbarhate99, commit 728cce8, `PPO.update`)."""
 
 import chex
 import jax
@@ -6,18 +6,18 @@ import jax.numpy as jnp
 
 from swarmjax.shards import ALONE, Shards
 
-_EPSILON = 1e-7  # PPO-PyTorch's
+_EPSILON = 1e-7  # as in PPO-PyTorch
 
 
 def monte_carlo_returns(reward: jax.Array, boundary: jax.Array, *, discount: float) -> jax.Array:
-    """Sums up what is earned from each step to the next boundary, discounted, time first.
+    """Sums the discounted rewards from each step to the next boundary, time first.
 
-    Nothing is bootstrapped: at a boundary, and at the end of the rollout, the sum is cut as if
-    nothing more could be earned. Where an episode ends and no boundary is marked, the return goes
-    on into the next episode.
+    Nothing is bootstrapped: the sum ends at a boundary and at the end of the rollout, as if no more
+    rewards followed. If an episode ends without a boundary, the return goes on into the next
+    episode.
 
     Args:
-        reward: [T, ...], of step t.
+        reward: [T, ...], reward of step t.
         boundary: [T, ...], bool: the return of step t ends with its reward.
         discount: Per step, 0..1.
 
@@ -42,15 +42,15 @@ def monte_carlo_returns(reward: jax.Array, boundary: jax.Array, *, discount: flo
 def normalize(returns: jax.Array, valid: jax.Array, shards: Shards = ALONE) -> jax.Array:
     """Shifts and scales returns to mean 0 and deviation 1 over the valid samples.
 
-    The deviation is the unbiased one, of N - 1, plus 1e-7.
+    The deviation is the unbiased one, which divides by N - 1, plus 1e-7.
 
     Args:
         returns: [...].
-        valid: [...], bool or 0/1, of the same shape.
+        valid: [...], bool or 0/1.
         shards: How the samples are spread over devices.
 
     Returns:
-        The normalised returns, [...], of the others too.
+        The normalised returns, [...], including those that are not valid.
     """
     chex.assert_equal_shape([returns, valid])
     valid = valid.astype(bool)

@@ -26,17 +26,18 @@ _ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "swish": nn.swish}
 _OUTPUTS = {"linear": lambda mean: mean, "tanh": nn.tanh}
 
 # Gains of the orthogonal initialisation: Huang et al. 2022, "The 37 Implementation Details of
-# Proximal Policy Optimization", core detail 2. Theirs is 1 for the critic, whose rewards are scaled
-# to a return of about 1. Ours are metres: a critic that begins between -1 and 1 is wrong by more
-# than there is to earn, and the policy follows its errors (docs/results.md, "Why seeds were slow").
+# Proximal Policy Optimization", core detail 2. Theirs is 1 for the critic, because they scale
+# rewards to a return of about 1. Our returns are metres: a critic that begins between -1 and 1 is
+# wrong by more than a robot can earn, and the policy follows its errors (docs/results.md, "Why
+# seeds were slow").
 _HIDDEN_GAIN = math.sqrt(2.0)
 _HEAD_GAIN = 0.01
 
 
 class Hearing(NamedTuple):
-    """Where neighbours stand in an observation: `rows` of `width` entries each, from `first` on.
+    """The place of neighbours in an observation: `rows` of `width` entries each, from `first` on.
 
-    The first entry of a row says whether there is a neighbour, 1, or not, 0.
+    The first entry of a row is 1 if there is a neighbour, otherwise 0.
     """
 
     first: int
@@ -45,7 +46,7 @@ class Hearing(NamedTuple):
 
     @property
     def last(self) -> int:
-        """The entry behind them."""
+        """Index of the entry after the neighbours."""
         return self.first + self.rows * self.width
 
 
@@ -64,9 +65,10 @@ class _Torso(nn.Module):
 
 
 class _Head(nn.Module):
-    """An affine layer of features and, where there is one, the memory beside them.
+    """An affine layer of the features and, if there is one, the memory.
 
-    Both are multiplied by rows of one kernel, so that nothing is copied to put them side by side.
+    Features and memory are multiplied by different rows of one kernel, so they need not be copied
+    side by side.
     """
 
     config: AlgoConfig
@@ -130,18 +132,18 @@ class _Critic(nn.Module):
 
 
 def _hear(config: AlgoConfig, seen: jax.Array) -> jax.Array:
-    """Adds neighbours up: one layer (`hearing`) for each of them, and the sum of what comes out.
+    """Sums neighbours up: applies one layer (`hearing`) to each neighbour and adds the results.
 
-    The form of a function of a set: Zaheer et al. 2017, "Deep Sets", theorem 2. So their order is
-    of no matter, and neither is how many robots there are.
+    This is the form of a function of a set: Zaheer et al. 2017, "Deep Sets", theorem 2. The order
+    and the number of robots therefore do not matter.
 
     Args:
-        config: Says where they stand.
-        seen: [B, O] or, of a critic that sees more, [B, O + P].
+        config: Gives the neighbours' place.
+        seen: [B, O], or [B, O + P] for a critic that sees the state too.
 
     Returns:
-        [B, O - K W + E], or with P besides, E as wide as the first hidden layer; `seen` itself of
-        robots that do not hear.
+        [B, O - K W + E], or with P more. E is the width of the first hidden layer. Without
+        neighbour messages, `seen` unchanged.
     """
     hearing = config.hearing
     if hearing is None:
@@ -167,15 +169,15 @@ def _memory_size(config: AlgoConfig) -> int:
 
 
 def _torso(config: AlgoConfig) -> nn.Module:
-    """Makes what comes before the heads: hidden layers, or an extension's network."""
+    """Makes the layers before the heads: hidden layers, or an extension's network."""
     return _Torso(config, name="torso") if config.torso is None else config.torso(name="torso")
 
 
 def _initializers(config: AlgoConfig, inputs: int, gain: float) -> tuple[Any, Any]:
-    """Returns what draws kernel and bias of a layer; `gain` is that of an orthogonal kernel."""
+    """Returns initialisers of kernel and bias of a layer; `gain` is for orthogonal kernels."""
     if config.initialization == "orthogonal":
         return nn.initializers.orthogonal(gain), nn.initializers.zeros_init()
-    # What `torch.nn.Linear.reset_parameters` comes to: the bound of both is 1 / sqrt(inputs).
+    # `torch.nn.Linear.reset_parameters` does the same: the bound of both is 1 / sqrt(inputs).
     uniform = functools.partial(ppo_memory.uniform, bound=1.0 / math.sqrt(inputs))
     return uniform, uniform
 
@@ -191,15 +193,16 @@ def init_params(
 
     Args:
         key: Random key, consumed.
-        config: Layers, how they begin, and the initial standard deviation.
+        config: Layers, their initialisation, and the first standard deviation.
         observation_size: O.
         action_size: U.
-        state_size: P, what the critic sees besides.
+        state_size: P, how many numbers the critic sees in addition.
 
     Returns:
         `{"actor": {"torso": {"hidden_0": ..}, "mean": .., "log_std": [U]}, "critic": {"torso":
-        {"hidden_0": ..}, "value": ..}}`, each layer a dict of `kernel` [in, out] and `bias` [out];
-        with `config.memory`, `{"memory": {"input": .., "recurrent": ..}}` in each besides.
+        {"hidden_0": ..}, "value": ..}}`. Each layer is a dict of `kernel` [in, out] and `bias`
+        [out]. With `config.memory`, each network also has `{"memory": {"input": .., "recurrent":
+        ..}}`.
     """
     actor_key, critic_key = jax.random.split(key)
     seen, judged = (jnp.zeros(n) for n in (observation_size, observation_size + state_size))
@@ -215,11 +218,11 @@ def begin_memory(config: AlgoConfig, shape: tuple[int, ...]) -> Recall | None:
     """Returns the memory of episodes that begin.
 
     Args:
-        config: Says whether, and how much, is remembered.
-        shape: Axes before that of the memory.
+        config: Whether there is a memory, and its size.
+        shape: Leading axes.
 
     Returns:
-        [*shape, H] each, or None if nothing is remembered.
+        [*shape, H] each, or None without a memory.
     """
     if config.memory == "none":
         return None
@@ -229,25 +232,26 @@ def begin_memory(config: AlgoConfig, shape: tuple[int, ...]) -> Recall | None:
 def action_distribution(
     params: Params, config: AlgoConfig, observation: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Computes the diagonal Gaussian of the action of a policy without memory.
+    """Computes the diagonal Gaussian of the action, for a policy without memory.
 
     Args:
-        params: What `init_params` returned.
+        params: Result of `init_params`.
         config: The config that made `params`.
         observation: [B, O], normalised.
 
     Returns:
         The mean [B, U], within -1..1 if the output is tanh, otherwise unbounded, and the standard
-        deviation [U], which no observation changes, nor any gradient if it is scheduled.
+        deviation [U]. The deviation does not depend on the observation. If it is scheduled, it has
+        no gradient.
     """
     return recall_action(params, config, observation, None)[:2]
 
 
 def value(params: Params, config: AlgoConfig, observation: jax.Array) -> jax.Array:
-    """Computes the value of an observation, of a critic without memory.
+    """Computes the value of an observation, for a critic without memory.
 
     Args:
-        params: What `init_params` returned.
+        params: Result of `init_params`.
         config: The config that made `params`.
         observation: [B, O + P], normalised, as in `recall_value`.
 
@@ -264,17 +268,18 @@ def recall_action(
     memory: jax.Array | None,
     begins: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
-    """Computes the diagonal Gaussian of the action, and what is remembered.
+    """Computes the diagonal Gaussian of the action, and the memory.
 
     Args:
-        params: What `init_params` returned.
+        params: Result of `init_params`.
         config: The config that made `params`.
         observation: [B, O], normalised, or [T, B, O] of sequences.
-        memory: [B, H] of the actor before; None without memory.
-        begins: [T, B] of sequences, whether an episode begins with the step; None of one step.
+        memory: [B, H], memory of the actor before; None without memory.
+        begins: [T, B] of sequences, whether an episode begins with the step; None for a single
+            step.
 
     Returns:
-        Mean and standard deviation as `action_distribution`, and the memory [B, H] after.
+        Mean and standard deviation as in `action_distribution`, and the memory [B, H] after.
     """
     _check_input(params["actor"], observation, config)
     actor = _Actor(config, params["actor"]["log_std"].shape[-1])
@@ -292,14 +297,14 @@ def recall_value(
     memory: jax.Array | None,
     begins: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array | None]:
-    """Computes the value of an observation, and what is remembered.
+    """Computes the value of an observation, and the memory.
 
     Args:
-        params: What `init_params` returned.
+        params: Result of `init_params`.
         config: The config that made `params`.
-        observation: [B, O + P] or [T, B, O + P], normalised: what the policy sees, and after it
-            the state that the critic sees besides, if any.
-        memory: [B, H] of the critic before; None without memory.
+        observation: [B, O + P] or [T, B, O + P], normalised: the policy's observation, followed by
+            the state that the critic sees in addition, if any.
+        memory: [B, H], memory of the critic before; None without memory.
         begins: As in `recall_action`.
 
     Returns:
@@ -311,14 +316,14 @@ def recall_value(
 
 
 def critic_input(observation: jax.Array, state: jax.Array | None) -> jax.Array:
-    """Puts together what a critic sees.
+    """Joins the critic's inputs.
 
     Args:
         observation: [B, O], normalised.
-        state: [B, P], what the critic sees besides; None if nothing.
+        state: [B, P], what the critic sees in addition; None if nothing.
 
     Returns:
-        [B, O + P], as `recall_value` takes it.
+        [B, O + P], for `recall_value`.
     """
     return observation if state is None else jnp.concatenate([observation, state], axis=-1)
 
@@ -330,7 +335,7 @@ def beyond_range(mean: jax.Array) -> jax.Array:
         mean: [B, U], -1..1 spans the commands.
 
     Returns:
-        [B, U]: 0 within the range, below 0 under it, above 0 over it.
+        [B, U]: 0 within the range, negative below it, positive above it.
     """
     return mean - jnp.clip(mean, -1.0, 1.0)
 
@@ -341,7 +346,7 @@ def log_prob(mean: jax.Array, std: jax.Array, action: jax.Array) -> jax.Array:
     Args:
         mean: [B, U].
         std: [U], above 0.
-        action: [B, U], as drawn: whoever bounds it does so afterwards.
+        action: [B, U], as drawn, before any clipping.
 
     Returns:
         The log density summed over U, [B].
@@ -367,7 +372,7 @@ def entropy(std: jax.Array) -> jax.Array:
 
 
 def _check_input(network: Params, observation: jax.Array, config: AlgoConfig) -> None:
-    """Holds an observation to the size that hidden layers take; other networks check it."""
+    """Checks that an observation has the size of the hidden layers; other networks check theirs."""
     first = network.get("torso", {}).get("hidden_0", {})
     if "kernel" in first:
         size = first["kernel"].shape[-2]
@@ -377,16 +382,16 @@ def _check_input(network: Params, observation: jax.Array, config: AlgoConfig) ->
 
 
 def bind_hearing(config: AlgoConfig, observation_size: int, count: int, width: int) -> AlgoConfig:
-    """Tells a config where neighbours stand in an observation: at its end.
+    """Adds the place of neighbours in an observation, its end, to a config.
 
     Args:
-        config: Of the learner.
+        config: Settings of the learner.
         observation_size: O.
-        count: K, how many neighbours are heard; 0: robots do not hear.
-        width: W, entries of each.
+        count: K, how many neighbours a robot hears; 0: robots do not hear.
+        width: W, entries for each neighbour.
 
     Returns:
-        The config with its `hearing`; as it is where robots do not hear.
+        The config with its `hearing`; unchanged if robots do not hear.
     """
     if not count:
         return config
@@ -396,16 +401,16 @@ def bind_hearing(config: AlgoConfig, observation_size: int, count: int, width: i
 def bind(
     config: AlgoConfig, networks: Sequence[Network], observation_size: int, state_size: int = 0
 ) -> AlgoConfig:
-    """Gives a config the module that it names.
+    """Adds the module that a config names to the config.
 
     Args:
-        config: Names a network, or leaves it to the extension.
-        networks: Of an extension.
+        config: Names a network, or leaves the choice to the extension.
+        networks: Networks of an extension.
         observation_size: O.
-        state_size: P, what the critic sees besides.
+        state_size: P, how many numbers the critic sees in addition.
 
     Returns:
-        The config with the module as its `torso`; as it is where that is `mlp`.
+        The config with the module as its `torso`; unchanged for `mlp`.
 
     Raises:
         ConfigError: The network is missing, or does not return features.

@@ -1,8 +1,8 @@
 """Running mean and variance of observations.
 
-Not Brax's `running_statistics`: importing that loads MuJoCo, MJX and Warp, which nothing here
-needs, and a first batch without a valid sample (a learner that has nothing to learn from yet) makes
-it divide 0 by 0.
+Brax's `running_statistics` is unsuitable: importing it loads MuJoCo, MJX and Warp, which this
+package does not need. It also divides 0 by 0 if the first batch has no valid sample, as happens to
+a learner whose robots are still absent.
 """
 
 import chex
@@ -12,7 +12,7 @@ from flax import struct
 
 from swarmjax.shards import ALONE, Shards
 
-# An observation that has hardly moved so far is magnified by at most 1 / this.
+# An observation that has hardly varied yet is magnified by at most 1 / this.
 MIN_STD = 1e-3
 
 
@@ -21,8 +21,8 @@ class Normalizer:
     """Mean and variance of the observations seen so far.
 
     Attributes:
-        count: [], float32, number of observations. Beyond 2**24 it rounds, which is harmless:
-            it only weighs a batch against the past, and a relative error of 2**-24 is nothing.
+        count: [], float32, number of observations. It rounds beyond 2**24. That is harmless: it
+            only weighs a batch against the past, and a relative error of 2**-24 is negligible.
         mean: [O].
         variance: [O], of the population; 1 before the first observation.
     """
@@ -38,7 +38,7 @@ class Normalizer:
 
 
 def init(observation_size: int) -> Normalizer:
-    """Returns a normalizer that has seen nothing and changes nothing."""
+    """Returns a new normalizer, which changes nothing yet."""
     return Normalizer(
         count=jnp.zeros((), jnp.float32),
         mean=jnp.zeros((observation_size,), jnp.float32),
@@ -49,11 +49,11 @@ def init(observation_size: int) -> Normalizer:
 def update(
     normalizer: Normalizer, observation: jax.Array, valid: jax.Array, shards: Shards = ALONE
 ) -> Normalizer:
-    """Takes a batch of observations in.
+    """Adds a batch of observations.
 
-    Merges the moments of two sets as in Chan, Golub and LeVeque 1983, "Algorithms for Computing
-    the Sample Variance: Analysis and Recommendations". The batch's own moments are taken in two
-    passes, so nothing is lost to the subtraction of large squares.
+    It merges the moments of two sets as in Chan, Golub and LeVeque 1983, "Algorithms for Computing
+    the Sample Variance: Analysis and Recommendations". The batch's own moments take two passes,
+    which avoids subtracting large squares.
 
     Args:
         normalizer: Moments so far.
@@ -62,7 +62,7 @@ def update(
         shards: How the observations are spread over devices.
 
     Returns:
-        The moments of all observations; the same as before if none is valid.
+        The moments of all observations; unchanged if none is valid.
     """
     chex.assert_shape(observation, (*valid.shape, *normalizer.mean.shape))
     axes = tuple(range(valid.ndim))

@@ -1,4 +1,4 @@
-"""The optimiser, and the one step that every way of computing a gradient ends in."""
+"""The optimiser, and the step that every way of computing a gradient ends with."""
 
 from typing import Any
 
@@ -11,8 +11,8 @@ from swarmjax.ppo.losses import Metrics
 from swarmjax.ppo.networks import Params
 from swarmjax.shards import ALONE, Shards
 
-# The metrics of a step: those of `losses.ppo_loss`, the norm of the gradient before clipping, and 1
-# if the step was taken, and if it was skipped.
+# The metrics of a step: those of `losses.ppo_loss`, the norm of the gradient before clipping, and
+# two flags that are 1 if the step was taken, or skipped.
 METRICS = (
     "approx_kl",
     "bound_loss",
@@ -27,17 +27,17 @@ METRICS = (
 
 Progress = tuple[Params, optax.OptState]
 
-# The rule of `learning_rates`. Runs of 128 to 8,192 arenas end well if their rates, summed over the
-# gradient steps, are those of 6,000 to 15,000 steps at 3e-4 that fall to 0; larger sums end worse
-# (docs/results.md, "Why more training made the swarm worse").
+# The rule of `learning_rates`. Runs of 128 to 8,192 arenas ended well when their rates, summed over
+# the gradient steps, equalled those of 6,000 to 15,000 steps that fall from 3e-4 to 0. Larger sums
+# ended worse (docs/results.md, "Why more training made the swarm worse").
 _RATES = {"actor": 3e-4, "critic": 1e-3}
 _FULL_RATE_STEPS = 15_000
-# Mean over the run of what a schedule makes of a rate.
+# Mean over the run of the factor that a schedule applies to a rate.
 _MEAN_OF_SCHEDULE = {"constant": 1.0, "linear": 0.5}
 
 
 def gradient_steps(config: AlgoConfig, updates: int) -> int:
-    """Counts the gradient steps of a run, those without a valid sample among them.
+    """Counts the gradient steps of a run, including those without a valid sample.
 
     Args:
         config: Passes over each rollout, and minibatches of each pass.
@@ -49,8 +49,8 @@ def gradient_steps(config: AlgoConfig, updates: int) -> int:
 def learning_rates(config: AlgoConfig, updates: int) -> dict[str, float]:
     """Chooses the learning rates that a run begins with.
 
-    A rate that the config leaves open is `_RATES`, times what keeps the sum of rates over the run
-    at or below that of `_FULL_RATE_STEPS` steps that fall linearly to 0.
+    If the config leaves a rate open, it is `_RATES` times a share of at most 1. The share keeps the
+    sum of rates over the run at or below that of `_FULL_RATE_STEPS` steps that fall linearly to 0.
 
     Args:
         config: Learning rates, or None for the rule; their schedule.
@@ -74,7 +74,7 @@ def make(config: AlgoConfig, updates: int) -> optax.GradientTransformation:
         updates: Number of updates of the whole run: the learning rate's horizon.
 
     Returns:
-        An optimiser of `{"actor": .., "critic": ..}`.
+        An optimiser for `{"actor": .., "critic": ..}`.
     """
     rates, steps = learning_rates(config, updates), gradient_steps(config, updates)
 
@@ -102,28 +102,28 @@ def take(
     any_valid: jax.Array,
     shards: Shards = ALONE,
 ) -> tuple[Progress, Metrics]:
-    """Takes a step along a gradient; none at all if no sample is valid.
+    """Takes a step along a gradient, unless no sample is valid.
 
     Devices add up their gradients and metrics, and take the same step.
 
-    A step is skipped, and counted, if a number of its gradient, or of what it leads to, is not
-    finite. `optax.apply_if_finite` looks at the gradient alone, so that an optimiser whose state is
-    broken would break the parameters, and after some skips it takes such a step.
+    A step is skipped, and counted, if its gradient or its result is not finite.
+    `optax.apply_if_finite` is not enough: it checks the gradient alone, so a broken optimiser state
+    would break the parameters. After some skips it also takes such a step anyway.
 
     Args:
-        config: Of the optimiser.
-        updates: As given to `make`.
+        config: Settings of the optimiser.
+        updates: The value given to `make`.
         progress: Parameters and the optimiser's state before.
         found: The gradient, and the metrics of its loss.
-        any_valid: [], whether the gradient is of any valid sample.
+        any_valid: [], whether the gradient includes a valid sample.
         shards: How the samples are spread over devices.
 
     Returns:
-        Parameters and the optimiser's state after, and the metrics with `grad_norm`,
-        `taken_steps` and `skipped_steps`, which are zero in a skipped step but for the last.
+        Parameters and the optimiser's state after, and the metrics with `grad_norm`, `taken_steps`
+        and `skipped_steps`. In a skipped step all metrics but `skipped_steps` are zero.
     """
     params, optimizer_state = progress
-    # In one sum: on several devices each one costs tens of microseconds, whatever its size.
+    # One sum for all: on several devices each sum takes tens of microseconds, whatever its size.
     (gradient, metrics), devices = shards.sum((found, any_valid.astype(jnp.float32)))
     any_valid = devices > 0.0
     metrics["grad_norm"] = optax.tree.norm(gradient)
@@ -134,27 +134,27 @@ def take(
     metrics["skipped_steps"] = (any_valid & ~finite).astype(jnp.float32)
     taken = any_valid & finite
     metrics["taken_steps"] = taken.astype(jnp.float32)
-    # Adam moves by its momentum even where the gradient is zero.
+    # Adam's momentum would move the parameters even where the gradient is zero.
     return jax.tree.map(lambda new, old: jnp.where(taken, new, old), stepped, progress), metrics
 
 
 def _is_finite(tree: Any) -> jax.Array:
-    """Tells whether all numbers of a tree are finite: their sum is not if one is not."""
+    """Tells whether all numbers of a tree are finite: otherwise their sum is not finite either."""
     return jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves(tree)))
 
 
 def mean_of_taken(metrics: Metrics) -> Metrics:
-    """Sums up the steps of an update.
+    """Averages the metrics over the steps of an update.
 
     Args:
-        metrics: Of its steps, any shape, as `take` gives them.
+        metrics: Metrics of its steps, any shape, from `take`.
 
     Returns:
-        The means over the steps that were taken, [], and the number of `skipped_steps`. Without a
-        step that was taken, the means are NaN if one was skipped, and 0 if there was none.
+        The means over the steps taken, [], and the number of `skipped_steps`. If no step was taken,
+        the means are NaN if one was skipped, and 0 otherwise.
     """
     taken, skipped = jnp.sum(metrics["taken_steps"]), jnp.sum(metrics["skipped_steps"])
-    # Exactly 1 in an update whose steps were all taken.
+    # Exactly 1 if all steps of the update were taken.
     share = metrics["taken_steps"].size / jnp.maximum(taken, 1.0)
     share = jnp.where((taken == 0) & (skipped > 0), jnp.nan, share)
     means = {name: jnp.mean(metric) * share for name, metric in metrics.items()}

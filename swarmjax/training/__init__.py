@@ -1,6 +1,6 @@
-"""The compiled side of a run: one program that drives, learns and decides, n times over.
+"""The compiled program of a run: it drives, learns and decides, for a given number of updates.
 
-Imports `task`, `sim`, `ppo` and `curriculum`. `config.py` has what fixes the program, `program.py`
-builds it, `rollout.py` drives the arenas, `loop.py` joins it all, `seeds.py` runs several at once.
-Start with `loop.update`.
+It imports `task`, `sim`, `ppo` and `curriculum`. `config.py` has the settings that fix the program,
+and `program.py` builds it. `rollout.py` drives the arenas, `loop.py` joins all steps of an update,
+and `seeds.py` runs several seeds at once. Start with `loop.update`.
 """

@@ -12,14 +12,14 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig
 from swarmjax.task.stage_config import StageConfig
 
-# Control steps of a rollout for which one episode of each arena is drawn; the shortest that the
-# six stages have take 23.
+# Each arena gets one waiting episode per this many control steps of a rollout. The shortest
+# episodes of the six stages take 23 steps.
 _STEPS_PER_EPISODE = 32
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProgramConfig(Section):
-    """What fixes the compiled program, whoever calls it and wherever it is written down."""
+    """The settings that fix the compiled program, for every caller and every file."""
 
     stage: tuple[StageConfig, ...]
     robot: RobotConfig = field(default_factory=RobotConfig)
@@ -34,15 +34,16 @@ class ProgramConfig(Section):
             "runs trained at once, of seed, seed + 1, ...",
             1,
             4096,
-            reason="a call of the compiled program reports 4096 rows, one a seed. Train more in a "
-            "second run, with seed=4096",
+            reason="a call of the compiled program reports 4096 rows, one per seed. Train more in "
+            "a second run, with seed=4096",
         ),
     )
     seeds_by: Literal["vmap", "map", "cores", "devices"] = field(
         default="vmap",
         metadata=about(
-            "vmap: side by side; map: in turn, each as it would be alone, bit for bit; cores: "
-            "vmap, in a group for each core of a CPU; devices: vmap, in a group for each device"
+            "vmap: side by side; map: one after the other, bit for bit as in a run of one seed; "
+            "cores: vmap, in a group for each core of a CPU; devices: vmap, in a group for each "
+            "device"
         ),
     )
     arenas: int = field(
@@ -51,13 +52,15 @@ class ProgramConfig(Section):
     )
     devices: int = field(
         default=1,
-        metadata=about("that share the arenas of every seed, or by seeds_by the seeds", 1, 2**16),
+        metadata=about(
+            "devices that share every seed's arenas; with seeds_by=devices, the seeds", 1, 2**16
+        ),
     )
     streams: int | None = field(
         default=None,
         metadata=about(
-            "of random numbers, a multiple of devices: with as many, a run draws the same on fewer "
-            "or more devices; null: devices",
+            "random streams, a multiple of devices; a run with as many draws the same on fewer or "
+            "more devices; null: devices",
             1,
             2**16,
         ),
@@ -67,7 +70,7 @@ class ProgramConfig(Section):
     )
     realism: RealismConfig = field(default_factory=RealismConfig)
     extensions: str | None = field(
-        default=None, metadata=about("Python file with pieces of your own; it is run")
+        default=None, metadata=about("Python file with your own extension; it is executed")
     )
     pieces: dict[str, dict[str, str]] = field(
         default_factory=ByName,
@@ -76,30 +79,30 @@ class ProgramConfig(Section):
 
     @property
     def arena_devices(self) -> int:
-        """Devices that share the arenas of a seed."""
+        """Number of devices that share the arenas of a seed."""
         return 1 if self.seeds_by == "devices" else self.devices
 
     @property
     def stream_count(self) -> int:
-        """Streams of random numbers of a seed."""
+        """Number of random streams of a seed."""
         return self.streams or self.arena_devices
 
     @property
     def updates(self) -> int:
-        """Updates that the budget pays for; what is left over is not spent."""
+        """Number of whole updates in the budget; the rest of the budget is not spent."""
         return self.budget // (self.arenas * self.algo.rollout_length)
 
     @property
     def learners(self) -> int:
-        """Actor-critics that are trained: one, or one for each robot."""
+        """Number of trained actor-critics: one, or one for each robot."""
         return self.sim.robots if self.algo.policy == "independent" else 1
 
     @property
     def numbers(self) -> range:
-        """The seeds of a run, in the order of their axis."""
+        """The seeds of a run, in the order of the seed axis."""
         return range(self.seed, self.seed + self.seeds)
 
     @property
     def waiting(self) -> int:
-        """Episodes that are drawn for each arena ahead of a rollout."""
+        """Number of episodes that are drawn for each arena before a rollout."""
         return max(1, self.algo.rollout_length // _STEPS_PER_EPISODE)

@@ -1,6 +1,7 @@
 """`run.episodes`: a line of `episodes.jsonl` for each episode that ended, robot by robot.
 
-The compiled loop hands them on packed: of a rollout the steps at which none ended are left out.
+The compiled loop returns the episodes of a rollout packed: steps without an ended episode are left
+out.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,21 +16,21 @@ from jax import Array
 from swarmjax.task.episode import Ended, Robots
 from swarmjax.training.config import ProgramConfig
 
-KEY = "episodes_log"  # of the metrics of an update, beside its numbers
-MOST_HELD = 2**19  # episodes that a call may hand on, over all updates and seeds
+KEY = "episodes_log"  # key in the metrics of an update
+MOST_HELD = 2**19  # most episodes that a call may return, over all updates and seeds
 
 Row = dict[str, Any]
 
 
 class EpisodeLog(NamedTuple):
-    """Episodes that ended in one update, in the order in which they ended; E fit in.
+    """Episodes that ended in one update, in the order in which they ended, at most E.
 
     Attributes:
-      ended: [] how many, int32; if more than E, the last ones are lost.
-      arena_steps: [E] control steps of all arenas together in the update by its end.
-      stage: [E] on which it began.
+      ended: [] number of episodes, int32; if more than E, the last ones are lost.
+      arena_steps: [E] control steps of all arenas in the update until the episode ended.
+      stage: [E] stage on which the episode began.
       steps: [E] control steps.
-      robots: [E] what became of each robot.
+      robots: [E] outcome for each robot.
     """
 
     ended: Array
@@ -40,29 +41,29 @@ class EpisodeLog(NamedTuple):
 
 
 def room(config: ProgramConfig) -> int:
-    """Returns how many episodes of one update and seed fit in.
+    """Returns the most episodes of one update and seed that are kept.
 
-    One more for each arena than wait for it, the one that is under way; or as many as a step limit
-    ends, where that is shorter; or one at each control step, of which there are no more.
+    For each arena these are the waiting episodes and the one under way, or, if more, as many as the
+    step limit ends. No arena ends more than one episode at each control step.
     """
     steps, limit = config.algo.rollout_length, config.task.step_limit
     return config.arenas * min(steps, max(config.waiting, steps // limit) + 1)
 
 
 def rows_of_call(config: ProgramConfig) -> int:
-    """Returns how many updates of each seed a call may hand on."""
+    """Returns for how many updates of each seed a call may return episodes."""
     return max(1, MOST_HELD // (room(config) * config.seeds))
 
 
 def pack(ended: Ended, size: int) -> EpisodeLog:
-    """Leaves out where no episode ended.
+    """Drops the places where no episode ended.
 
     Args:
       ended: [T, A], with `robots`.
       size: E.
 
     Returns:
-      The episodes, first by the step at which they ended, then by arena; what follows them is 0.
+      The episodes, ordered by the step at which they ended, then by arena; the rest is 0.
     """
     chex.assert_rank(ended.episodes, 2)
     assert ended.robots is not None
@@ -93,14 +94,15 @@ def rows(
     """Turns the episodes of a call into rows for JSON.
 
     Args:
-      log: [N, rows, ...], of which each seed's first n hold an update each.
-      updates: [n] their numbers.
-      stages: names.
-      seeds: [N], the run's.
+      log: [N, rows, ...]; the first n rows of each seed hold one update each.
+      updates: [n] numbers of the updates.
+      stages: names of the stages.
+      seeds: [N] seeds of the run.
       control_steps: arena control steps of one update and seed, over all arenas.
 
     Returns:
-      The rows, by update, then seed, then as they ended; and how many episodes were lost.
+      The rows, by update, then seed, then in the order of their ends; and the number of lost
+      episodes.
     """
     found, lost = [], 0
     for i, update in enumerate(updates.tolist()):
@@ -115,7 +117,7 @@ def rows(
 
 
 def _row(log: EpisodeLog, index: int, stages: Sequence[str], before: int) -> Row:
-    """Describes one episode, of the robots that took part."""
+    """Describes one episode, with the robots that were present."""
     present = np.asarray(log.robots.present[index])
     values: Mapping[str, np.ndarray] = log.robots._asdict()
     by_robot = {

@@ -1,7 +1,7 @@
-"""The compiled training loop: rollout, advantages, PPO update, curriculum, n times over.
+"""The compiled training loop: rollout, advantages, PPO update, curriculum, n times.
 
-One program serves every chunk size, because the number of updates is an argument of it; and any
-chunk size gives the same run.
+The number of updates is an argument, so one program serves every chunk size. Any chunk size gives
+the same run.
 """
 
 from dataclasses import replace
@@ -26,10 +26,10 @@ from swarmjax.training.practice import LevelSource
 from swarmjax.training.program import Program
 from swarmjax.training.rollout import Arena
 
-# Two rounds of a loop as one, so that what a round hands to the next need not be copied first: the
-# step of 8,192 arenas took 542 us instead of 606 on an H100 (docs/performance.md).
+# XLA then runs two iterations of a loop as one, so it need not copy what one iteration passes to
+# the next: a step of 8,192 arenas took 542 us instead of 606 on an H100 (docs/performance.md).
 _GPU_OPTIONS = {"xla_gpu_enable_while_loop_unrolling": "WHILE_LOOP_UNROLLING_DOUBLE_BUFFER"}
-# XLA then chooses no kernel by timing it, and none that adds in an order that varies.
+# XLA then does not choose kernels by timing them, and uses none that adds in a varying order.
 _DETERMINISTIC = {"xla_gpu_deterministic_ops": True}
 
 Metrics = dict[str, Any]
@@ -37,14 +37,14 @@ Metrics = dict[str, Any]
 
 @struct.dataclass
 class TrainState:
-    """All that changes in a run: a checkpoint holds exactly this.
+    """The complete state of a run: a checkpoint holds exactly this.
 
     Attributes:
       learners: [L].
       arenas: [A], packed.
-      curriculum: where it stands.
+      curriculum: state of the curriculum.
       key: random key of the next update.
-      update: [] updates done, int32.
+      update: [] number of finished updates, int32.
     """
 
     learners: LearnerState
@@ -58,9 +58,9 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
     """Starts a run.
 
     Args:
-      program: the compiled side.
+      program: the compiled program.
       schedule: the curriculum's numbers.
-      seed: [] of the run, int32; the config's if there is none.
+      seed: [] seed of the run, int32; None: the config's.
 
     Returns:
       The state before the first update.
@@ -85,15 +85,15 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
 
 
 def draw_arenas(program: Program, schedule: Schedule, state: TrainState) -> TrainState:
-    """Draws the arenas of a run whose checkpoint holds none.
+    """Draws the arenas of a run whose checkpoint has none.
 
     Args:
-      program: the compiled side.
+      program: the compiled program.
       schedule: the curriculum's numbers.
-      state: without arenas (None).
+      state: state without arenas (None).
 
     Returns:
-      The state with arenas, and with a cohort of the curriculum that begins with them.
+      The state with arenas, and with a new cohort of the curriculum.
     """
     key, level_key = jax.random.split(state.key)
     curriculum = curricula.begin_cohort(state.curriculum)
@@ -107,16 +107,16 @@ def train_chunk(
     """Trains for `n` updates; `jit` it with `program` bound and `state` donated.
 
     Args:
-      program: the compiled side.
+      program: the compiled program.
       schedule: the curriculum's numbers.
-      state: before.
-      n: [] updates to do, at most `program.rows`, int32.
+      state: state before.
+      n: [] number of updates, at most `program.rows`, int32.
 
     Returns:
-      The state after, and metrics with a leading axis of `program.rows`: the first n rows hold
-      an update each.
+      The state after, and metrics with a leading axis of `program.rows`: the first n rows hold one
+      update each.
     """
-    # Traced once, for the shapes and for the loop.
+    # Traced once, for both the shapes and the loop.
     step = jax.jit(partial(update, program), inline=True)
     one = step.eval_shape(schedule, state)[1]
     blank = jax.tree.map(lambda x: jnp.zeros((program.rows, *x.shape), x.dtype), one)
@@ -129,12 +129,12 @@ def train_chunk(
 
 
 def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[TrainState, Metrics]:
-    """One update: every arena drives for one rollout, the learners learn, the curriculum decides.
+    """Runs one update: the arenas drive for a rollout, the learners learn, the curriculum decides.
 
     Args:
-      program: the compiled side.
+      program: the compiled program.
       schedule: the curriculum's numbers.
-      state: before.
+      state: state before.
 
     Returns:
       The state after, and the metrics of this update.
@@ -191,7 +191,7 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
 
 
 def _every_source(arenas: Arena, waiting: Arena) -> LevelSource | None:
-    """Lists what the episodes of a rollout begin on, [J, A]; None without a buffer of levels."""
+    """Lists the level sources of a rollout's episodes, [J, A]; None without a buffer of levels."""
     if arenas.source is None or waiting.source is None:
         return None
     return practice.line_up(arenas.source, waiting.source)
@@ -205,7 +205,7 @@ def _practise(
     ended: Ended,
     curriculum: Curriculum,
 ) -> tuple[Arena, Curriculum, Metrics]:
-    """Takes the episodes of a rollout into the buffer of levels."""
+    """Adds the episodes of a rollout to the buffer of levels."""
     config, source, loss = program.config.curriculum, arenas.source, None
     assert curriculum.levels is not None
     assert source is not None
@@ -223,7 +223,7 @@ def _practise(
 
 
 def _assigned(program: Program, curriculum: Curriculum) -> Array:
-    """Says on which stage the next episode of each arena of this device begins."""
+    """Returns the stage on which the next episode of each arena of this device begins."""
     return program.shards.local(curricula.assign(curriculum, program.config.arenas))
 
 
@@ -235,14 +235,14 @@ def _draw_first(program: Program, schedule: Schedule, curriculum: Curriculum, ke
 def _draw_waiting(
     program: Program, schedule: Schedule, curriculum: Curriculum, key: Array
 ) -> Arena:
-    """Draws the episodes that wait for the arenas of this device during a rollout."""
+    """Draws the waiting episodes for the arenas of this device, before a rollout."""
     return _draw(program, schedule, curriculum, key, waiting=program.config.waiting)
 
 
 def _draw(
     program: Program, schedule: Schedule, curriculum: Curriculum, key: Array, *, waiting: int
 ) -> Arena:
-    """Draws so many episodes for each arena of this device."""
+    """Draws `waiting` episodes for each arena of this device."""
     config = program.config
     return rollout.draw_starts(
         program.world,
@@ -257,12 +257,12 @@ def _draw(
 
 
 def _mix(stage: Array, stages: int) -> Array:
-    """Counts the arenas by the stages [A] that they are on."""
+    """Counts the arenas on each stage, from the stage of each arena [A]."""
     return jnp.sum(stage == jnp.arange(stages)[:, None], axis=-1, dtype=jnp.int32)
 
 
 def _curriculum_metrics(before: Curriculum, after: Curriculum, decision: Decision) -> Metrics:
-    """What was decided, the weights that were decided by it or held, and how each stage goes."""
+    """Reports the decision, the weights that it set or held, and the record of each stage."""
     record = after.record
     return {
         "decision": decision.reason,
@@ -281,14 +281,14 @@ def _curriculum_metrics(before: Curriculum, after: Curriculum, decision: Decisio
 
 
 def _learner_metrics(learned: Metrics, batch: Batch, shards: Shards) -> Metrics:
-    """Averages [L] over the learners that had anything to learn from."""
+    """Averages [L] over the learners that had a valid sample."""
     learns = shards.any(jnp.any(batch.valid, axis=(1, 2)))
     count = jnp.maximum(jnp.sum(learns), 1)
     return {name: jnp.sum(jnp.where(learns, x, 0.0)) / count for name, x in learned.items()}
 
 
 def _episode_metrics(ended: Ended, stage: Array) -> Metrics:
-    """Sums over the episodes that ended in this update on the stage that is being trained."""
+    """Sums over the episodes that ended in this update on the current training stage."""
     mine = ended.stage == stage
 
     def total(x: Array) -> Array:
@@ -311,7 +311,7 @@ def _episode_metrics(ended: Ended, stage: Array) -> Metrics:
 
 
 def compiler_options(*, deterministic: bool = False) -> dict[str, str | bool]:
-    """Says what XLA is told for loops like this one on the device that JAX computes on.
+    """Returns XLA's options for loops like this one on JAX's current device.
 
     Args:
       deterministic: Whether a GPU must compute the same bits each time. A CPU always does.

@@ -1,8 +1,8 @@
-"""A run over several devices: one program on each, with a share of the arenas or of the seeds.
+"""A run over several devices: each runs one program, with a share of the arenas or of the seeds.
 
-Where arenas are shared, what is learned and decided is the same on every device (`Shards`), so only
-the arenas are spread. Where seeds are shared (`seeds_by=devices`), nothing passes between devices.
-With one device there is no mesh, and the program is that of `seeds`.
+If devices share the arenas, only the arenas are spread: every device learns and decides the same
+(`Shards`). If devices share the seeds (`seeds_by=devices`), they exchange nothing. With one device
+there is no mesh, and the program is that of `seeds`.
 """
 
 from collections.abc import Callable
@@ -25,16 +25,16 @@ from swarmjax.training.program import Program
 
 _ALL: Any = PartitionSpec()
 _SEEDS: Any = PartitionSpec("seeds")
-_ARENAS: Any = PartitionSpec(None, AXIS)  # the axis before is that of the seeds
+_ARENAS: Any = PartitionSpec(None, AXIS)  # the first axis is the seeds'
 
 
 class _Layout(NamedTuple):
-    """How a run is spread.
+    """How a run is spread over devices.
 
     Attributes:
-      mesh: The devices.
-      lanes: What is spread of arrays with an axis of seeds.
-      state: The same, of each part of a state.
+      mesh: the devices.
+      lanes: sharding of arrays with a seed axis.
+      state: sharding of each part of a state.
     """
 
     mesh: Mesh
@@ -43,7 +43,7 @@ class _Layout(NamedTuple):
 
     @property
     def shardings(self) -> Any:
-        """Of each part of a state."""
+        """Sharding of each part of a state, on the mesh."""
         return jax.tree.map(
             partial(NamedSharding, self.mesh),
             self.state,
@@ -60,10 +60,10 @@ def _layout(config: ProgramConfig) -> _Layout:
 
 
 def make(devices: int, axis: str = AXIS) -> Mesh:
-    """Makes the mesh of the first devices that JAX knows, those of all hosts among them.
+    """Makes the mesh of the first devices that JAX knows, including those of other hosts.
 
     Raises:
-      ConfigError: if there are fewer.
+      ConfigError: there are fewer devices.
     """
     found = jax.device_count()
     if devices > found:
@@ -76,13 +76,14 @@ def make(devices: int, axis: str = AXIS) -> Mesh:
 
 
 def init(program: Program) -> Callable[[Schedule], TrainState]:
-    """Returns what starts every seed of a run, as `seeds.init` does; `jit` it.
+    """Returns a function that starts every seed of a run, as `seeds.init` does; `jit` it.
 
     Args:
-      program: the compiled side.
+      program: the compiled program.
 
     Returns:
-      From the curriculum's numbers to the states [N] before the first update, spread over devices.
+      A function from the curriculum's numbers to the states [N] before the first update, spread
+      over devices.
     """
     if program.config.devices == 1:
         return partial(seeds.init, program)
@@ -102,9 +103,9 @@ def draw_arenas(program: Program, schedule: Schedule, state: TrainState) -> Trai
     """Draws the arenas of every seed, as `seeds.draw_arenas` does.
 
     Args:
-      program: the compiled side.
+      program: the compiled program.
       schedule: the curriculum's numbers.
-      state: [N] without arenas (None), spread over devices.
+      state: [N] states without arenas (None), spread over devices.
 
     Returns:
       [N] states with arenas.
@@ -124,10 +125,10 @@ def draw_arenas(program: Program, schedule: Schedule, state: TrainState) -> Trai
 
 
 def jit_chunk(program: Program) -> Any:
-    """Jits what trains every seed for some updates, as `seeds.train_chunk` does.
+    """Jits the function that trains every seed for some updates, as `seeds.train_chunk` does.
 
     Args:
-      program: the compiled side.
+      program: the compiled program.
 
     Returns:
       The jitted function; it donates the state, whose arenas are spread over devices.
@@ -153,11 +154,11 @@ def jit_chunk(program: Program) -> Any:
 
 
 def put(program: Program, state: TrainState) -> TrainState:
-    """Spreads a state that every process holds whole over the devices of the program.
+    """Spreads a state over the devices of the program; every process holds the whole state.
 
     Args:
-      program: the compiled side.
-      state: [N], of all arenas, or without arenas (None).
+      program: the compiled program.
+      state: [N] states with all arenas, or without arenas (None).
 
     Returns:
       The same state.
@@ -176,22 +177,22 @@ def bytes_each(config: ProgramConfig, state: TrainState) -> int:
     """Returns the bytes of a state that one device holds.
 
     Args:
-      config: of the run.
-      state: [N] of all devices, or what `jax.eval_shape` gives of one.
+      config: settings of the run.
+      state: [N] states of all devices, or their shapes from `jax.eval_shape`.
     """
     spread = seeds.size(state if config.seeds_by == "devices" else state.arenas)
     return seeds.size(state) - spread + spread // config.devices
 
 
 def stepped_together(program: Program, state: TrainState) -> Any:
-    """Takes out of a state the arenas of one device that the program steps together.
+    """Takes the arenas of one device that the program steps together out of a state.
 
     Args:
-      program: the compiled side.
-      state: [N].
+      program: the compiled program.
+      state: [N] states.
 
     Returns:
-      What `seeds.stepped_together` does, of the arenas of this process's first device.
+      Result of `seeds.stepped_together`, for the arenas of this process's first device.
     """
     if program.config.devices > 1:
         state = jax.tree.map(lambda x: x.addressable_data(0), state)
@@ -206,5 +207,5 @@ def _spread(sharding: NamedSharding, x: jax.Array) -> jax.Array:
 
 
 def _without_empty(state: TrainState) -> TrainState:
-    """Replaces arrays without elements: passed through `shard_map` they break jaxlib 0.11.2."""
+    """Replaces arrays without elements: `shard_map` of jaxlib 0.11.2 fails on them."""
     return jax.tree.map(lambda x: x if x.size else jnp.zeros(x.shape, x.dtype), state)

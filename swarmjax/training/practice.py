@@ -1,8 +1,8 @@
-"""The curriculum over levels in a rollout: what episodes begin on, and what they come to.
+"""The curriculum over levels in a rollout: where episodes begin, and how they end.
 
-`curriculum.levels` has the buffer by itself. Here its levels are dealt out to arenas, and the
-episodes of a rollout are read off again. An arena's source is not carried through the steps of a
-rollout: how many episodes have ended in an arena says which one it is in.
+`curriculum.levels` holds the buffer. This module deals its levels out to arenas, and reads the
+results of a rollout's episodes. The steps of a rollout do not carry an arena's level source along:
+the number of ended episodes in an arena tells which one it is in.
 
 Axes: W episodes that wait for each arena, J = 1 + W with the one under way, V numbers of a level.
 """
@@ -39,14 +39,14 @@ class Gained(NamedTuple):
 
 
 class LevelSource(NamedTuple):
-    """What the episode of each arena began on, [A].
+    """The source of each arena's episode, [A].
 
     Attributes:
-      slot: place in the buffer, or what else it was (`levels.FRESH`, ...), int32.
-      stage: that the level is of, int32.
-      numbers: [.., V] that the level is drawn from.
-      generation: of the level, int32.
-      gained: value loss so far; None where it is not asked for.
+      slot: place in the buffer, or another source (`levels.FRESH`, ...), int32.
+      stage: stage of the level, int32.
+      numbers: [.., V] numbers that define the level.
+      generation: generation of the level, int32.
+      gained: value loss so far; None if the curriculum does not use it.
     """
 
     slot: Array
@@ -57,12 +57,12 @@ class LevelSource(NamedTuple):
 
 
 class Practice(NamedTuple):
-    """What levels are dealt out from.
+    """The inputs for dealing levels out.
 
     Attributes:
-      buffer: of levels.
+      buffer: buffer of levels.
       options: the curriculum's numbers.
-      by_loss: whether value loss is asked for.
+      by_loss: whether the curriculum uses value loss.
     """
 
     buffer: LevelBuffer
@@ -71,23 +71,23 @@ class Practice(NamedTuple):
 
 
 def spacing(config: ProgramConfig) -> Spacing:
-    """Returns the sizes that a run's levels are drawn with."""
+    """Returns the sizes for drawing a run's levels."""
     size = config.sim.robots, config.sim.obstacles
     return Spacing(*size, config.robot.hull_radius, config.task.target_radius)
 
 
 def number_count(config: ProgramConfig) -> int:
-    """Returns how many numbers a level of the buffer has, V."""
+    """Returns V, the count of numbers that define a level of the buffer."""
     if config.curriculum.levels.mutates:
         return mutation.number_count(config.stage, spacing(config))
     return level.uniform_count(spacing(config))
 
 
 def numbers(config: ProgramConfig) -> LevelNumbers | None:
-    """Works the numbers of the curriculum over levels out; None without a buffer.
+    """Computes the numbers of the curriculum over levels; None without a buffer.
 
     Raises:
-      ConfigError: if levels are to be mutated that have nothing to move.
+      ConfigError: the config mutates levels, but nothing in them can move.
     """
     options = config.curriculum.levels
     if not options.is_on:
@@ -102,7 +102,7 @@ def numbers(config: ProgramConfig) -> LevelNumbers | None:
 
 
 def init(config: ProgramConfig) -> LevelBuffer | None:
-    """Starts without a level; None without a buffer."""
+    """Returns an empty buffer; None without a curriculum over levels."""
     options = config.curriculum.levels
     if not options.is_on:
         return None
@@ -112,7 +112,7 @@ def init(config: ProgramConfig) -> LevelBuffer | None:
 def of(
     buffer: LevelBuffer | None, options: LevelNumbers | None, config: CurriculumConfig
 ) -> Practice | None:
-    """Puts together what levels are dealt out from; None without a buffer."""
+    """Collects the inputs for dealing levels out; None without a buffer."""
     if buffer is None or options is None:
         return None
     return Practice(buffer, options, config.levels.mode == "value_loss")
@@ -121,15 +121,15 @@ def of(
 def deal(
     practice: Practice, uniforms: Array, stage: Array, key: Array, shards: Shards, spacing: Spacing
 ) -> LevelSource:
-    """Says what each episode begins on.
+    """Chooses the level source of each episode.
 
     Args:
-      practice: what levels are dealt out from.
-      uniforms: [W, A, uniform_count(spacing)] of new levels.
-      stage: [W, A] of each episode.
+      practice: inputs for dealing levels out.
+      uniforms: [W, A, uniform_count(spacing)] uniform numbers of new levels.
+      stage: [W, A] stage of each episode.
       key: random key, the same on all devices.
       shards: how the arenas are spread over devices.
-      spacing: sizes.
+      spacing: sizes for drawing levels.
 
     Returns:
       [W A].
@@ -160,7 +160,7 @@ def _nothing(slot: Array) -> Gained:
 
 
 def _mutate(practice: Practice, source: LevelSource, picks: Array) -> LevelSource:
-    """Moves something in some of the levels [N] that are played again; picks are [N, 3]."""
+    """Moves something in some of the replayed levels [N]; picks are [N, 3]."""
     buffer, options = practice.buffer, practice.options
     if options.movable is None:
         return source
@@ -176,12 +176,12 @@ def _mutate(practice: Practice, source: LevelSource, picks: Array) -> LevelSourc
 
 
 def is_fresh(source: LevelSource) -> Array:
-    """Tells which episodes speak for their stage: those on levels that are drawn for them."""
+    """Tells which episodes count for their stage: only those on levels drawn for them."""
     return source.slot == FRESH
 
 
 def line_up(under_way: LevelSource, waiting: LevelSource) -> LevelSource:
-    """Lists what every arena's episodes of a rollout begin on, in their order.
+    """Lists the level sources of every arena's episodes of a rollout, in their order.
 
     Args:
       under_way: [A].
@@ -198,11 +198,11 @@ def line_up(under_way: LevelSource, waiting: LevelSource) -> LevelSource:
 
 
 def current(every: LevelSource, ended: Array) -> LevelSource:
-    """Picks what each arena is on after a rollout.
+    """Picks the level source of each arena after a rollout.
 
     Args:
-      every: [J, A] as `line_up` lists them.
-      ended: [A] how many episodes have ended in it; beyond W the last one is begun again.
+      every: [J, A] from `line_up`.
+      ended: [A] number of episodes that have ended in the arena; beyond W the last one repeats.
 
     Returns:
       [A].
@@ -213,16 +213,16 @@ def current(every: LevelSource, ended: Array) -> LevelSource:
 
 
 def gain(before: Gained, batch: Batch, over: Array) -> tuple[Array, Gained]:
-    """Adds the advantages above 0 of a rollout up, episode by episode.
+    """Sums the positive advantages of a rollout, episode by episode.
 
     Args:
-      before: [A] of the episodes that are under way.
-      batch: [L] of A groups of T N samples.
+      before: [A] sums of the episodes under way.
+      batch: [L] batches of A groups of T N samples.
       over: [T, A] whether the episode ended with the step.
 
     Returns:
-      [T, A] positive value loss of the episode up to the step: the mean of max(advantage, 0) over
-      its transitions; and [A] of those under way after it.
+      [T, A] positive value loss of the episode up to the step, the mean of max(advantage, 0) over
+      its transitions; and [A] the sums of the episodes under way afterwards.
     """
     steps = over.shape[0]
 
@@ -243,16 +243,16 @@ def gain(before: Gained, batch: Batch, over: Array) -> tuple[Array, Gained]:
 
 
 def plays(every: LevelSource, ended: Ended, loss: Array | None, config: CurriculumConfig) -> Play:
-    """Reads off the outcomes of the episodes of a rollout.
+    """Reads the outcomes of a rollout's episodes.
 
-    An arena that ends more episodes than waited for it begins the last one again; those count for
-    no level: a short episode would count more often than a long one.
+    An arena that runs out of waiting episodes repeats the last one. The repeats count for no level:
+    otherwise a short episode would count more often than a long one.
 
     Args:
-      every: [J, A] as `line_up` lists them.
+      every: [J, A] from `line_up`.
       ended: [T, A].
-      loss: [T, A] value loss of episodes, by the step at which they ended; None: 0.
-      config: says what success is.
+      loss: [T, A] value loss of episodes, at the step where they ended; None: 0.
+      config: defines success.
 
     Returns:
       [J, A].
@@ -263,7 +263,7 @@ def plays(every: LevelSource, ended: Ended, loss: Array | None, config: Curricul
     at = jnp.where(over, jnp.minimum(number, rows), rows), jnp.arange(arenas)
 
     def read(x: Array) -> Array:
-        # What counts for nothing goes to a row beyond the last.
+        # Repeats go to a row beyond the last, which is dropped.
         return jnp.zeros((rows + 1, arenas), x.dtype).at[at].set(x)[:rows]
 
     whole = config.success == "all"
@@ -282,6 +282,6 @@ def plays(every: LevelSource, ended: Ended, loss: Array | None, config: Curricul
 
 
 def together(played: Play, shards: Shards) -> Play:
-    """Puts the episodes [J, A] of all devices on one axis, in the order of their arenas."""
+    """Joins the episodes [J, A] of all devices on one axis, in the order of their arenas."""
     every = jax.tree.map(partial(shards.gather, axis=1), played)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), every)

@@ -1,4 +1,4 @@
-"""The compiled side of a run: what is fixed before anything moves."""
+"""The compiled program of a run: everything that is fixed before the run starts."""
 
 from dataclasses import dataclass, replace
 
@@ -19,18 +19,18 @@ from swarmjax.training import episodes, practice
 from swarmjax.training.config import ProgramConfig
 
 ACTION_SIZE = drive.COMMAND_SIZE  # of robots that broadcast nothing
-MAX_ROWS = 4096  # updates that a call can report, over all seeds; a longer chunk is several calls
+MAX_ROWS = 4096  # most updates of a call, over all seeds; longer chunks take several calls
 
 
 @dataclass(frozen=True, eq=False)
 class Program[C: ProgramConfig]:
-    """What fixes the compiled program.
+    """The parts that fix the compiled program.
 
     Attributes:
       config: its settings.
       world: the compiled environment.
       backend: how learners compute their updates.
-      by_robot: whether each episode is handed on robot by robot.
+      by_robot: whether to report each episode robot by robot.
     """
 
     config: C
@@ -53,7 +53,7 @@ class Program[C: ProgramConfig]:
 
     @property
     def state_size(self) -> int:
-        """Entries of what a critic sees besides the observation, P; 0 if nothing."""
+        """Count of numbers that a critic sees in addition to the observation, P; 0 if none."""
         return _state_size(self.config)
 
     @property
@@ -63,18 +63,18 @@ class Program[C: ProgramConfig]:
 
 
 def load[C: ProgramConfig](config: C, *, by_robot: bool = False) -> tuple[Program[C], Schedule]:
-    """Builds the program and the curriculum's numbers; everything left to `auto` is resolved here.
+    """Builds the program and the curriculum's numbers; resolves every setting left to `auto`.
 
     Args:
       config: the settings.
-      by_robot: whether each episode is handed on robot by robot.
+      by_robot: whether to report each episode robot by robot.
 
     Returns:
-      The program, and the numbers that are an argument of it.
+      The program, and its argument, the curriculum's numbers.
 
     Raises:
-      ConfigError: if Warp is asked for and not installed, a gradient that cannot be had, or a
-        piece of an extension does not fit.
+      ConfigError: Warp is required but not installed, the gradient's backend is not available, or a
+        part of an extension does not fit.
     """
     world, pieces = load_world(config), extension.load(config.extensions)
     heard = config.task.neighbours
@@ -91,7 +91,7 @@ def _state_size(config: ProgramConfig) -> int:
 
 
 def load_world(config: ProgramConfig) -> World:
-    """Builds the environment, with room for all arenas that are stepped together."""
+    """Builds the environment, with memory for all arenas that are stepped together."""
     return env.load(
         config.stage,
         config.robot,
@@ -104,10 +104,10 @@ def load_world(config: ProgramConfig) -> World:
 
 
 def schedule(config: ProgramConfig) -> Schedule:
-    """Works the curriculum's numbers out.
+    """Computes the curriculum's numbers.
 
     Raises:
-      ConfigError: if levels are to be mutated that have nothing to move.
+      ConfigError: the config mutates levels, but nothing in them can move.
     """
     found = curricula.schedule(
         config.stage,
@@ -121,11 +121,11 @@ def schedule(config: ProgramConfig) -> Schedule:
 
 
 def groups(config: ProgramConfig, cores: int) -> int:
-    """Returns into how many groups of as many seeds a run is cut, to be called at once.
+    """Returns the number of equal groups of seeds that a run is split into, called at once.
 
     Args:
-      config: of the run.
-      cores: that the process may use.
+      config: settings of the run.
+      cores: number of cores that the process may use.
     """
     if config.seeds_by != "cores" or jax.default_backend() != "cpu":
         return 1

@@ -1,4 +1,4 @@
-"""What a promotion does to the learners, as the config says."""
+"""The effect of a promotion on the learners, as the config defines it."""
 
 from dataclasses import replace
 
@@ -15,19 +15,20 @@ from swarmjax.training.config import ProgramConfig
 def carry_over(
     learners: LearnerState, config: ProgramConfig, before: Array, after: Array, promoted: Array
 ) -> LearnerState:
-    """Prepares the learners for a stage that a promotion has begun.
+    """Prepares the learners for the stage that begins with a promotion.
 
-    Where each robot has a learner and the swarm grows beyond what was met so far, the newcomers
-    take those of the others over in turn: parameters, optimiser and normaliser. Without that they
-    begin as they are, untrained. Then the optimiser, the normaliser and the exploration of all
-    learners are dealt with as `config.curriculum` says. What is kept costs nothing.
+    If each robot has a learner and the swarm grows beyond its largest size so far,
+    `newcomers=copy` lets the new robots copy the others' learners in turn: parameters, optimiser
+    and normaliser. Otherwise they begin untrained. Then the optimiser, the normaliser and the
+    exploration of all learners are reset or kept, as `config.curriculum` says. Keeping them has no
+    cost.
 
     Args:
       learners: [L].
-      config: of the run.
-      before: [] the most robots that a stage has had so far, at least 1.
-      after: [] the same with the stage that now begins.
-      promoted: [] whether there was a promotion; otherwise nothing happens.
+      config: settings of the run.
+      before: [] most robots of any stage so far, at least 1.
+      after: [] most robots of any stage, including the one that begins.
+      promoted: [] whether there was a promotion; otherwise the learners stay unchanged.
 
     Returns:
       The learners, [L].
@@ -38,7 +39,8 @@ def carry_over(
     if options.optimizer == "reset":
         carried = replace(carried, optimizer_state=_forgotten(carried.optimizer_state))
     if options.normalizer == "relearn":
-        # With a count of 0 the next batch's moments replace these, which normalise it meanwhile.
+        # The old moments normalise the next batch. With a count of 0, that batch's moments then
+        # replace them.
         unweighted = replace(carried.normalizer, count=jnp.zeros_like(carried.normalizer.count))
         carried = replace(carried, normalizer=unweighted)
     if options.exploration == "reset":
@@ -49,7 +51,7 @@ def carry_over(
 
 
 def _copied(learners: LearnerState, before: Array, after: Array) -> LearnerState:
-    """Puts learner i % before in the place of learner i, for before <= i < after."""
+    """Copies learner i % before to the place of learner i, for before <= i < after."""
     index = jnp.arange(learners.normalizer.count.shape[0])
     new = (index >= before) & (index < after)
     source = jnp.where(new, index % before, index)
@@ -59,7 +61,7 @@ def _copied(learners: LearnerState, before: Array, after: Array) -> LearnerState
 def _forgotten(state: optax.OptState) -> optax.OptState:
     """Sets Adam's moments, and the count that corrects their bias, to 0.
 
-    The learning rate's schedule counts by itself and goes on.
+    The learning rate's schedule has its own count and goes on.
     """
 
     def is_adam(part: object) -> bool:

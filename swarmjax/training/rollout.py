@@ -1,7 +1,7 @@
-"""Arenas times policy: many arenas driven by the learners for one rollout.
+"""Rollouts: the learners drive many arenas.
 
-Here, and only here, arenas and robots are laid out for the learners: [A, R, ...] becomes
-[L, A, N, ...], with N the robots of an arena that one learner drives.
+Only this module lays arenas and robots out for the learners: [A, R, ...] becomes [L, A, N, ...],
+with N the robots of an arena that one learner drives.
 """
 
 import functools
@@ -30,21 +30,21 @@ from swarmjax.training import practice as practices
 from swarmjax.training.practice import LevelSource, Practice
 from swarmjax.training.program import Program
 
-# Cohort of an episode that counts for none: curricula number theirs from 0, and -1 is the one
+# Cohort of an episode that does not count. Curricula number theirs from 0, and -1 is the cohort
 # before the first.
 UNCOUNTED = -2
 
 
 @struct.dataclass
 class Arena(EnvState):
-    """An arena that is trained in, and what its episode counts for.
+    """A training arena, with the stage and cohort of its episode.
 
     Attributes:
       stage: [] index of the stage on which the episode began, int32.
       cohort: [] the curriculum's cohort in which it began, int32.
-      recall: [R, H] of each robot's actor and critic before they see the observation; None if they
-        remember nothing.
-      source: what the curriculum over levels had it begin on; None without one.
+      recall: [R, H] memory of each robot's actor and critic before the observation; None without a
+        memory.
+      source: the episode's level source; None without a curriculum over levels.
     """
 
     stage: Array
@@ -54,7 +54,7 @@ class Arena(EnvState):
 
 
 class Trajectory(NamedTuple):
-    """What the learners did and what came of it, [T, L, A, N, ...].
+    """The learners' observations and actions and their results, [T, L, A, N, ...].
 
     Attributes:
       observation: [.., O], raw.
@@ -63,11 +63,12 @@ class Trajectory(NamedTuple):
       value: of the observation.
       next_value: of the observation after the step, before any reset.
       reward: of the step.
-      terminated: the robot arrived in this step; by `task.arrival=hold`, all were there at once.
+      terminated: the robot arrived in this step; with `task.arrival=hold`, all robots were on their
+        targets at once.
       truncated: the time ran out for the robot.
-      valid: a transition to learn from.
-      over: the episode ended with the step; None where nothing is remembered.
-      state: [.., P], what the critic sees besides the observation; None if nothing.
+      valid: whether to learn from the transition.
+      over: the episode ended with the step; None without a memory.
+      state: [.., P], what the critic sees in addition to the observation; None if nothing.
     """
 
     observation: Array
@@ -122,24 +123,25 @@ def draw_starts(
     config: AlgoConfig | None = None,
     practice: Practice | None = None,
 ) -> Arena:
-    """Draws fresh levels: episodes that wait until their arena is free.
+    """Draws new levels for episodes that wait until their arena is free.
 
-    They are drawn ahead of a rollout, not at every step, `config.waiting` for each arena. An arena
-    that ends more episodes than that begins the rest on the last of its levels. Those train, but
-    count for no cohort: short episodes would be counted more often than long ones.
+    They are drawn before a rollout, `config.waiting` for each arena, and not at every step. An
+    arena that runs out of them repeats the last level. The repeats train, but count for no cohort:
+    otherwise short episodes would count more often than long ones.
 
     Args:
       world: the compiled environment.
       stages: [S].
-      index: [W, A] stage of each episode: the first of every arena, then the second, and so on.
-      cohort: [] the curriculum's cohort.
+      index: [W, A] stage of each episode: the first episode of every arena, then the second, and so
+        on.
+      cohort: [] cohort of the curriculum.
       key: random key, consumed.
-      shards: how the arenas are spread over devices; A counts those of this one.
-      config: says whether robots remember; None: they do not.
-      practice: what the curriculum over levels deals out; None: every level is new.
+      shards: how the arenas are spread over devices; A counts those of this device.
+      config: whether robots have a memory; None: they have none.
+      practice: inputs of the curriculum over levels; None: every level is new.
 
     Returns:
-      [W A] the episodes that wait, packed.
+      [W A] waiting episodes, packed.
     """
     memory = None if config is None else begin_memory(config, (world.spacing.robots,))
     waiting, arenas = index.shape
@@ -169,13 +171,13 @@ def draw_starts(
 def collect(
     program: Program, learners: LearnerState, arenas: Arena, starts: Arena, key: Array
 ) -> tuple[Arena, Trajectory, Ended]:
-    """Drives all arenas for one rollout; an arena whose episode ends takes the one that waits.
+    """Drives all arenas for one rollout; an arena whose episode ends begins a waiting one.
 
     Args:
-      program: the compiled side.
+      program: the compiled program.
       learners: [L].
       arenas: [A], packed.
-      starts: [W A] episodes that wait, as `draw_starts` orders them, packed.
+      starts: [W A] waiting episodes in the order of `draw_starts`, packed.
       key: random key, consumed; the same on all devices.
 
     Returns:
@@ -201,7 +203,7 @@ def collect(
 
 
 def explore(program: Program, learners: LearnerState, steps: Array | int) -> LearnerState:
-    """Moves the learners [L] on along the schedule of exploration, by steps of every arena."""
+    """Moves the learners [L] along the schedule of exploration, by `steps` of every arena."""
     config, arenas = program.config.algo, program.config.arenas
     return jax.vmap(lambda learner: ppo.explore(learner, config, steps * arenas))(learners)
 
@@ -212,13 +214,13 @@ def batch(
     shards: Shards = ALONE,
     memory: Recall | None = None,
 ) -> Batch:
-    """Turns a rollout into what the learners learn from.
+    """Turns a rollout into batches for the learners.
 
     Args:
       trajectory: [T, L, A, N, ...].
-      config: says what a return is.
+      config: defines the return.
       shards: how the arenas are spread over devices.
-      memory: [A, R, H] of the arenas before the rollout; None if robots remember nothing.
+      memory: [A, R, H] memory of the arenas before the rollout; None without a memory.
 
     Returns:
       [L] batches of A groups of T * N samples.
@@ -266,7 +268,7 @@ def _bootstrapped(trajectory: Trajectory, config: AlgoConfig, _: Shards) -> tupl
 
 
 def _monte_carlo(trajectory: Trajectory, config: AlgoConfig, shards: Shards) -> tuple[Array, Array]:
-    """Returns what the normalised Monte-Carlo returns have above the values, and themselves."""
+    """Returns the normalised Monte-Carlo returns less the values, and the returns themselves."""
     boundary = trajectory.terminated | trajectory.truncated
     if config.time_out == "leak":
         boundary = boundary & ~_timed_out(trajectory)
@@ -277,17 +279,17 @@ def _monte_carlo(trajectory: Trajectory, config: AlgoConfig, shards: Shards) -> 
 
 
 def _timed_out(trajectory: Trajectory) -> Array:
-    """Tells where the step limit cut, not physics that broke, whose step is not valid."""
+    """Tells where the step limit ended episodes. Steps whose physics broke are not valid."""
     return trajectory.truncated & trajectory.valid
 
 
 class _Judged(NamedTuple):
-    """What critics make of what robots see now, [L, A, N, ...].
+    """The critics' results for the current observations, [L, A, N, ...].
 
     Attributes:
-      value: of it.
-      memory: [.., H] of the critic after it; None if nothing is remembered.
-      state: [.., P], what the critic sees besides the observation; None if nothing.
+      value: value of the observation.
+      memory: [.., H] memory of the critic afterwards; None without a memory.
+      state: [.., P], what the critic sees in addition to the observation; None if nothing.
     """
 
     value: Array
@@ -296,13 +298,13 @@ class _Judged(NamedTuple):
 
 
 class _Waiting(NamedTuple):
-    """Episodes [W A] that wait, packed, and what critics make of their beginnings."""
+    """Waiting episodes [W A], packed, and the critics' results for their first observations."""
 
     starts: Arena
     judged: _Judged
 
 
-# What `Ended` counts, by name, and how many numbers each is.
+# The counts of `Ended`, by name, and how many numbers each has.
 _COUNTS = {
     "episodes": 1,
     "stage": 1,
@@ -318,7 +320,7 @@ _COUNTS = {
 }
 
 _Counts = tuple[Array, Array, Robots | None]  # counts [A, K], rewards [A], robots
-_Carry = tuple[Arena, _Judged, Array]  # arenas, and how many episodes each has begun
+_Carry = tuple[Arena, _Judged, Array]  # arenas, critics' results, episodes begun by each arena
 
 
 def _step(
@@ -328,7 +330,7 @@ def _step(
     carry: _Carry,
     now: tuple[Array, Array],
 ) -> tuple[_Carry, tuple[Trajectory, _Counts]]:
-    """One control step of all arenas, the first of a rollout being 1."""
+    """Runs one control step of all arenas; the first step of a rollout is 1."""
     (arenas, judged, begun), (key, number) = carry, now
     count = judged.value.shape[0]
     mine = to_learners(arenas.observation, count)
@@ -385,7 +387,7 @@ def _noise(shards: Shards, key: Array, shape: tuple[int, ...]) -> Array:
 
 
 def _next(waits: _Waiting, begun: Array) -> tuple[Arena, _Judged]:
-    """Picks the episode [A] that each arena begins next, and what critics make of it."""
+    """Picks the next episode [A] of each arena, and the critics' results for it."""
     arenas = begun.shape[0]
     count = waits.starts.cohort.shape[0] // arenas
     starts, judged = waits
@@ -397,7 +399,7 @@ def _next(waits: _Waiting, begun: Array) -> tuple[Arena, _Judged]:
 
 
 def _judge(program: Program, learners: LearnerState, arenas: Arena) -> _Judged:
-    """Lets critics judge what the robots of arenas [A] see now."""
+    """Lets critics judge the current observations of arenas [A]."""
     config, count = program.config.algo, jax.tree.leaves(learners)[0].shape[0]
     memory = None if arenas.recall is None else to_learners(arenas.recall.critic, count)
     state = None
@@ -411,15 +413,15 @@ def _judge(program: Program, learners: LearnerState, arenas: Arena) -> _Judged:
 
 
 def restart[S: EnvState](arenas: S, starts: S, done: Array) -> S:
-    """Puts the waiting episode in the place of one that is over.
+    """Replaces episodes that are over by waiting ones.
 
     Args:
-      arenas: [A], `sim` the physics' data.
+      arenas: [A], with `sim` the physics' data.
       starts: [A], packed.
       done: [A].
 
     Returns:
-      The arenas, `sim` the physics' data: of that only what is physically the state is replaced.
+      The arenas, with `sim` the physics' data; only the physical state in it is replaced.
     """
     packed = physics.PhysicsState(arenas.sim.qpos, arenas.sim.qvel, arenas.sim.qacc_warmstart)
     chosen = _pick(done, starts, replace(arenas, sim=packed))
@@ -427,7 +429,7 @@ def restart[S: EnvState](arenas: S, starts: S, done: Array) -> S:
 
 
 def _pick[Tree](done: Array, yes: Tree, no: Tree) -> Tree:
-    """Chooses by arena, whatever axes follow."""
+    """Chooses by arena; any axes may follow."""
 
     def pick(a: Array, b: Array) -> Array:
         return jnp.where(done.reshape(done.shape + (1,) * (b.ndim - done.ndim)), a, b)
@@ -436,7 +438,7 @@ def _pick[Tree](done: Array, yes: Tree, no: Tree) -> Tree:
 
 
 def _ended(arenas: Arena, came: env.TimeStep, *, by_robot: bool) -> Ended:
-    """Sums up the episodes that ended in this step, [A]."""
+    """Counts the episodes that ended in this step, [A], and sums their results."""
     done, episode = came.done, arenas.episode
     present = arenas.level.present
     targets, reached = jnp.sum(present, axis=-1), jnp.sum(present & arenas.arrived, axis=-1)
@@ -462,7 +464,7 @@ def _ended(arenas: Arena, came: env.TimeStep, *, by_robot: bool) -> Ended:
 
 
 def _to_counts(ended: Ended) -> _Counts:
-    """Lays all counts [A, ...] of a step side by side [A, K]: one array to write instead of 11."""
+    """Lays the counts [A, ...] of a step side by side [A, K]: one array to write instead of 11."""
     columns = [getattr(ended, name).reshape(len(ended.reward), -1) for name in _COUNTS]
     return jnp.concatenate(columns, axis=1), ended.reward, ended.robots
 
@@ -477,7 +479,7 @@ def _to_ended(counts: Array, reward: Array, robots: Robots | None) -> Ended:
 
 
 def _robots(arenas: EnvState) -> Robots:
-    """Tells what became of each robot, [A, R]."""
+    """Returns the outcome for each robot, [A, R]."""
     present, episode = arenas.level.present, arenas.episode
     return Robots(
         present=present,

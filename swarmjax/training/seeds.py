@@ -1,8 +1,8 @@
 """Several seeds of a run in one program: `loop` with a leading axis N on state and metrics.
 
-Each seed is a whole run with networks, arenas and curriculum of its own; nothing passes between
-lanes. Seed k is `config.seed + k`. The axis is there for one seed too, so that there is one kind
-of state, of checkpoint and of metrics.
+Each seed is a whole run with its own networks, arenas and curriculum, and seeds exchange nothing.
+Seed k is `config.seed + k`. A single seed has the axis too, so that there is one format of state,
+checkpoint and metrics.
 """
 
 import math
@@ -24,7 +24,7 @@ from swarmjax.training.program import Program, side_by_side
 
 
 def numbers(config: ProgramConfig) -> range:
-    """Returns the seeds of a run, lane by lane."""
+    """Returns the seeds of a run, in the order of the seed axis."""
     return config.numbers
 
 
@@ -34,9 +34,9 @@ def init(
     """Starts every seed of a run.
 
     Args:
-      program: the compiled side.
+      program: the compiled program.
       schedule: the curriculum's numbers.
-      lanes: [N] seeds, uint32; those of the config if there are none.
+      lanes: [N] seeds, uint32; None: the config's.
 
     Returns:
       [N] states before the first update.
@@ -49,9 +49,9 @@ def draw_arenas(program: Program, schedule: Schedule, state: TrainState) -> Trai
     """Draws the arenas of every seed, as `loop.draw_arenas` does.
 
     Args:
-      program: the compiled side.
+      program: the compiled program.
       schedule: the curriculum's numbers.
-      state: [N] without arenas.
+      state: [N] states without arenas.
 
     Returns:
       [N] states with arenas.
@@ -65,29 +65,29 @@ def train_chunk(
     """Trains every seed for `n` updates; `jit` it with `program` bound and `state` donated.
 
     Args:
-      program: the compiled side.
-      schedule: the curriculum's numbers, the same for all.
-      state: [N] before.
-      n: [] updates to do, at most `program.rows`, int32.
+      program: the compiled program.
+      schedule: the curriculum's numbers, the same for all seeds.
+      state: [N] states before.
+      n: [] number of updates, at most `program.rows`, int32.
 
     Returns:
-      [N] states after, and metrics [N, rows, ...]: the first n rows hold an update each.
+      [N] states after, and metrics [N, rows, ...]: the first n rows hold one update each.
     """
     return each(program.config, lambda lane: loop.train_chunk(program, schedule, lane, n), state)
 
 
 def each(config: ProgramConfig, function: Callable[[Any], Any], lanes: Any) -> Any:
-    """Applies a function of one seed to all of them, as `config.seeds_by` says.
+    """Applies a function of one seed to all seeds, as `config.seeds_by` says.
 
-    Side by side (`vmap`) the matrix products are batched, which rounds differently from one seed
-    alone, but the same in every lane; one seed is not batched at all. In turn (`map`) a seed comes
-    to the same bits however many there are. With `cores` they go side by side in groups, of which
-    each call has one, and with `devices` on each device.
+    Side by side (`vmap`), the matrix products are batched. This rounds differently from a run of
+    one seed, but in the same way for every seed. One seed alone is not batched. One after the other
+    (`map`), a seed gives the same bits for any number of seeds. With `cores`, groups of seeds run
+    side by side, one group a call. With `devices`, the seeds of each device run side by side.
 
     Args:
-      config: the run's config.
+      config: settings of the run.
       function: from a tree to a tree.
-      lanes: the function's argument with a leading axis N.
+      lanes: the function's arguments with a leading axis N.
 
     Returns:
       The function's results with a leading axis N.
@@ -116,19 +116,19 @@ def join(parts: list[Any]) -> Any:
 
 
 def size(tree: Any) -> int:
-    """Returns the bytes of a tree's arrays, or of what `jax.eval_shape` gives of them."""
+    """Returns the bytes of a tree's arrays, or of their shapes from `jax.eval_shape`."""
     return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
 def stepped_together(program: Program, state: TrainState) -> PhysicsState:
-    """Takes out of a state the arenas that the program steps together, all on one axis.
+    """Takes the arenas that the program steps together out of a state, all on one axis.
 
     Args:
-      program: the compiled side.
-      state: [N].
+      program: the compiled program.
+      state: [N] states.
 
     Returns:
-      [N A] arenas where seeds go side by side, [A] where they go in turn.
+      [N A] arenas if seeds run side by side, [A] if they run one after the other.
     """
     lanes = side_by_side(program.config)
     return jax.tree.map(lambda x: x[:lanes].reshape(-1, *x.shape[2:]), state.arenas.sim)

@@ -122,18 +122,18 @@ def _edit(name: str, index: Any, value: Any) -> Callable[[dict[str, Any]], None]
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda a: a.pop("meta"), "meta is missing or no JSON"),
-        (_set("meta", np.array("{")), "meta is missing or no JSON"),
+        (lambda a: a.pop("meta"), "meta is missing or not JSON"),
+        (_set("meta", np.array("{")), "meta is missing or not JSON"),
         (_meta(lambda m: m.update(format=2)), "meta.format is not 1"),
         (_meta(lambda m: m.pop("cells")), "meta.suite or meta.cells is missing"),
         (_meta(lambda m: m["cells"].append(m["cells"][0])), "meta.cells names a cell more than"),
-        (_meta(lambda m: m["cells"].pop()), "some/episode is not known: no cell of it is listed."),
+        (_meta(lambda m: m["cells"].pop()), "some/episode is unknown: meta.cells lists no such"),
         (_meta(lambda m: m["cells"][0].update(x=1)), "cell one: x is not a key"),
         (_meta(lambda m: m["cells"][0]["stage"].update(robots=0)), "cell one: stage.robots is 0"),
         (_meta(lambda m: m["cells"][0].update(seed=1)), "cell one: seed is 1: give 1000000 to"),
         (_meta(lambda m: m["cells"][0].update(digest=None)), "cell one: digest is missing."),
         (_meta(lambda m: m["cells"][0].update(digest="0" * 64)), "cell one of the file has the "),
-        (_set("one/other", np.zeros(3)), "one/other is not known"),
+        (_set("one/other", np.zeros(3)), "one/other is unknown"),
         (lambda a: a.pop("two/target"), "two/target is missing."),
         (_set("one/seed", np.zeros(3, np.int32)), "one/seed is int32 [3]: expected uint32 [3]."),
         (_set("one/start", np.zeros((3, 2, 2), np.float32)), "one/start is float32 [3, 2, 2]: "),
@@ -146,7 +146,7 @@ def _edit(name: str, index: Any, value: Any) -> Callable[[dict[str, Any]], None]
         (_edit("two/obstacle", (0, 0, 3), 9.0), "cell two: obstacle is longer than the largest "),
         (_edit("two/obstacle_present", (0, 0), False), "cell two: obstacle is not present, but "),
         (_edit("two/obstacle", (0, 0, 0), 0.1), "cell two of the file has the digest "),
-        (_set("two/obstacle", np.array([None])), "it cannot be read: 'two/obstacle.npy' is not"),
+        (_set("two/obstacle", np.array([None])), "it cannot be read: 'two/obstacle.npy' does not"),
     ],
 )
 def test_a_file_that_is_unsound_is_refused(
@@ -322,7 +322,7 @@ def test_a_digest_that_is_off_is_refused(tmp_path: Path) -> None:
     path.write_text(_text(f"{cell}, digest: {'a' * 64}"))
     sentence = refusal(cells.draw, str(path))
     assert sentence.startswith("cell here of suite tiny has the digest ")
-    assert "but aaaaaaaaaaaa... is written down: these are other levels." in sentence
+    assert "but aaaaaaaaaaaa... is recorded: the levels differ." in sentence
 
 
 def test_suites_are_for_robots_of_the_nominal_size() -> None:

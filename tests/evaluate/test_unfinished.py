@@ -143,9 +143,9 @@ def test_another_evaluation_is_refused_where_one_was_stopped(
     assert _command(monkeypatch, *words, *change, "out=stopped") == USER_ERROR
     printed = capsys.readouterr()
     assert printed.err == (
-        "swarmjax.evaluate: error: out has stopped/unfinished, where an evaluation was stopped "
-        f"that differs from this one in {key}: give the command that was stopped, give another "
-        "out, or remove that folder.\n"
+        "swarmjax.evaluate: error: out has stopped/unfinished, from an unfinished evaluation "
+        f"that differs from this one in {key}: repeat its command, give another out, or remove "
+        "that folder.\n"
     )
     assert _content(Path("stopped")) == before
 

@@ -156,7 +156,7 @@ def test_policies_that_were_trained_differently_need_a_word(tmp_path: Path) -> N
     both = f"{first},{other.partition('=')[2]}"
     assert refusal(_load, both) == (
         f"{tmp_path / '0.npz'} and {tmp_path / '1.npz'} were trained differently, with "
-        "robot.hull_radius its default and 0.044: say by which to judge them, as in "
+        "robot.hull_radius its default and 0.044: choose the one to judge them with, as in "
         "robot.hull_radius=0.044."
     )
     assert _load(both, "robot.hull_radius=0.037").robot.hull_radius == 0.037

@@ -1,6 +1,6 @@
-"""Faster ways to the same update, which nothing needs: only `ppo/dispatch.py` calls them.
+"""Faster ways to compute the same update. They are optional: only `ppo/dispatch.py` calls them.
 
-`tiles.py` learns by the kernels of `fused.py` on an NVIDIA GPU, `blocks.py` takes a whole batch on
-a CPU in blocks that stay in a core's cache. `sequences.py` takes policies with memory, by the
-sequences of robots that something is learned from.
+`tiles.py` learns with the kernels of `fused.py` on an NVIDIA GPU. `blocks.py` splits a whole batch
+on a CPU into blocks that fit a core's cache. `sequences.py` trains policies with memory, and leaves
+out the sequences without a valid sample.
 """

@@ -1,9 +1,8 @@
 """Gradients over a whole batch on a CPU, block by block.
 
-The loss is a sum over samples, so that its gradient is the sum of those of blocks. The activations
-of a block stay in a core's cache, and blocks without a valid sample are left out. One that is
-vectorised would wait for the fullest learner in every step: learners and seeds take their turns
-instead.
+The loss is a sum over samples, so its gradient is the sum of the blocks' gradients. The activations
+of a block stay in a core's cache, and blocks without a valid sample are left out. Learners and
+seeds run one after the other: a vectorised loop would run as long as the fullest learner's.
 """
 
 import functools
@@ -21,7 +20,8 @@ from swarmjax.ppo.networks import Params
 from swarmjax.ppo.optimizer import Progress
 from swarmjax.shards import ALONE, Shards
 
-# Samples of a block: of 100 to 6,000, with layers of 64, 250 to 400 took least CPU time.
+# Samples of a block. With layers of 64, blocks of 250 to 400 samples took the least CPU time, of
+# sizes from 100 to 6,000.
 BLOCK = 256
 
 
@@ -30,7 +30,7 @@ class Blocks(NamedTuple):
 
     Attributes:
         samples: [K, B, ...], B at most `BLOCK`.
-        used: [], int32, blocks that hold a valid sample: the first ones.
+        used: [], int32, how many blocks hold a valid sample. They come first.
     """
 
     samples: Minibatch
@@ -48,7 +48,7 @@ def learn(
     """Learns from a batch: each epoch is one step on all samples, so their order does not matter.
 
     Args:
-        config: With one minibatch.
+        config: Settings with one minibatch.
         updates: Number of updates of the whole run.
         begun: Parameters and the optimiser's state.
         samples: [G, N, ...], zero where not valid.
@@ -63,7 +63,7 @@ def learn(
 def _learn(
     config: AlgoConfig, updates: int, shards: Shards, begun: Progress, samples: Minibatch
 ) -> tuple[Progress, Metrics]:
-    """All epochs, each one step on all samples; the metrics of each are [epochs]."""
+    """Runs all epochs, each one step on all samples; the metrics of each are [epochs]."""
     blocks, count = arrange(samples), shards.sum(jnp.sum(samples.valid))
 
     def epoch(progress: Progress, _: None) -> tuple[Progress, Metrics]:
@@ -80,7 +80,7 @@ def arrange(samples: Minibatch) -> Blocks:
         samples: [G, N, ...], zero where not valid.
 
     Returns:
-        The blocks; what fills the last one up is not valid.
+        The blocks; the padding of the last one is not valid.
     """
     flat = valid_first(samples)
     size = min(BLOCK, len(flat.valid))
@@ -100,7 +100,7 @@ def gradient(
     """Computes the gradient of `losses.ppo_loss` over all samples.
 
     Args:
-        params: Of actor and critic.
+        params: Parameters of the actor and the critic.
         blocks: The samples.
         config: Clip range and costs.
         expected_valid: [], valid samples of the batch.
@@ -117,14 +117,14 @@ def gradient(
 
 
 def add_up[T](count: jax.Array, part: Callable[[jax.Array | int], T]) -> T:
-    """Adds up what is computed part by part, such as gradients of a sum over samples.
+    """Adds up the results of several parts, such as gradients of a sum over samples.
 
     Args:
         count: [], int32, how many parts there are.
-        part: Computes one, a tree of arrays, from its number.
+        part: Computes the part with a given number, as a tree of arrays.
 
     Returns:
-        The sum; 0 if there is none.
+        The sum; 0 if there are no parts.
     """
 
     def add(i: jax.Array, total: T) -> T:
@@ -136,5 +136,5 @@ def add_up[T](count: jax.Array, part: Callable[[jax.Array | int], T]) -> T:
 
 
 def in_turn[**P, T](function: Callable[P, T]) -> Callable[P, T]:
-    """Makes `vmap` of a function, at any depth, apply it to one lane after the other."""
+    """Makes `vmap` of a function, at any depth, apply it to one element after the other."""
     return jax.custom_batching.sequential_vmap(function)

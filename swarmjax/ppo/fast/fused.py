@@ -1,16 +1,18 @@
-"""The gradient of the PPO loss of a minibatch on an NVIDIA GPU, by a kernel for each network.
+"""The gradient of the PPO loss of a minibatch on an NVIDIA GPU, with one kernel for each network.
 
-It is that of `losses.ppo_loss`, written out. With s over the valid samples, n = max(expected_valid,
-1), ratio r_s = exp(log pi(a_s) - log pi_old(a_s)) and V the critic, that loss is
+It is the gradient of `losses.ppo_loss`, written out. With s over the valid samples, n =
+max(expected_valid, 1), ratio r_s = exp(log pi(a_s) - log pi_old(a_s)) and V the critic, that loss
+is
 
     1/n sum_s [-min(r_s A_s, clip(r_s) A_s) + value_cost (V_s - R_s)^2 / 2 - entropy_cost H
-               + bound_cost |b_s|^2],
+               + bound_cost |b_s|^2].
 
-b_s being how far the mean action lies beyond -1..1.
+b_s is how far the mean action lies beyond -1..1.
 
-Its kernels sum over samples; what is the same for all of them, 1/n among it, comes after. They take
-tiles of samples in any order, so that a batch whose valid samples lie first is learned from where
-it lies: a minibatch is a choice of tiles, and the rest of the batch costs nothing.
+The kernels sum over samples. Factors and terms that all samples share, such as 1/n, are applied
+afterwards. The kernels take tiles of samples in any order. So once the valid samples lie first, the
+kernels can read the batch in place: a minibatch is a choice of tiles, and tiles without a valid
+sample are never read.
 """
 
 import functools
@@ -31,12 +33,12 @@ from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
 
 # 64 samples are the fewest rows that four warps multiply at once on an H100. With two layers of 64,
-# 128 threads then take all of their 255 registers, and 80 kB on the chip: each of its 132
-# multiprocessors has room for two programs, and as many are there from begin to end.
+# each of the 128 threads then uses all of its 255 registers, and a program uses 80 kB of the chip's
+# memory. Each of the 132 multiprocessors holds two such programs, so all 264 run from start to end.
 LAUNCH = Launch(tile=64, programs=264, warps=4)
-# Faster by 30 % on an H100 (design-notes.md), where a program may take so much of the chip.
+# 30 % faster on an H100 (design-notes.md), but a program needs more of the chip's memory.
 LARGE = Launch(tile=128, programs=264, warps=8)
-# Of a minibatch: with fewer, one tile more or less would make minibatches too unlike.
+# Fewest tiles of a minibatch: with fewer, one tile more or less makes minibatches too unequal.
 _LEAST_TILES = 8
 
 _Run = functools.partial[tuple[jax.Array, Metrics]]
@@ -44,10 +46,10 @@ Flat = dict[str, jax.Array]  # a vector for each network, in the order of its tr
 
 
 def fits(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
-    """Says whether the kernels take the networks.
+    """Tells whether the kernels support the networks.
 
     Args:
-        config: Of the networks.
+        config: Settings of the networks.
         observation_size: O.
         action_size: U.
 
@@ -63,13 +65,14 @@ def choose_launch(
     """Chooses how the kernels are spread over the GPU that JAX computes on.
 
     Args:
-        config: Of networks that `fits` accepts.
+        config: Settings of networks that `fits` accepts.
         observation_size: O.
         action_size: U.
-        samples: B of the batch that minibatches are dealt from; None: all of it is one.
+        samples: B of the batch that minibatches are dealt from; None if the batch is one minibatch.
 
     Returns:
-        `LARGE` where the chip has room for it, and the batch has `_LEAST_TILES` for a minibatch.
+        `LARGE` if the chip has enough memory for it, and each minibatch gets at least
+        `_LEAST_TILES` tiles.
     """
     if samples is not None and samples < _LEAST_TILES * config.num_minibatches * LARGE.tile:
         return LAUNCH
@@ -86,21 +89,21 @@ def gradient(
     launch: Launch | None = None,
     interpret: bool = False,
 ) -> tuple[Params, Metrics]:
-    """Computes what `jax.grad(losses.ppo_loss, has_aux=True)` does, but for rounding.
+    """Computes what `jax.grad(losses.ppo_loss, has_aux=True)` does, up to rounding.
 
     Args:
-        params: Of actor and critic, of layers that `fits` accepts.
+        params: Parameters of the actor and the critic, with layers that `fits` accepts.
         minibatch: B samples.
         config: Clip range and costs.
         expected_valid: [], as `losses.ppo_loss` takes it.
-        launch: How the kernels are spread over the GPU; None: by `choose_launch`.
-        interpret: Run them as ordinary JAX, on any device.
+        launch: How the kernels are spread over the GPU; None: `choose_launch` decides.
+        interpret: Whether to run them as ordinary JAX, on any device.
 
     Returns:
-        The gradient, as `params`, and the metrics, each [].
+        The gradient, in the shape of `params`, and the metrics, each [].
 
     Raises:
-        ValueError: `fits` says no.
+        ValueError: `fits` refuses the layers.
     """
     sizes = minibatch.observation.shape[1], minibatch.action.shape[1]
     launch = choose_launch(config, *sizes) if launch is None else launch
@@ -124,7 +127,7 @@ def flatten(params: Params) -> Flat:
     """Lays each network out in one vector.
 
     Args:
-        params: Of actor and critic.
+        params: Parameters of the actor and the critic.
 
     Returns:
         The vectors, [n] and [m], by the networks' names.
@@ -136,20 +139,20 @@ def unflatten(flat: Flat, like: Params) -> Params:
     """Undoes `flatten`.
 
     Args:
-        flat: The vectors, [n] and [m], of parameters or of what has their shapes.
-        like: Parameters of these shapes.
+        flat: The vectors, [n] and [m], of parameters or of values with the same shapes.
+        like: Parameters with these shapes.
 
     Returns:
-        What `flat` holds, as `like`.
+        The content of `flat`, in the shape of `like`.
     """
     return {name: ravel_pytree(network)[1](flat[name]) for name, network in like.items()}
 
 
 def layouts(params: Params) -> dict[str, KernelLayout]:
-    """Says how `flatten` lays the networks out.
+    """Describes how `flatten` lays the networks out.
 
     Args:
-        params: Of actor and critic, arrays or their shapes.
+        params: Parameters of the actor and the critic, arrays or their shapes.
 
     Returns:
         The layouts, by the networks' names.
@@ -165,24 +168,24 @@ def shuffle(
 ) -> Tiles:
     """Deals the tiles that hold valid samples out to minibatches; sizes differ by one at most.
 
-    Where there are fewer of them than minibatches, some minibatches have none.
+    If there are fewer such tiles than minibatches, some minibatches get none.
 
     Args:
         keys: [E] random keys, one for each pass over the samples, consumed.
-        samples: B, the first `valid` of which are valid.
-        valid: [], int32.
+        samples: B, the number of samples. The valid ones come first.
+        valid: [], int32, the number of valid samples.
         minibatches: M of a pass.
-        launch: of what tiles.
+        launch: Its `tile` is the number of samples of a tile.
 
     Returns:
-        The passes' orders one after the other, and the span [E M, 2] of each minibatch.
+        The order of each pass, one after the other, and the span [E M, 2] of each minibatch.
     """
     count = -(-samples // launch.tile)
     used = -(-valid // launch.tile)
     index = jnp.arange(count, dtype=jnp.int32)
 
     def order(key: jax.Array) -> jax.Array:
-        # The last number is kept for tiles without a valid sample, which sort to the end.
+        # Tiles without a valid sample get the greatest number, so that they sort to the end.
         bits = jnp.minimum(jax.random.bits(key, (count,), jnp.uint32), jnp.uint32(2**32 - 2))
         return jax.lax.sort_key_val(jnp.where(index < used, bits, jnp.uint32(2**32 - 1)), index)[1]
 
@@ -207,23 +210,24 @@ def flat_gradient(
 ) -> tuple[Flat, Metrics, jax.Array]:
     """Computes the gradient over some tiles of a batch, with each network as one vector.
 
-    Products have JAX's precision, `jax.default_matmul_precision`.
+    Matrix products use JAX's precision, `jax.default_matmul_precision`.
 
     Args:
-        flat: What `flatten` returned.
-        layout: What `layouts` returned, of layers that `fits` accepts.
-        samples: B samples; `valid` is float32, 0 or 1, lest it be converted at every step.
-        tiles: Of `launch.tile` samples, the minibatch.
+        flat: Result of `flatten`.
+        layout: Result of `layouts`, for layers that `fits` accepts.
+        samples: B samples. `valid` is float32, 0 or 1, so that no step has to convert it.
+        tiles: The minibatch, in tiles of `launch.tile` samples.
         config: Clip range and costs.
         expected_valid: [], as `losses.ppo_loss` takes it.
         launch: How the kernels are spread over the GPU.
-        interpret: Run them as ordinary JAX, on any device.
+        interpret: Whether to run them as ordinary JAX, on any device.
 
     Returns:
-        The gradient, as `flat`; `METRICS`, each []; how many samples of the tiles are valid, [].
+        The gradient, in the shape of `flat`; `METRICS`, each []; and how many samples of the tiles
+        are valid, [].
 
     Raises:
-        ValueError: `fits` says no.
+        ValueError: `fits` refuses the layers.
     """
     _check(samples, layout, config)
     share = 1.0 / jnp.maximum(expected_valid, 1.0)
@@ -237,7 +241,7 @@ def flat_gradient(
     actor, surrogate = _actor_sums(run, flat["actor"], layout["actor"], samples, config)
     critic, error = _critic_sums(run, flat["critic"], layout["critic"], samples)
     count = error.pop("valid")
-    weight = count * share  # in a mean, of what all have in common
+    weight = count * share  # weight in the mean of a term that all samples share
     first, width = layout["actor"].vectors["log_std"]
     deviation = jnp.exp(flat["actor"][first : first + width])
     metrics = {name: total * share for name, total in (surrogate | error).items()}
@@ -252,7 +256,7 @@ def flat_gradient(
 def _actor_sums(
     run: _Run, actor: jax.Array, layout: KernelLayout, samples: Minibatch, config: AlgoConfig
 ) -> tuple[jax.Array, Metrics]:
-    """Sums over samples of the surrogate's gradient, and of metrics."""
+    """Sums the gradient of the surrogate, and metrics, over samples."""
     loss = functools.partial(_surrogate, config, samples.action.shape[1])
     names = ("observation", "action", "log_prob", "advantage", "valid")
     return run(actor, layout, loss=loss, samples=_samples(samples, names))
@@ -261,7 +265,7 @@ def _actor_sums(
 def _critic_sums(
     run: _Run, critic: jax.Array, layout: KernelLayout, samples: Minibatch
 ) -> tuple[jax.Array, Metrics]:
-    """Sums over samples of the gradient of half the squared error, of that, and of `valid`."""
+    """Sums the gradient of half the squared error, that error and `valid` over samples."""
     names = ("observation", "return_", "valid")
     return run(critic, layout, loss=_half_square, samples=_samples(samples, names))
 
@@ -269,10 +273,10 @@ def _critic_sums(
 def _with_entropy(
     gradient: jax.Array, config: AlgoConfig, weight: jax.Array, first: int, width: int
 ) -> jax.Array:
-    """Adds the slope of the entropy's cost by `log_std`, which is there from `first` on.
+    """Adds the entropy cost's derivative with respect to `log_std`, which starts at `first`.
 
-    The entropy is the sum of log_std and a constant, so its slope is 1. Nothing moves a deviation
-    that follows a schedule.
+    The entropy is the sum of log_std and a constant, so the derivative is 1. The gradient never
+    moves a deviation that follows a schedule.
     """
     index = jnp.arange(gradient.shape[0])
     moved = 0.0 if config.exploration == "scheduled" else gradient - config.entropy_cost * weight
@@ -314,12 +318,14 @@ def _samples(samples: Minibatch, names: tuple[str, ...]) -> Samples:
 def _surrogate(
     config: AlgoConfig, size: int, output: jax.Array, samples: Samples, vectors: Samples
 ) -> tuple[jax.Array, Metrics]:
-    """The clipped surrogate, negated, with the action padded by zeros.
+    """Computes the clipped surrogate, negated, with the action padded by zeros.
 
-    Schulman et al. 2017, "Proximal Policy Optimization Algorithms", equation 7: where the minimum
-    is r A its slope by log pi is r A, since dr / dlog pi = r; where it is the clipped term, 0. The
-    two are equal within the range. With z = (a - mu) / sigma, log pi is the sum over the action of
-    -z^2 / 2 - log sigma - log(2 pi) / 2: its slopes are z / sigma by mu and z^2 - 1 by log sigma.
+    Schulman et al. 2017, "Proximal Policy Optimization Algorithms", equation 7. If the minimum is
+    r A, its derivative with respect to log pi is r A, since dr / dlog pi = r. If the minimum is the
+    clipped term, the derivative is 0. Within the range the two terms are equal. With
+    z = (a - mu) / sigma, log pi is the sum over the action of
+    -z^2 / 2 - log sigma - log(2 pi) / 2. Its derivatives with respect to mu and log sigma are
+    z / sigma and z^2 - 1.
     """
     mean = jnp.tanh(output) if config.mean_activation == "tanh" else output
     log_std = vectors["log_std"][None, :]
@@ -327,7 +333,7 @@ def _surrogate(
     log_density = jnp.sum(-0.5 * standardised * standardised - log_std, axis=1)
     log_density -= 0.5 * size * math.log(2.0 * math.pi)
     valid, advantage = samples["valid"] > 0.0, samples["advantage"]
-    # Masked before exp: an overflow there would turn the zero gradient of a mask into NaN.
+    # Masked before exp: an overflow there would turn the masked zero gradient into NaN.
     log_ratio = jnp.where(valid, log_density - samples["log_prob"], 0.0)
     ratio = jnp.exp(log_ratio)
     gain = ratio * advantage
@@ -347,14 +353,14 @@ def _surrogate(
         "approx_kl": ratio - 1.0 - log_ratio,  # 0 where not valid
         "clip_fraction": jnp.where(
             jnp.abs(ratio - 1.0) > config.clip_epsilon, 1.0, 0.0
-        ),  # likewise
+        ),  # 0 where not valid
     }
 
 
 def _half_square(
     output: jax.Array, samples: Samples, vectors: Samples
 ) -> tuple[jax.Array, Metrics]:
-    """Half the squared error of the first column of the output, whose others are padding."""
+    """Computes half the squared error of the output's first column; the others are padding."""
     del vectors
     value = jnp.sum(output, axis=1)
     error = jnp.where(samples["valid"] > 0.0, value - samples["return_"], 0.0)

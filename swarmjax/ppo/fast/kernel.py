@@ -1,11 +1,11 @@
-"""A kernel that takes samples through a network, a loss and back without leaving the chip.
+"""A kernel that takes samples forward through a network and a loss, and back, on the chip.
 
-XLA writes the activations of every layer to memory and reads them again; here a program of the grid
-keeps those of a tile of samples, and writes no more than its sums at its end. Programs share
-nothing, so that the same samples give the same bits. A network is one vector, and so is its
-gradient: of each there is one array to read, add up and step along instead of a dozen.
+XLA writes the activations of every layer to memory and reads them again. Here a program of the grid
+keeps the activations of a tile of samples on the chip, and writes only its sums, at its end.
+Programs share nothing, so the same samples give the same bits. A network is one vector, and so is
+its gradient: the optimiser then handles one array instead of a dozen.
 
-B stands for samples, P for programs, `tile` for the samples that a program holds at once.
+B stands for samples, P for programs, and `tile` for the samples that a program holds at once.
 """
 
 import functools
@@ -20,13 +20,14 @@ from jax.experimental.pallas import triton
 
 # Least width of an operand of a matrix product on the tensor cores.
 LEAST_WIDTH = 16
-# A kernel's sums of 128 x 128 would take 128 registers of 128 threads, of 255 each.
+# Greatest width of a layer: the sums for a 128 x 128 matrix take 128 of the 255 registers of each
+# of 128 threads.
 MOST_WIDTH = 128
-# Bytes of a program: 99 KiB are the least that compute capability 8 and later give (CUDA C++
-# Programming Guide, "Technical Specifications per Compute Capability"); other products than those
-# of 9.0, which `fits` counts, take up to 4 more.
+# Bytes of the chip's memory that a program may use. Compute capability 8 and later gives at least
+# 99 KiB (CUDA C++ Programming Guide, "Technical Specifications per Compute Capability"). `fits`
+# counts for the matrix products of capability 9.0; those of others take up to 4 KiB more.
 SHARED_MEMORY = 95 * 1024
-# By compute capability, bytes, where a program may have more than the least: as above.
+# Bytes by compute capability, where a program may use more; from the same source.
 _MORE_SHARED_MEMORY = {"8.0": 163 * 1024, "9.0": 227 * 1024, "10.0": 227 * 1024}
 
 
@@ -46,9 +47,9 @@ class Place(NamedTuple):
     """Where an affine layer lies in the vector of its network's parameters, row by row.
 
     Attributes:
-        kernel: index of its first number.
-        bias: likewise.
-        shape: in and out.
+        kernel: Index of its first number.
+        bias: Index of its first number.
+        shape: Numbers of inputs and outputs.
     """
 
     kernel: int
@@ -60,9 +61,9 @@ class Launch(NamedTuple):
     """How the kernel is spread over the GPU.
 
     Attributes:
-        tile: samples of a tile, a power of two of at least `LEAST_WIDTH`.
-        programs: programs of the grid, at most; no more than there are tiles to choose from.
-        warps: warps of a program.
+        tile: Samples of a tile, a power of two of at least `LEAST_WIDTH`.
+        programs: Programs of the grid, at most. There are never more than tiles to choose from.
+        warps: Warps of a program.
     """
 
     tile: int
@@ -74,9 +75,9 @@ class KernelLayout(NamedTuple):
     """How the parameters of a network lie in one vector.
 
     Attributes:
-        layers: hidden layers and output, in order.
-        vectors: what else there is, by name: index of the first number, and width.
-        size: of the vector.
+        layers: Hidden layers and output, in order.
+        vectors: Other parameters, by name: index of the first number, and width.
+        size: Length of the vector.
     """
 
     layers: tuple[Place, ...]
@@ -85,11 +86,12 @@ class KernelLayout(NamedTuple):
 
 
 class Tiles(NamedTuple):
-    """Which tiles of the samples a kernel takes: tile i is samples i * tile to (i + 1) * tile.
+    """The tiles of samples that a kernel takes. Tile i is samples i * tile to (i + 1) * tile.
 
     Attributes:
-        order: [K], int32, tiles.
-        span: [2], int32, those of `order` that are taken: from the first number, below the other.
+        order: [K], int32, numbers of tiles.
+        span: [2], int32, the part of `order` to take: from the first index up to, but not
+            including, the second.
     """
 
     order: jax.Array
@@ -98,8 +100,8 @@ class Tiles(NamedTuple):
 
 # Samples of a tile by name, each [tile] or [tile, width], zero past the last sample.
 Samples = dict[str, jax.Array]
-# (output of the network [tile, width], samples, vectors) -> (derivative of the loss with respect
-# to the output [tile, width], what else is to be summed over all samples, each [tile, ...]).
+# (output of the network [tile, width], samples, vectors) -> (derivative of the loss with respect to
+# the output [tile, width], other terms to sum over all samples, each [tile, ...]).
 Loss = Callable[[jax.Array, Samples, dict[str, jax.Array]], tuple[jax.Array, dict[str, jax.Array]]]
 
 
@@ -107,13 +109,13 @@ _Activations = list[tuple[jax.Array, jax.Array]]
 
 
 def shared_memory() -> int:
-    """Returns how many bytes a program may have on the chip that JAX computes on."""
+    """Returns how many bytes of the chip's memory a program may use on JAX's current device."""
     capability = str(getattr(jax.devices()[0], "compute_capability", ""))
     return _MORE_SHARED_MEMORY.get(capability, SHARED_MEMORY)
 
 
 def padded_width(width: int) -> int:
-    """Returns what a width is padded to: Triton knows powers of two only."""
+    """Returns the next power of two: Triton supports no other widths."""
     return max(LEAST_WIDTH, pl.next_power_of_2(width))
 
 
@@ -124,17 +126,17 @@ def fits(
     tile: int,
     memory: int = SHARED_MEMORY,
 ) -> bool:
-    """Says whether the kernel takes a network: widths, and the memory on the chip.
+    """Tells whether the kernel supports a network: its widths, and the memory that it needs.
 
-    What Triton puts there is the first kernel once and all others twice, the second time turned
-    over for the way back, with a tile of observations and two of the widest hidden layer.
+    Triton stores the first weight matrix once and all others twice: the second copy is transposed
+    for the backward pass. It also stores a tile of observations and two of the widest hidden layer.
 
     Args:
-        inputs: width of the observation, which is padded, as that of the output is.
-        hidden: widths of the hidden layers: powers of two.
-        outputs: width of the output.
-        tile: samples of a tile.
-        memory: on the chip, of a program, bytes.
+        inputs: Width of the observation. It is padded, and so is the output.
+        hidden: Widths of the hidden layers, powers of two.
+        outputs: Width of the output.
+        tile: Samples of a tile.
+        memory: Bytes on the chip for a program.
 
     Returns:
         Whether `sums` may be called.
@@ -157,22 +159,24 @@ def sums(
     launch: Launch,
     interpret: bool = False,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Sums the gradient of a loss, and what else it tells, over the samples of some tiles.
+    """Sums the gradient of a loss, and the loss's other terms, over the samples of some tiles.
 
     Args:
-        parameters: [n] of a network. All is read and written as it is, and padded on the chip.
-        layout: of these; hidden layers have widths that `padded_width` leaves as they are.
-        activation: of the hidden layers: `tanh`, `relu` or `swish`.
-        loss: of the output; what must not count is 0 in all that it returns. Of the layout's
-            vectors it takes the padded values, and returns the derivatives under their names.
-        samples: by name, each [B] or [B, width], float32; of them `observation` [B, O] goes into
-            the network.
-        tiles: of `launch.tile` samples, which to take.
-        launch: how it is spread over the GPU.
-        interpret: run it as ordinary JAX, on any device.
+        parameters: [n] of a network. They are read and written without padding, and padded on the
+            chip.
+        layout: Layout of `parameters`. `padded_width` leaves the widths of the hidden layers
+            unchanged.
+        activation: Activation of the hidden layers: `tanh`, `relu` or `swish`.
+        loss: Loss of the output. Whatever must not count is 0 in all that it returns. It takes the
+            layout's vectors with padding, and returns their derivatives under their names.
+        samples: By name, each [B] or [B, width], float32. `observation` [B, O] is the network's
+            input.
+        tiles: The tiles to take, each of `launch.tile` samples.
+        launch: How the kernel is spread over the GPU.
+        interpret: Whether to run it as ordinary JAX, on any device.
 
     Returns:
-        The gradient [n], and what else the loss returns by name, each [].
+        The gradient [n], and the loss's other terms by name, each [].
     """
     of_tile = functools.partial(_of_tile, activation, loss)
     shapes = jax.eval_shape(of_tile, *_shapes(layout, samples, launch.tile))
@@ -183,7 +187,7 @@ def sums(
         functools.partial(_program, of_tile, shapes, layout, launch.tile),
         grid=(programs,),
         out_shape=jax.ShapeDtypeStruct((programs * width,), jnp.float32),
-        # Nothing to run ahead of: a tile's samples are few bytes beside its products.
+        # Prefetching does not pay: a tile's samples are few bytes compared with its products.
         compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=1),
         interpret=interpret,
     )(parameters, samples, tiles)
@@ -192,7 +196,7 @@ def sums(
 
 
 def _shapes(layout: KernelLayout, samples: Samples, tile: int) -> Any:
-    """Shapes of the arguments of a tile: layers, samples and vectors, all padded."""
+    """Lists the shapes of the arguments of a tile: layers, samples and vectors, all padded."""
 
     def array(*shape: int) -> Any:
         return jax.ShapeDtypeStruct(tuple(map(padded_width, shape)), jnp.float32)
@@ -212,7 +216,7 @@ def _program(
     tiles: Any,
     totals: Any,
 ) -> None:
-    """A program: every P-th tile; all arguments after `tile` are references."""
+    """Runs one program, on every P-th tile; all arguments after `tile` are references."""
     program, programs = pl.program_id(0), pl.num_programs(0)
     layers = tuple(_read_layer(parameters, place) for place in layout.layers)
     vectors = {name: _read_row(parameters, *at) for name, at in layout.vectors.items()}
@@ -239,7 +243,7 @@ def _program(
 
 
 def _at(first: Any, shape: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
-    """Indices of an array that lies in a vector row by row, padded, and which of them it has."""
+    """Returns indices of a padded array stored row by row in a vector, and which of them exist."""
     counts = [jnp.arange(padded_width(width)) for width in shape]
     if len(shape) == 1:
         return first + counts[0], counts[0] < shape[0]
@@ -270,7 +274,7 @@ def _write_row(ref: Any, row: jax.Array, first: int, width: int, values: jax.Arr
 
 
 def _read(ref: Any, rows: jax.Array) -> jax.Array:
-    """Rows of an array, widened to what products take; zeros where it has none."""
+    """Reads rows of an array, widened to float32; zeros where the array has no row."""
     known = rows < ref.shape[0]
     if len(ref.shape) == 1:
         return triton.load(ref.at[rows], mask=known, other=0.0)
@@ -287,7 +291,7 @@ def _of_tile(
     samples: Samples,
     vectors: dict[str, jax.Array],
 ) -> tuple[tuple[Layer, ...], dict[str, jax.Array]]:
-    """Forward, loss and backward of a tile: sums of the gradient, and what else is to be summed."""
+    """Runs a tile forward and backward; returns sums of the gradient and of the other terms."""
     activations, output = _forward(activation, network, samples["observation"])
     slope, parts = loss(output, samples, vectors)
     return _backward(activation, network, activations, slope), parts
@@ -296,7 +300,7 @@ def _of_tile(
 def _forward(
     activation: str, network: tuple[Layer, ...], features: jax.Array
 ) -> tuple[_Activations, jax.Array]:
-    """What goes into each layer, with what the activation that made it took, and the output."""
+    """Returns each layer's input, with the value before its activation, and the output."""
     seen, before = [], features
     for layer in network[:-1]:
         seen.append((before, features))
@@ -309,10 +313,11 @@ def _forward(
 def _backward(
     activation: str, network: tuple[Layer, ...], seen: _Activations, slope: jax.Array
 ) -> tuple[Layer, ...]:
-    """Backpropagation, summed over the tile: Goodfellow et al. 2016, "Deep Learning", alg. 6.4.
+    """Backpropagates, summed over the tile: Goodfellow et al. 2016, "Deep Learning", alg. 6.4.
 
-    With z = x W + b and g the derivative with respect to z, those with respect to W, b and x are
-    x^T g, the sum of g over samples, and g W^T; x = f(z') of the layer before multiplies by f'(z').
+    With z = x W + b and g the derivative with respect to z, the derivatives with respect to W, b
+    and x are x^T g, the sum of g over samples, and g W^T. If x = f(z') is the output of the layer
+    before, its derivative is multiplied by f'(z').
     """
     gradient = []
     for index in reversed(range(len(network))):
@@ -325,7 +330,7 @@ def _backward(
 
 
 def _outer(features: jax.Array, slope: jax.Array) -> jax.Array:
-    """x^T g, with the wider of both in front: an H100's fast products have 64 rows or more."""
+    """Computes x^T g with the wider one in front: an H100's fast products need 64 rows or more."""
     if features.shape[1] < slope.shape[1]:
         return jnp.dot(slope.T, features).T
     return jnp.dot(features.T, slope)
@@ -336,18 +341,18 @@ def _swish(before: jax.Array) -> jax.Array:
 
 
 def logistic(x: jax.Array) -> jax.Array:
-    """Computes 1 / (1 + exp(-x)), of what Triton knows."""
+    """Computes 1 / (1 + exp(-x)) from functions that Triton has."""
     return 1.0 / (1.0 + jnp.exp(-x))
 
 
 def _slope_of_swish(before: jax.Array, after: jax.Array) -> jax.Array:
-    """The derivative of z s(z), s + z s (1 - s), since that of the logistic s is s (1 - s)."""
+    """Computes the derivative of z s(z), s + z s (1 - s), where s is the logistic function."""
     share = logistic(before)
     return share + after * (1.0 - share)
 
 
 _ACTIVATIONS = {"tanh": jnp.tanh, "relu": lambda z: jnp.maximum(z, 0.0), "swish": _swish}
-# Derivatives, by what the activation took and what it gave.
+# Derivatives of the activations, from their input and their output.
 _SLOPES = {
     "tanh": lambda _, after: 1.0 - after * after,
     "relu": lambda before, _: jnp.where(before > 0.0, 1.0, 0.0),

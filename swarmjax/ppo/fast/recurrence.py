@@ -1,10 +1,11 @@
-"""Kernels that take a GRU through sequences, and its gradient back, without leaving the chip.
+"""Kernels that take a GRU through sequences, and its gradient back, on the chip.
 
-XLA launches several kernels for each step of a sequence, and writes what they pass on to memory.
-Here a program of the grid holds a tile of sequences and their memory, and goes through all steps.
+XLA launches several kernels for each step of a sequence, and passes data between them through the
+GPU's memory. Here a program of the grid holds a tile of sequences and their memory, and runs all
+steps.
 
-T stands for control steps, B for sequences, F for features, H for the memory, `tile` for the
-sequences that a program holds, P for programs.
+T stands for control steps, B for sequences, F for features, H for the memory's width, `tile` for
+the sequences that a program holds, and P for programs.
 """
 
 import functools
@@ -18,14 +19,16 @@ from jax.experimental.pallas import triton
 
 from swarmjax.ppo.fast.kernel import logistic
 
-# Sequences of a tile. On an H100 a program of 8 warps takes twice as long back through 64 of them,
-# and one of 4 warps longer through 32 (docs/performance.md).
+# Sequences of a tile. In the backward pass on an H100, 64 sequences took 8 warps twice as long, and
+# 4 warps were slower than 8 for 32 sequences (docs/performance.md).
 TILE = 32
 _WARPS, _BACKWARD_WARPS = 4, 8
-# What is seen, and the gradient by it, are the largest arrays: with half as many bytes, training
-# takes 8 % less time on an H100. Rollouts round alike, so that ratios of probabilities begin at 1.
+# The GRU's inputs and their gradient are the largest arrays. With half as many bytes, training took
+# 8 % less time on an H100. The rollout rounds in the same way, so that ratios of probabilities
+# begin at 1.
 _SEEN = jnp.bfloat16
-# Widths of a memory: the least operand of a tensor core, and the most whose kernels fit the chip.
+# Supported widths of a memory: 16 is the least operand of a tensor core, and wider weight matrices
+# than 64 do not fit the chip.
 _SIZES = (16, 32, 64)
 
 _Three = tuple[jax.Array, ...]  # of reset, update and candidate
@@ -36,7 +39,7 @@ class _Rows(NamedTuple):
     """The sequences of a program at a step.
 
     Attributes:
-        at: [tile], their rows of [T B, ...].
+        at: [tile], their rows in [T B, ...].
         exist: [tile], false past the last sequence.
     """
 
@@ -48,9 +51,9 @@ class _Unit(NamedTuple):
     """The weights of reset, update and candidate.
 
     Attributes:
-        kernels: [H, H] each, of what is recalled.
-        biases: [H] each, of what is recalled.
-        biases_seen: [H] each, of what is seen.
+        kernels: [H, H] each, weights of the memory.
+        biases: [H] each, added to the memory's part.
+        biases_seen: [H] each, added to the input's part.
     """
 
     kernels: _Three
@@ -59,7 +62,7 @@ class _Unit(NamedTuple):
 
 
 class _Weights(NamedTuple):
-    """The weights of a unit as they come: kernel [H, 3 H] and bias [3 H], and of what is seen."""
+    """The weights of a unit: the memory's kernel [H, 3 H] and bias [3 H], and the input's bias."""
 
     kernel: Any
     bias: Any
@@ -67,7 +70,7 @@ class _Weights(NamedTuple):
 
 
 class _Sequences(NamedTuple):
-    """What a unit goes through: [T B, 3 H], [T B] of 0 or 1, and [B, H] before."""
+    """The inputs of a unit [T B, 3 H], where episodes begin [T B] (0 or 1), and memories [B, H]."""
 
     seen: Any
     begins: Any
@@ -81,7 +84,7 @@ class _Gates(NamedTuple):
         reset: 0..1.
         update: 0..1.
         candidate: -1..1.
-        recalled: What the candidate recalls, before `reset`.
+        recalled: The memory's part of the candidate, before `reset` scales it.
     """
 
     reset: jax.Array
@@ -91,14 +94,14 @@ class _Gates(NamedTuple):
 
 
 def fits(size: int, shared_memory: int) -> bool:
-    """Says whether the kernels take a memory: its width, and the room on the chip.
+    """Tells whether the kernels support a memory of this width on this chip.
 
-    What lies there is the kernel of what is recalled twice, the second time turned over for the way
-    back, with four tiles of memories and slopes.
+    The chip's memory holds the recurrent weights twice: the second copy is transposed for the
+    backward pass. It also holds four tiles of memories and derivatives.
 
     Args:
         size: H.
-        shared_memory: Of a program, bytes.
+        shared_memory: Bytes on the chip for a program.
 
     Returns:
         Whether `remember_all` may be called.
@@ -113,9 +116,9 @@ def remember_all(
     memory: jax.Array,
     interpret: bool = False,
 ) -> jax.Array:
-    """Computes what `memory.Gru` remembers after each observation, but for rounding.
+    """Computes the memory of `memory.Gru` after each observation, up to rounding.
 
-    Features are rounded to bfloat16, and so is what the gates see of them. Other products have
+    Features, and what the gates compute from them, are rounded to bfloat16. Other products use
     JAX's precision, `jax.default_matmul_precision`.
 
     Args:
@@ -123,8 +126,8 @@ def remember_all(
             [3 H]; `fits` accepts H.
         features: [T, B, F].
         begins: [T, B], whether an episode begins with the step.
-        memory: [B, H] before the first.
-        interpret: Run the kernels as ordinary JAX, on any device.
+        memory: [B, H] before the first step.
+        interpret: Whether to run the kernels as ordinary JAX, on any device.
 
     Returns:
         The memory [T, B, H] after each step.
@@ -143,16 +146,16 @@ def remember(
     memory: jax.Array,
     interpret: bool = False,
 ) -> jax.Array:
-    """Computes what `memory.Gru` remembers after one observation, but for rounding.
+    """Computes the memory of `memory.Gru` after one observation, up to rounding.
 
     Args:
         layers: As `remember_all` takes them.
         features: [B, F].
-        memory: [B, H] before.
-        interpret: Run the kernel as ordinary JAX, on any device.
+        memory: [B, H] before the observation.
+        interpret: Whether to run the kernel as ordinary JAX, on any device.
 
     Returns:
-        The memory [B, H] after.
+        The memory [B, H] after the observation.
     """
     flat = memory.reshape(-1, memory.shape[-1])
     seen = features.reshape(1, -1, features.shape[-1])
@@ -162,7 +165,7 @@ def remember(
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _through(weights: _Weights, sequences: _Sequences, interpret: bool) -> jax.Array:
-    """Takes memories through sequences: [T, B, H]."""
+    """Takes memories through sequences; returns the memory after each step, [T, B, H]."""
     count, size = sequences.memory.shape
     steps = len(sequences.seen) // count
     every = pl.pallas_call(
@@ -184,7 +187,7 @@ def _through_forward(weights: _Weights, sequences: _Sequences, interpret: bool) 
 def _through_backward(
     interpret: bool, kept: tuple[_Weights, _Sequences, jax.Array], slope: jax.Array
 ) -> tuple[_Weights, _Sequences]:
-    """Takes the gradient [T, B, H] by what is remembered back to all that it came from."""
+    """Backpropagates from the memories [T, B, H] to weights, inputs and first memories."""
     weights, sequences, every = kept
     steps, count, size = every.shape
     programs = pl.cdiv(count, TILE)
@@ -204,7 +207,7 @@ def _through_backward(
     by_kernel = found["kernel"].reshape(programs, size, 3 * size).sum(axis=0)
     gates, recalled, candidate = jnp.split(found["sums"].sum(axis=0), (2 * size, 3 * size))
     by_bias, by_bias_seen = (jnp.concatenate([gates, x]) for x in (recalled, candidate))
-    # Nothing has a slope by where episodes begin.
+    # `begins` has no gradient.
     by_begins = jnp.zeros_like(sequences.begins)
     return (
         _Weights(by_kernel, by_bias, by_bias_seen),
@@ -216,7 +219,7 @@ _through.defvjp(_through_forward, _through_backward)
 
 
 def _forward(steps: int, weights: _Weights, sequences: _Sequences, every: Any) -> None:
-    """A program: a tile of sequences from the first step to the last, of references."""
+    """Runs one program: a tile of sequences from first step to last; arguments are references."""
     unit, (count, size) = _read_unit(weights), sequences.memory.shape
     own = _own(count)
 
@@ -239,7 +242,7 @@ def _backward(
     slope: Any,
     found: dict[str, Any],
 ) -> None:
-    """A program: a tile of sequences from the last step to the first, of references."""
+    """Runs one program: a tile of sequences from last step to first; arguments are references."""
     unit, (count, size) = _read_unit(weights), sequences.memory.shape
     own = _own(count)
 
@@ -269,7 +272,7 @@ def _backward(
 def _write_sums(
     found: dict[str, Any], products: tuple[jax.Array, ...], totals: tuple[jax.Array, ...]
 ) -> None:
-    """Writes what a program has summed: by the kernel, gate by gate, and by the biases."""
+    """Writes the sums of a program: gradients of the weights, gate by gate, and of the biases."""
     program, size = pl.program_id(0), len(totals[0])
     columns = jnp.arange(size)
     for gate, product in enumerate(products):
@@ -280,7 +283,7 @@ def _write_sums(
 
 
 def _gates(seen: Any, rows: _Rows, before: jax.Array, unit: _Unit) -> _Gates:
-    """Computes what `memory.remember` does before it mixes."""
+    """Computes the gates as `memory.remember` does, before it mixes them."""
     size = before.shape[1]
 
     def of(gate: int) -> tuple[jax.Array, jax.Array]:
@@ -293,13 +296,15 @@ def _gates(seen: Any, rows: _Rows, before: jax.Array, unit: _Unit) -> _Gates:
 
 
 def _slopes(slope: jax.Array, gates: _Gates, before: jax.Array) -> tuple[_Three, _Three, jax.Array]:
-    """Takes the slope by the memory after back through the gates.
+    """Backpropagates from the memory after a step through the gates.
 
-    With r, u the gates, n = tanh(x + r c) the candidate and h' = n + u (h - n): the slopes by n,
-    u and h are 1 - u, h - n and u, and those of tanh and logistic are 1 - n^2 and r (1 - r).
+    r and u are the gates, n = tanh(x + r c) is the candidate, and h' = n + u (h - n). The
+    derivatives of h' with respect to n, u and h are 1 - u, h - n and u. Those of tanh and of the
+    logistic function are 1 - n^2 and r (1 - r).
 
     Returns:
-        Slopes by what is seen and by what is recalled, gate by gate, and by the memory before.
+        Derivatives with respect to the inputs and to the memory's part, gate by gate, and to the
+        memory before.
     """
     reset, update, candidate, recalled = gates
     by_candidate = slope * (1.0 - update) * (1.0 - candidate * candidate)
@@ -310,18 +315,18 @@ def _slopes(slope: jax.Array, gates: _Gates, before: jax.Array) -> tuple[_Three,
 
 
 def _own(count: int) -> _Rows:
-    """The sequences of this program at the first step. Interpreted, a loop cannot ask for them."""
+    """Returns this program's sequences at the first step. Interpreted loops cannot look them up."""
     at = pl.program_id(0) * TILE + jnp.arange(TILE)
     return _Rows(at, at < count)
 
 
 def _rows(own: _Rows, first: jax.Array) -> _Rows:
-    """The same sequences, at a step whose first row is `first`."""
+    """Moves the same sequences to the step whose first row is `first`."""
     return own._replace(at=first + own.at)
 
 
 def _goes_on(begins: Any, rows: _Rows) -> jax.Array:
-    """Whether an episode goes on, [tile, 1], 0 or 1."""
+    """Returns whether an episode goes on, [tile, 1], 0 or 1."""
     return 1.0 - triton.load(begins.at[rows.at], mask=rows.exist, other=0.0)[:, None]
 
 
@@ -343,7 +348,7 @@ def _read_unit(weights: _Weights) -> _Unit:
 
 
 def _load(ref: Any, rows: _Rows, first: int, size: int) -> jax.Array:
-    """Reads [tile, H] from column `first` on, zeros of sequences that do not exist."""
+    """Reads [tile, H] from column `first` on; zeros for sequences that do not exist."""
     columns = first + jnp.arange(size)
     mask = rows.exist[:, None] & (columns >= 0)[None, :]
     found = triton.load(ref.at[rows.at[:, None], columns[None, :]], mask=mask, other=0.0)
@@ -351,7 +356,7 @@ def _load(ref: Any, rows: _Rows, first: int, size: int) -> jax.Array:
 
 
 def _write(ref: Any, rows: _Rows, first: int, x: jax.Array) -> None:
-    """Writes [tile, H] from column `first` on, but for sequences that do not exist."""
+    """Writes [tile, H] from column `first` on, except for sequences that do not exist."""
     columns = first + jnp.arange(x.shape[1])
     mask = rows.exist[:, None] & (columns >= 0)[None, :]
     triton.store(ref.at[rows.at[:, None], columns[None, :]], x.astype(ref.dtype), mask=mask)

@@ -1,9 +1,9 @@
-"""Updates of policies with memory, in minibatches of the sequences that something is learned from.
+"""Updates of policies with memory, in minibatches of sequences that hold a valid sample.
 
-A sequence is the rollout of one robot. Those of robots that are absent, or that had arrived before
-the rollout began, hold no valid sample: they come last, and tiles that would hold no others are
-left out. The others are shuffled one by one, and a minibatch is taken in tiles of a fixed number of
-them. The loss is a sum over samples, so the gradients of tiles add up.
+A sequence is the rollout of one robot. A robot that is absent, or had arrived before the rollout
+began, has no valid sample. Its sequence comes last, and tiles of such sequences alone are left out.
+The other sequences are shuffled one by one, and a minibatch is processed in tiles of a fixed number
+of sequences. The loss is a sum over samples, so the gradients of tiles add up.
 """
 
 from dataclasses import replace
@@ -20,15 +20,15 @@ from swarmjax.ppo.networks import Params
 from swarmjax.ppo.optimizer import Progress
 from swarmjax.shards import ALONE, Shards
 
-# Sequences of a tile. On a CPU tiles of 32 take no longer than whole minibatches where all robots
-# take part, and fill up where few do.
+# Sequences of a tile on a CPU. Tiles of 32 take no longer than whole minibatches where all robots
+# are present, and are well filled where few are.
 CPU_TILE = 32
-# Samples of a tile elsewhere, at least and at most. An accelerator waits for one step after the
-# other, so a large tile takes it little longer than a small one. With default layers a tile of the
-# most takes about 12 GB for each learner and seed.
+# Fewest and most samples of a tile on an accelerator. An accelerator runs one step after the other,
+# so a large tile takes little longer than a small one. With default layers, the largest tile takes
+# about 12 GB for each learner and seed.
 TILE_SAMPLES = 2**16, 2**21
-# Tiles of a full minibatch elsewhere, between these: where most robots are absent, most are left
-# out.
+# Between these bounds, an accelerator splits a full minibatch into this many tiles. Where most
+# robots are absent, most of the tiles are left out.
 _TILES = 4
 
 
@@ -36,9 +36,9 @@ class Dealt(NamedTuple):
     """The useful sequences of a batch, dealt out to minibatches.
 
     Attributes:
-        order: [Q], int32, all sequences; those of the first minibatch come first, the useless ones
-            last.
-        span: [M, 2], int32, where in `order` each minibatch begins, and where it has ended.
+        order: [Q], int32, all sequences. Those of the first minibatch come first, and those without
+            a valid sample last.
+        span: [M, 2], int32, where in `order` each minibatch begins and ends.
     """
 
     order: jax.Array
@@ -56,7 +56,7 @@ def learn(
     """Learns from a batch, in minibatches of useful sequences.
 
     Args:
-        config: Of networks with memory.
+        config: Settings of networks with memory.
         updates: Number of updates of the whole run.
         begun: Parameters and the optimiser's state.
         samples: [G, N, ...], zero where not valid, ordered by step.
@@ -89,7 +89,7 @@ def arrange(samples: Minibatch, steps: int) -> Minibatch:
         steps: T.
 
     Returns:
-        [Q, T, ...] and memory [Q, H], with Q = G S: the robots of the first group come first.
+        [Q, T, ...] and memory [Q, H], with Q = G S. The robots of the first group come first.
     """
 
     def by_sequence(x: jax.Array) -> jax.Array:
@@ -103,9 +103,9 @@ def arrange(samples: Minibatch, steps: int) -> Minibatch:
 def deal(key: jax.Array, useful: jax.Array, minibatches: int, shards: Shards = ALONE) -> Dealt:
     """Deals the useful sequences out to minibatches at random.
 
-    Each stream of random numbers deals its own, as evenly as they divide, so that a minibatch holds
-    the same sequences on any number of devices. Where a stream has fewer of them than there are
-    minibatches, the last minibatches get none of it.
+    Each stream of random numbers deals its own sequences out, as evenly as possible, so that a
+    minibatch holds the same sequences on any number of devices. If a stream has fewer sequences
+    than there are minibatches, the last minibatches get none of them.
 
     Args:
         key: Random key, the same on all devices, consumed.
@@ -143,9 +143,9 @@ def gradient(
     """Computes the gradient of `losses.ppo_loss` over the sequences of one minibatch.
 
     Args:
-        params: Of actor and critic.
-        rows: As `arrange` gives them.
-        order: [Q], as `deal` gives it.
+        params: Parameters of the actor and the critic.
+        rows: Result of `arrange`.
+        order: [Q], result of `deal`.
         span: [2], int32, of the minibatch.
         config: Clip range and costs.
         expected_valid: [], valid samples of the whole batch / number of minibatches.
@@ -166,12 +166,12 @@ def tile_size(sequences: int, minibatches: int, steps: int) -> int:
     """Chooses how many sequences a tile has, so that few tiles fill the fullest minibatch.
 
     Args:
-        sequences: Q, of the batch.
+        sequences: Q of the batch.
         minibatches: M.
-        steps: T, of a sequence.
+        steps: T of a sequence.
 
     Returns:
-        At least 1, and between the bounds above.
+        At least 1. On an accelerator it respects `TILE_SAMPLES`.
     """
     fullest = -(-sequences // minibatches)
     if jax.default_backend() == "cpu":
@@ -183,7 +183,7 @@ def tile_size(sequences: int, minibatches: int, steps: int) -> int:
 
 
 def tiles_of(span: jax.Array, size: int) -> jax.Array:
-    """Counts the tiles of `size` sequences, [], that a span [2] of sequences takes."""
+    """Counts the tiles, [], that a span [2] of sequences needs, with `size` sequences a tile."""
     return (span[1] - span[0] + size - 1) // size
 
 
@@ -193,10 +193,10 @@ def take_tile(
     """Takes the sequences of a tile, step by step.
 
     Args:
-        rows: As `arrange` gives them.
-        order: [Q], as `deal` gives it.
-        start: [], int32, place in `order` of the tile's first sequence.
-        end: [], int32, where the minibatch has ended. What the tile holds from there on is not
+        rows: Result of `arrange`.
+        order: [Q], result of `deal`.
+        start: [], int32, index in `order` of the tile's first sequence.
+        end: [], int32, index in `order` at which the minibatch ends. Samples from there on are not
             valid.
         size: Sequences of the tile.
 

@@ -1,7 +1,8 @@
-"""Updates by the kernels of `fused`, from where the batch lies: minibatches of tiles.
+"""Updates with the kernels of `fused`, which read the batch in place: minibatches of tiles.
 
-Valid samples are moved to the front once; tiles of them are shuffled instead of groups, and a
-minibatch is a span of that order. There may be fewer tiles of valid samples than minibatches.
+Valid samples are moved to the front once. Then tiles of them are shuffled, instead of groups, and a
+minibatch is a span of the shuffled tiles. There may be fewer tiles of valid samples than
+minibatches.
 """
 
 from dataclasses import replace
@@ -31,14 +32,14 @@ def learn(
 ) -> tuple[Progress, Metrics]:
     """Learns from a batch, in minibatches of tiles of valid samples.
 
-    Each device deals out its own tiles. How samples come together then depends on the number of
-    devices, and not on random streams alone.
+    Each device deals out its own tiles. The samples of a minibatch therefore depend on the number
+    of devices as well as on the random streams.
 
-    Networks and what the optimiser has of them are one vector each on the way: of a minibatch's
-    kernels most would otherwise add up, compare and move one of two dozen small arrays.
+    Each network is one vector here, and so is the optimiser's state of it. Otherwise most kernels
+    of a minibatch would handle one of two dozen small arrays each.
 
     Args:
-        config: Of networks that `fused.fits` accepts.
+        config: Settings of networks that `fused.fits` accepts.
         updates: Number of updates of the whole run.
         begun: Parameters and the optimiser's state.
         samples: [G, N, ...], zero where not valid.
@@ -83,7 +84,7 @@ def learn(
 def _flat_state(
     config: AlgoConfig, updates: int, params: Params, state: optax.OptState
 ) -> optax.OptState:
-    """The optimiser's state with one vector where there is a tree of each network's parameters."""
+    """Converts the optimiser's state: one vector for each network instead of a tree."""
     like = jax.eval_shape(optimizer.make(config, updates).init, fused.flatten(params))
     return jax.tree.map(lambda x, tree: ravel_pytree(tree)[0] if x.ndim else tree, like, state)
 
