@@ -1,0 +1,233 @@
+"""Does a curriculum pay on worlds with walls? Its modes, levels, memory and messages compared.
+
+`python -m benchmarks.worlds_study arms=random,adaptive [key=value ...]` trains each arm on the ten
+families of `stage=worlds`, one seed after another in one program, and judges every seed at points
+along its training: on the device, on the same new levels of every family, with the sizes of the
+suite `worlds`. It prints a JSON line for each arm as soon as it is done. Keys are those of `Study`
+and of `swarmjax.train`; `seeds` is 10 unless given.
+
+`python -m benchmarks.worlds_table FILE...` makes the table.
+"""
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, Literal
+
+import jax
+import numpy as np
+
+from benchmarks import curriculum, key_value
+from swarmjax import command, provenance
+from swarmjax.config import ConfigError, Section, about, to_dict
+from swarmjax.config.section import MAX_COUNT
+from swarmjax.evaluate import engine_mjx
+from swarmjax.ppo.learner import LearnerState
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.task import env
+from swarmjax.task.level import Level
+from swarmjax.task.stage_config import StageConfig
+from swarmjax.training import program as programs
+from swarmjax.training import seeds
+
+# What all arms share: memory, messages and a critic that sees the state (docs/worlds.md).
+RECIPE = [
+    "seeds=10",
+    "seeds_by=map",
+    "stage=worlds",
+    "task.step_limit=1500",
+    "task.reward.progress=0",
+    "task.reward.path_progress=1",
+    "task.reward.contact=-0.05",
+    "task.reward.touching=-0.003",
+    "task.reward.arrival=2",
+    "algo.rollout_length=64",
+    "algo.gae_lambda=0.98",
+    "algo.num_minibatches=32",
+    "algo.epochs=2",
+    "arenas=8192",
+    "budget=1e8",
+    "curriculum.success=all",
+]
+_EVENLY = ["curriculum.mode=adaptive", "curriculum.floor=1", "curriculum.shares=robots"]
+_BY_FAILURE = [
+    "curriculum.mode=adaptive",
+    "curriculum.floor=0.3",
+    "curriculum.shares=robots",
+    "curriculum.score=failure",
+]
+ARMS = {
+    "hardest": _EVENLY,
+    "random": _EVENLY,
+    "sequential": ["curriculum.mode=sequential"],
+    "mixed": ["curriculum.mode=mixed"],
+    "adaptive": _BY_FAILURE,
+    "prerequisites": [*_BY_FAILURE, "curriculum.prerequisites=1"],
+    "learnability": [*_EVENLY, "curriculum.levels.mode=learnability"],
+    "value_loss": [*_EVENLY, "curriculum.levels.mode=value_loss"],
+    "mutation": [
+        *_EVENLY,
+        "curriculum.levels.mode=learnability",
+        "curriculum.levels.mutation=0.3",
+    ],
+}
+_PARTS = {
+    "memory": ["algo.memory=gru"],
+    "messages": ["task.neighbours.count=4", "task.neighbours.message_size=2"],
+    "state": ["algo.critic=state"],
+}
+# The sizes of the suite `worlds`, where a stage of training has ranges.
+HARDEST: dict[str, dict[str, Any]] = {
+    "trap": {"width": 0.3, "depth": 0.3},
+    "fence": {"length": 0.6},
+    "door": {"gap": 0.13},
+}
+
+Judge = Callable[[LearnerState], dict[str, dict[str, np.ndarray]]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study(Section):
+    """What is compared, and how it is judged."""
+
+    arms: tuple[
+        Literal[
+            "hardest",
+            "random",
+            "sequential",
+            "mixed",
+            "adaptive",
+            "prerequisites",
+            "learnability",
+            "value_loss",
+            "mutation",
+        ],
+        ...,
+    ] = field(
+        default=tuple(ARMS),
+        metadata=about("hardest: no curriculum, the suite's sizes alone; random: all families"),
+    )
+    without: Literal["nothing", "memory", "messages", "state"] = field(
+        default="nothing", metadata=about("part of the recipe that is left out")
+    )
+    points: int = field(default=5, metadata=about("evenly spaced points of judging", 1, 1000))
+    levels: int = field(default=64, metadata=about("levels of each family", 1, 2**20))
+    level_seed: int = field(default=5, metadata=about("of these levels", 0, MAX_COUNT))
+    steps: int = field(default=3000, metadata=about("control steps of an episode", 1, 10**6))
+
+
+def load_arm(study: Study, arm: str, words: Sequence[str]) -> TrainConfig:
+    """Makes the config of one arm.
+
+    Args:
+      study: The study.
+      arm: One of its arms.
+      words: Of training, `key=value`; they win over the recipe.
+
+    Returns:
+      The config.
+
+    Raises:
+      ConfigError: If a word is unsound.
+    """
+    parts = [word for name, mine in _PARTS.items() if name != study.without for word in mine]
+    found = load_train([*RECIPE, *parts, *ARMS[arm], *words])
+    if arm != "hardest":
+        return found
+    return replace(found, stage=tuple(_hardest(stage) for stage in found.stage))
+
+
+def _hardest(stage: StageConfig) -> StageConfig:
+    """Gives a stage the sizes of the suite `worlds`."""
+    return replace(stage, **HARDEST.get(stage.level, {}))
+
+
+def points(study: Study, trained: TrainConfig) -> np.ndarray:
+    """Returns the updates [P] after which an arm is judged; the last is the end of its budget.
+
+    Raises:
+      ConfigError: If there are fewer updates than points.
+    """
+    if trained.updates < study.points:
+        raise ConfigError(
+            f"points is {study.points}, but the budget pays for {trained.updates} updates: give "
+            f"at most {trained.updates}."
+        )
+    return np.linspace(0, trained.updates, study.points + 1).round().astype(int)[1:]
+
+
+def load_judge(study: Study, trained: TrainConfig) -> Judge:
+    """Makes the judge of one arm.
+
+    Args:
+      study: The study.
+      trained: The config of the arm.
+
+    Returns:
+      From learners [N, L] to the means [N] over the levels of each of the `Outcomes`, by family.
+    """
+    stages = tuple(_hardest(stage) for stage in trained.stage)
+    config = programs.load(trained)[0].config.algo
+    world = env.load(
+        stages,
+        trained.robot,
+        trained.task,
+        trained.realism,
+        trained.sim,
+        arenas=len(stages) * study.levels,
+    )
+    drawn = [engine_mjx.draw_levels(world, s, study.level_seed, study.levels) for s in stages]
+    levels = Level(*(np.concatenate(fields) for fields in zip(*drawn, strict=True)))
+    run = partial(engine_mjx.outcomes, world, config, steps=study.steps, sampled=True)
+    call = jax.jit(lambda learners: jax.lax.map(lambda one: run(one, levels), learners))
+
+    def judge(learners: LearnerState) -> dict[str, dict[str, np.ndarray]]:
+        found = call(learners)._asdict()
+        split = {name: np.split(np.asarray(x), len(stages), 1) for name, x in found.items()}
+        return {
+            stage.name: {name: parts[i].mean(axis=1) for name, parts in split.items()}
+            for i, stage in enumerate(stages)
+        }
+
+    return judge
+
+
+def results(study: Study, words: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Trains and judges all arms; yields a line each."""
+    arms = [(arm, load_arm(study, arm, words)) for arm in study.arms]
+    for arm, trained in arms:
+        at = points(study, trained)
+        curves = curriculum.measure(trained, at, load_judge(study, trained))
+        yield _line(study, arm, trained, at) | vars(curves)
+
+
+def _line(study: Study, arm: str, trained: TrainConfig, at: np.ndarray) -> dict[str, Any]:
+    """Says what an arm was."""
+    return {
+        "benchmark": "worlds_study",
+        "arm": arm if study.without == "nothing" else f"{arm}, without {study.without}",
+        "config": to_dict(trained),
+        "seeds": list(seeds.numbers(trained)),
+        "levels": study.levels,
+        "level_seed": study.level_seed,
+        "steps": study.steps,
+        "arena_steps": (at * trained.arenas * trained.algo.rollout_length).tolist(),
+        "device": provenance.device(),
+        "versions": provenance.versions(),
+        "commit": provenance.commit(),
+    }
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    study, words = key_value.parse(Study, arguments)
+    for line in results(study, words):
+        sys.stdout.write(json.dumps(line) + "\n")
+        sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("worlds_study", main, TrainConfig))
