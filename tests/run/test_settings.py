@@ -272,8 +272,8 @@ def test_import_needs_neither_jax_nor_hydra():
         # 1e15 // 4096 = 244140625000; 1 epoch of 8 minibatches: (2**31 - 1) // 8 = 268435455, and
         # 268435455 * 4096 = 1099511623680.
         (["budget=1e15"], "budget is 1000000000000000, which is 244140625000 updates of 4096 "
-         "control steps, and the gradient steps of no more than 268435455 are counted in 32 bits: "
-         "give at most 1099511623680."),
+         "control steps, but gradient steps are counted in 32 bits, which is enough for 268435455 "
+         "updates: give at most 1099511623680."),
     ],
 )  # fmt: skip
 def test_train_refuses(words, sentence):
