@@ -286,7 +286,7 @@ class Saves:
         return due
 
     def must_wait(self, tally: Tally) -> bool:
-        """Returns whether the next call would end over an interval after the last checkpoint."""
+        """Returns whether the next call ends over an interval after the second newest save."""
         return self._is_over(self._before, tally, self._call, most=1.0)
 
     def _is_over(
@@ -512,7 +512,7 @@ def _diverged(settings: TrainConfig, tally: Tally, row: Row) -> str:
 
 
 def _broke(settings: TrainConfig, row: Row) -> bool:
-    """Returns whether every arena was non-finite at every step of an update."""
+    """Returns whether every arena broke at every step of an update."""
     return row["broken_arenas"] >= settings.arenas * settings.algo.rollout_length
 
 
