@@ -104,7 +104,7 @@ def _watch(read: int, patient: bool) -> None:
             if first is not None:
                 _end(CODES[first])
             first = found
-            _say("stopping after this call, to save; once more stops at once")
+            _say("stopping after this call, to save; a second signal stops at once")
 
 
 def _end(code: int) -> None:
