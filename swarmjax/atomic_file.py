@@ -11,13 +11,13 @@ def replacing(path: Path) -> Iterator[Path]:
     """Gives a place to write to, and moves what was written to `path` unless something failed.
 
     Args:
-        path: Of the file; folders that are missing are made.
+      path: Of the file; folders that are missing are made.
 
     Yields:
-        Another path with the same ending.
+      Another path with the same ending.
 
     Raises:
-        OSError: If it cannot be written.
+      OSError: If it cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     # Beside the file, so that the move stays within one file system and cannot stop half way.

@@ -121,8 +121,8 @@ def line(name: str, *arguments: str) -> str:
     """Write a command that can be pasted into a shell.
 
     Args:
-        name: of the command, `evaluate` say.
-        arguments: its `key=value` words.
+      name: of the command, `evaluate` say.
+      arguments: its `key=value` words.
     """
     return shlex.join(["python", "-m", f"swarmjax.{name}", *arguments])
 
@@ -142,16 +142,16 @@ def help_text(cls: type[Section], module: str, topics: Sequence[str] = ()) -> st
     """Describe a command's settings.
 
     Args:
-        cls: the command's dataclass.
-        module: the command as `python -m` names it, such as `swarmjax.train`, or a script's path.
-        topics: sections or keys to list, or `all`; none for usage, examples, groups and the keys
-            that are in no section.
+      cls: the command's dataclass.
+      module: the command as `python -m` names it, such as `swarmjax.train`, or a script's path.
+      topics: sections or keys to list, or `all`; none for usage, examples, groups and the keys
+        that are in no section.
 
     Returns:
-        Lines for a terminal, without a newline at the end.
+      Lines for a terminal, without a newline at the end.
 
     Raises:
-        ConfigError: there is no such topic.
+      ConfigError: there is no such topic.
     """
     return "\n".join(_listed(cls, topics) if topics else _overview(cls, module))
 

@@ -32,10 +32,10 @@ class Piece:
     """A function of yours, and what it is called.
 
     Attributes:
-        kind: what it is, as sentences and policy files call it.
-        taken: names of this kind that the package itself uses.
-        name: as keys and policy files call it.
-        function: what it computes.
+      kind: what it is, as sentences and policy files call it.
+      taken: names of this kind that the package itself uses.
+      name: as keys and policy files call it.
+      function: what it computes.
     """
 
     kind: ClassVar[str] = ""
@@ -119,11 +119,11 @@ def reward_term(weight: float, name: str | None = None) -> Callable[[Callable], 
     """Make a function a term of the reward.
 
     Args:
-        weight: what it is multiplied by; `task.reward.extra.NAME` overrides it.
-        name: of the term; None: the function's.
+      weight: what it is multiplied by; `task.reward.extra.NAME` overrides it.
+      name: of the term; None: the function's.
 
     Raises:
-        TypeError: it stands without parentheses.
+      TypeError: it stands without parentheses.
     """
     if callable(weight):
         raise TypeError("write @reward_term(weight=...), with a weight")
@@ -142,14 +142,14 @@ def observation(
     """Make a function an observation.
 
     Args:
-        size: how many entries each robot gets.
-        unit: of the values, for the policy file.
-        offset: is subtracted, in that unit.
-        scale: divides, in that unit.
-        name: of the observation; None: the function's.
+      size: how many entries each robot gets.
+      unit: of the values, for the policy file.
+      offset: is subtracted, in that unit.
+      scale: divides, in that unit.
+      name: of the observation; None: the function's.
 
     Raises:
-        TypeError: it stands without parentheses.
+      TypeError: it stands without parentheses.
     """
     if callable(size):
         raise TypeError("write @observation(), with parentheses")
@@ -182,10 +182,10 @@ class Extensions(NamedTuple):
     """The pieces of a file, a module or a list.
 
     Attributes:
-        rewards: terms of the reward.
-        observations: more entries of the observation.
-        levels: ways of drawing levels.
-        networks: networks of actor and critic.
+      rewards: terms of the reward.
+      observations: more entries of the observation.
+      levels: ways of drawing levels.
+      networks: networks of actor and critic.
     """
 
     rewards: tuple[RewardTerm, ...] = ()
@@ -219,10 +219,10 @@ def load(source: str | None) -> Extensions:
     """Return the pieces that the key `extensions` names.
 
     Args:
-        source: path of a Python file, a word of `hand_over`, or None for no pieces.
+      source: path of a Python file, a word of `hand_over`, or None for no pieces.
 
     Raises:
-        ConfigError: the file is missing or does not import, or a piece is unsound.
+      ConfigError: the file is missing or does not import, or a piece is unsound.
     """
     if source is None:
         return NONE
@@ -249,10 +249,10 @@ def hand_over(given: object) -> str | None:
     """Return what the key `extensions` is to be for pieces that a Python program gives.
 
     Args:
-        given: None, a path, a module, a piece, or several pieces.
+      given: None, a path, a module, a piece, or several pieces.
 
     Raises:
-        ConfigError: it is nothing of the kind, or a piece is unsound.
+      ConfigError: it is nothing of the kind, or a piece is unsound.
     """
     if given is None or isinstance(given, str):
         return given
@@ -314,11 +314,11 @@ def collect(pieces: Iterable[Piece], where: str) -> Extensions:
     """Check pieces by themselves and sort them by kind.
 
     Args:
-        pieces: in any order.
-        where: what sentences call their source.
+      pieces: in any order.
+      where: what sentences call their source.
 
     Raises:
-        ConfigError: a name cannot be one, or is used twice; a number is out of range.
+      ConfigError: a name cannot be one, or is used twice; a number is out of range.
     """
     found: dict[str, dict[str, Any]] = {kind.kind: {} for kind in KINDS}
     for piece in pieces:
@@ -406,13 +406,13 @@ def check_needs(
     """Refuse to run a policy without the pieces that it was trained with.
 
     Args:
-        needs: the digests by kind and name, as the policy's `meta.extensions` holds them.
-        pieces: those that there are.
-        where: what a sentence calls the policy.
-        kinds: of the pieces that matter here.
+      needs: the digests by kind and name, as the policy's `meta.extensions` holds them.
+      pieces: those that there are.
+      where: what a sentence calls the policy.
+      kinds: of the pieces that matter here.
 
     Raises:
-        ConfigError: a piece is missing, or has changed.
+      ConfigError: a piece is missing, or has changed.
     """
     held = pieces.digests()
     for kind in kinds:

@@ -5,12 +5,12 @@ def count(number: int, noun: str, plural: str | None = None) -> str:
     """Writes how many there are.
 
     Args:
-        number: of things.
-        noun: one of them.
-        plural: several of them; None adds an s.
+      number: of things.
+      noun: one of them.
+      plural: several of them; None adds an s.
 
     Returns:
-        `1 arena` or `1,024 arenas`.
+      `1 arena` or `1,024 arenas`.
     """
     return f"{number:,} {noun if number == 1 else plural or noun + 's'}"
 

@@ -63,7 +63,7 @@ class SwarmBraxEnv(_base.Env):
         """Starts an episode in every arena; returns Brax's state, its fields [N, ...].
 
         Args:
-            rng: [N, 2] random keys, the first of which is used; else raises ValueError.
+          rng: [N, 2] random keys, the first of which is used; else raises ValueError.
         """
         if len(rng) != self.num_envs:
             raise ValueError(f"num_envs is {len(rng)}: give {self.num_envs}, the robots there are.")
@@ -76,11 +76,11 @@ class SwarmBraxEnv(_base.Env):
         """Makes a control step; returns the state after.
 
         Args:
-            state: before.
-            action: [N, U] floats; what is beyond -1..1 is clipped.
+          state: before.
+          action: [N, U] floats; what is beyond -1..1 is clipped.
 
         Raises:
-            ValueError: the action has a wrong shape; TypeError: a wrong dtype.
+          ValueError: the action has a wrong shape; TypeError: a wrong dtype.
         """
         check(action, (self.num_envs, self.action_size))
         steps = state.pipeline_state.arenas.clock[self.robots.arena] + 1.0

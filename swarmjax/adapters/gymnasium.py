@@ -29,7 +29,7 @@ class SwarmVectorEnv(_vector.VectorEnv):
     `info["final_obs"]` holds the last one of the old. Absent robots are left out.
 
     Attributes:
-        arena: [N] the arena of each sub-environment.
+      arena: [N] the arena of each sub-environment.
     """
 
     metadata = {  # noqa: RUF012  # Gymnasium's own form
@@ -52,15 +52,15 @@ class SwarmVectorEnv(_vector.VectorEnv):
         """Starts an episode in every arena.
 
         Args:
-            seed: of all levels to come; None goes on with those of the last one.
-            options: none are known; `reset_mask` is refused, since arenas reset themselves.
+          seed: of all levels to come; None goes on with those of the last one.
+          options: none are known; `reset_mask` is refused, since arenas reset themselves.
 
         Returns:
-            [N, O] observations, and no info.
+          [N, O] observations, and no info.
 
         Raises:
-            Error: the seed is no whole number, or some sub-environments alone are to be reset.
-            ClosedEnvironmentError: it was closed.
+          Error: the seed is no whole number, or some sub-environments alone are to be reset.
+          ClosedEnvironmentError: it was closed.
         """
         if seed is not None and not isinstance(seed, int | np.integer):
             raise errors.Error(f"seed is {seed!r}: all arenas share one seed, a whole number.")
@@ -75,15 +75,15 @@ class SwarmVectorEnv(_vector.VectorEnv):
         """Makes a control step.
 
         Args:
-            actions: [N, 2] speed and turn rate, floats; what is beyond -1..1 is clipped.
+          actions: [N, 2] speed and turn rate, floats; what is beyond -1..1 is clipped.
 
         Returns:
-            [N, O] observations, [N] rewards, terminations and truncations, and the info.
+          [N, O] observations, [N] rewards, terminations and truncations, and the info.
 
         Raises:
-            InvalidAction: the actions have a wrong shape or dtype.
-            ResetNeeded: it was never reset.
-            ClosedEnvironmentError: it was closed.
+          InvalidAction: the actions have a wrong shape or dtype.
+          ResetNeeded: it was never reset.
+          ClosedEnvironmentError: it was closed.
         """
         came = self._session.step(actions)
         every = np.ones(self.num_envs, bool)

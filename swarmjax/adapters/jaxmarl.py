@@ -61,18 +61,18 @@ class SwarmMultiAgentEnv(_base):
         """Makes a control step, and starts the next episode where this one ends.
 
         Args:
-            key: unused; the state has its own.
-            state: before.
-            actions: [2] floats by agent; what is beyond -1..1 is clipped.
-            reset_state: what to start from; None: a fresh level.
+          key: unused; the state has its own.
+          state: before.
+          actions: [2] floats by agent; what is beyond -1..1 is clipped.
+          reset_state: what to start from; None: a fresh level.
 
         Returns:
-            [O] observations by agent (of the next episode where `__all__` is done), the state,
-            rewards and dones by agent, and the info.
+          [O] observations by agent (of the next episode where `__all__` is done), the state,
+          rewards and dones by agent, and the info.
 
         Raises:
-            ValueError: an action is missing or has a wrong shape.
-            TypeError: an action is of a wrong dtype.
+          ValueError: an action is missing or has a wrong shape.
+          TypeError: an action is of a wrong dtype.
         """
         _, state, rewards, dones, info = self.step_env(key, state, actions)
         if reset_state is not None:

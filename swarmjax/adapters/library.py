@@ -17,13 +17,13 @@ def check(action: Any, shape: tuple[int, ...], whose: str = "") -> None:
     """Refuses an action, for libraries that have no errors of their own.
 
     Args:
-        action: what a robot or several are told.
-        shape: that it must have.
-        whose: put before the sentence.
+      action: what a robot or several are told.
+      shape: that it must have.
+      whose: put before the sentence.
 
     Raises:
-        ValueError: it has another shape.
-        TypeError: it is of a wrong dtype.
+      ValueError: it has another shape.
+      TypeError: it is of a wrong dtype.
     """
     if sentence := fault(action, shape):
         kind = ValueError if tuple(action.shape) != shape else TypeError
@@ -34,7 +34,7 @@ def find(module: str, extra: str, name: str | None = None) -> Any:
     """Imports a module of another library, or takes something out of it.
 
     Raises:
-        ImportError: it is missing or too old; the sentence names the extra that brings it.
+      ImportError: it is missing or too old; the sentence names the extra that brings it.
     """
     try:
         found = importlib.import_module(module)

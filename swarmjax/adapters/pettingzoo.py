@@ -27,8 +27,8 @@ class SwarmParallelEnv(_base):
     `task.arrival=hold` all robots leave in the same step. Nothing resets by itself.
 
     Attributes:
-        agents: those that are on their way.
-        possible_agents: all robots.
+      agents: those that are on their way.
+      possible_agents: all robots.
     """
 
     metadata = {"name": "swarmjax_v0", "render_modes": []}  # noqa: RUF012  # PettingZoo's own form
@@ -57,11 +57,11 @@ class SwarmParallelEnv(_base):
         """Starts an episode; raises ClosedEnvironmentError if it was closed.
 
         Args:
-            seed: of all levels to come; None goes on with those of the last one.
-            options: none are known.
+          seed: of all levels to come; None goes on with those of the last one.
+          options: none are known.
 
         Returns:
-            [O] observations and no infos, by agent.
+          [O] observations and no infos, by agent.
         """
         if seed is not None:
             self._random = np.random.default_rng(seed)
@@ -73,16 +73,16 @@ class SwarmParallelEnv(_base):
         """Makes a control step.
 
         Args:
-            actions: [2] floats by agent, of all in `agents`; those of robots that left are ignored.
+          actions: [2] floats by agent, of all in `agents`; those of robots that left are ignored.
 
         Returns:
-            Observations [O], rewards, terminations, truncations and infos, of the agents that
-            acted.
+          Observations [O], rewards, terminations, truncations and infos, of the agents that
+          acted.
 
         Raises:
-            InvalidAction: an action is missing, of no agent, or of a wrong shape or dtype.
-            ResetNeeded: no agent is left.
-            ClosedEnvironmentError: it was closed.
+          InvalidAction: an action is missing, of no agent, or of a wrong shape or dtype.
+          ResetNeeded: no agent is left.
+          ClosedEnvironmentError: it was closed.
         """
         self._session.check_open()
         if not self.agents:

@@ -51,10 +51,10 @@ class SwarmMjxEnv(_playground.MjxEnv):
         """Starts an episode.
 
         Args:
-            rng: random key.
+          rng: random key.
 
         Returns:
-            Playground's state.
+          Playground's state.
         """
         state, nothing = self.robots.swarm.reset(rng), jnp.zeros(())
         metrics = {"reached": nothing}
@@ -65,15 +65,15 @@ class SwarmMjxEnv(_playground.MjxEnv):
         """Makes a control step.
 
         Args:
-            state: before.
-            action: [N 2] speed and turn rate of each robot, floats; beyond -1..1 is clipped.
+          state: before.
+          action: [N 2] speed and turn rate of each robot, floats; beyond -1..1 is clipped.
 
         Returns:
-            The state after; `metrics["reached"]` is the share of the robots that arrived in it.
+          The state after; `metrics["reached"]` is the share of the robots that arrived in it.
 
         Raises:
-            ValueError: the action has a wrong shape.
-            TypeError: the action is of a wrong dtype.
+          ValueError: the action has a wrong shape.
+          TypeError: the action is of a wrong dtype.
         """
         check(action, (self.action_size,))
         late = state.data.arenas.clock[0] + 1 >= self.episode_length

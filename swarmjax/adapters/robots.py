@@ -17,13 +17,13 @@ class RobotStep(NamedTuple):
     """The outcome of a control step, robot by robot.
 
     Attributes:
-        observation: [N, O] act on this: of the next episode where `over`.
-        last: [N, O] the observation after the step, before any reset.
-        reward: [N] 0 for robots that had arrived and stand.
-        terminated: [N] the robot arrived in this step.
-        truncated: [N] the time ran out on its way.
-        valid: [N] the robot was on its way: learn from these.
-        over: [N] the episode of the robot's arena ended.
+      observation: [N, O] act on this: of the next episode where `over`.
+      last: [N, O] the observation after the step, before any reset.
+      reward: [N] 0 for robots that had arrived and stand.
+      terminated: [N] the robot arrived in this step.
+      truncated: [N] the time ran out on its way.
+      valid: [N] the robot was on its way: learn from these.
+      over: [N] the episode of the robot's arena ended.
     """
 
     observation: Any
@@ -40,8 +40,8 @@ class RobotRow:
     """The robots of a swarm, without the places of absent ones.
 
     Attributes:
-        swarm: of `swarmjax.make_env`.
-        index: [N] of the places [A R] where there is a robot, ascending.
+      swarm: of `swarmjax.make_env`.
+      index: [N] of the places [A R] where there is a robot, ascending.
     """
 
     swarm: Swarm
@@ -68,11 +68,11 @@ class RobotRow:
         """Moves all arenas on by one control step; those whose episode ends start another.
 
         Args:
-            state: before.
-            action: [N, U], -1..1 spans the commands; what is beyond is clipped.
+          state: before.
+          action: [N, U], -1..1 spans the commands; what is beyond is clipped.
 
         Returns:
-            The state after, and the outcome.
+          The state after, and the outcome.
         """
         arenas, robots = self.swarm.num_arenas, self.swarm.num_robots
         places = jnp.zeros((arenas * robots, self.action_size)).at[self.index].set(action)
@@ -103,7 +103,7 @@ def line_up_arena(swarm: Swarm) -> RobotRow:
     """Lists the robots of a swarm of one arena.
 
     Raises:
-        ValueError: there are more arenas.
+      ValueError: there are more arenas.
     """
     if swarm.num_arenas != 1:
         raise ValueError(

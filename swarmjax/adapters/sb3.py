@@ -26,8 +26,8 @@ class SwarmVecEnv(_base):
     The observation is then that of the next episode. Absent robots are left out.
 
     Attributes:
-        arena: [N] the arena of each environment.
-        valid: [N] whether the robot was on its way in the last step.
+      arena: [N] the arena of each environment.
+      valid: [N] whether the robot was on its way in the last step.
     """
 
     render_mode = None  # the base class overwrites it with itself
@@ -45,10 +45,10 @@ class SwarmVecEnv(_base):
         """Starts an episode in every arena, by the seed given to `seed`, if any.
 
         Returns:
-            [N, O] observations.
+          [N, O] observations.
 
         Raises:
-            ClosedEnvironmentError: of Gymnasium; it was closed.
+          ClosedEnvironmentError: of Gymnasium; it was closed.
         """
         if self._seeds[0] is not None:
             self._random = np.random.default_rng(self._seeds[0])
@@ -61,12 +61,12 @@ class SwarmVecEnv(_base):
         """Starts a control step.
 
         Args:
-            actions: [N, 2] speed and turn rate, floats; what is beyond -1..1 is clipped.
+          actions: [N, 2] speed and turn rate, floats; what is beyond -1..1 is clipped.
 
         Raises:
-            InvalidAction: of Gymnasium; the actions have a wrong shape or dtype.
-            ResetNeeded: of Gymnasium; it was never reset.
-            ClosedEnvironmentError: of Gymnasium; it was closed.
+          InvalidAction: of Gymnasium; the actions have a wrong shape or dtype.
+          ResetNeeded: of Gymnasium; it was never reset.
+          ClosedEnvironmentError: of Gymnasium; it was closed.
         """
         self._came = self._session.begin(actions)
 
@@ -74,10 +74,10 @@ class SwarmVecEnv(_base):
         """Waits for the step.
 
         Returns:
-            [N, O] observations, [N] rewards, [N] dones and the infos.
+          [N, O] observations, [N] rewards, [N] dones and the infos.
 
         Raises:
-            NoAsyncCallError: of Gymnasium; no step was started.
+          NoAsyncCallError: of Gymnasium; no step was started.
         """
         self._session.check_open()
         if self._came is None:

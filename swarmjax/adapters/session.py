@@ -35,13 +35,13 @@ class Session:
         """Starts an episode in every arena.
 
         Args:
-            seed: of the levels, not negative.
+          seed: of the levels, not negative.
 
         Returns:
-            [N, O] what to act on.
+          [N, O] what to act on.
 
         Raises:
-            ClosedEnvironmentError: it was closed.
+          ClosedEnvironmentError: it was closed.
         """
         self.check_open()
         state: SwarmState = self._reset(jax.random.key(seed))
@@ -52,15 +52,15 @@ class Session:
         """Starts a control step, and does not wait for it.
 
         Args:
-            action: [N, U] floats; what is beyond -1..1 is clipped.
+          action: [N, U] floats; what is beyond -1..1 is clipped.
 
         Returns:
-            What it comes to, on the device.
+          What it comes to, on the device.
 
         Raises:
-            ClosedEnvironmentError: it was closed.
-            ResetNeeded: it was never reset.
-            InvalidAction: the action has a wrong shape or dtype.
+          ClosedEnvironmentError: it was closed.
+          ResetNeeded: it was never reset.
+          InvalidAction: the action has a wrong shape or dtype.
         """
         self.check_open()
         if self._state is None:

@@ -28,7 +28,7 @@ class SwarmTorchEnv:
     the device on which JAX computes.
 
     Attributes:
-        arena: [N] the arena of each row.
+      arena: [N] the arena of each row.
     """
 
     def __init__(self, swarm: Swarm) -> None:
@@ -46,13 +46,13 @@ class SwarmTorchEnv:
         """Starts an episode in every arena.
 
         Args:
-            seed: of the levels, not negative.
+          seed: of the levels, not negative.
 
         Returns:
-            [N, O] a tensor to act on.
+          [N, O] a tensor to act on.
 
         Raises:
-            ValueError: it was closed.
+          ValueError: it was closed.
         """
         self._check_open()
         state: SwarmState = self._reset(jax.random.key(seed))
@@ -63,14 +63,14 @@ class SwarmTorchEnv:
         """Makes a control step.
 
         Args:
-            action: [N, U] float32 tensor; what is beyond -1..1 is clipped.
+          action: [N, U] float32 tensor; what is beyond -1..1 is clipped.
 
         Returns:
-            Tensors.
+          Tensors.
 
         Raises:
-            ValueError: the action has a wrong shape, or it was closed or never reset.
-            TypeError: the action is of a wrong dtype.
+          ValueError: the action has a wrong shape, or it was closed or never reset.
+          TypeError: the action is of a wrong dtype.
         """
         self._check_open()
         if self._state is None:

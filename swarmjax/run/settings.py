@@ -37,7 +37,7 @@ _RESUME_KEYS = tuple("run.*" if key == "run" else key for key in MAY_CHANGE)
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(Section):
-    """Settings that say where a run is written, and how often."""
+    """Where a run is written, and how often."""
 
     id: str | None = field(
         default=None, metadata=about("random id, drawn when the run begins", derived=True)

@@ -48,9 +48,9 @@ def _sign_in() -> None:
 class WandbRuns:
     """W&B runs by seed; a `Logger`.
 
-    Each of the first `BOARDS` seeds has a W&B run, all in one group. Online, a resumed run continues
-    them on the server. Offline, each process writes new W&B runs in the same group. W&B receives
-    nothing about the machine: not its name, load, source code or console output.
+    Each of the first `BOARDS` seeds has a W&B run. All are in one group. Online, a resumed run
+    continues them on the server. Offline, each process writes new W&B runs in the same group. W&B
+    receives nothing about the machine: not its name, load, source code or console output.
     """
 
     name = "W&B"

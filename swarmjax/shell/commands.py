@@ -10,8 +10,8 @@ class Command(NamedTuple):
     """A command of the package, which `python -m swarmjax.NAME` runs as well.
 
     Attributes:
-        settings: module and name of the dataclass of its keys, which importing must need no JAX.
-        meaning: what it does, in one sentence without a quote, which scripts of shells put it in.
+      settings: module and name of the dataclass of its keys, which importing must need no JAX.
+      meaning: what it does, in one sentence without a quote, which scripts of shells put it in.
     """
 
     settings: str
@@ -40,7 +40,7 @@ def settings(name: str) -> type[Section]:
     """Import the dataclass of a command's keys.
 
     Args:
-        name: one of `COMMANDS`.
+      name: one of `COMMANDS`.
     """
     module, _, cls = COMMANDS[name].settings.partition(":")
     return getattr(importlib.import_module(module), cls)

@@ -25,13 +25,13 @@ def script(shell: str) -> str:
     """Write the script that a shell reads.
 
     Args:
-        shell: one of `SHELLS`.
+      shell: one of `SHELLS`.
 
     Returns:
-        Its text, with a newline at the end.
+      Its text, with a newline at the end.
 
     Raises:
-        ConfigError: it is another shell.
+      ConfigError: it is another shell.
     """
     if shell not in SHELLS:
         raise ConfigError(f"--completion is {show(shell)}: give one of {', '.join(SHELLS)}.")
@@ -48,7 +48,7 @@ def table(name: str) -> list[str]:
     """List the keys of a command, each on a line with its choices.
 
     Args:
-        name: one of `COMMANDS`.
+      name: one of `COMMANDS`.
     """
     cls = settings(name)
     groups = {key for key in section.names(cls) if files.choices(_FOLDERS.get(key, key))}
@@ -62,10 +62,10 @@ def choices(hint: object) -> list[str]:
     """List what a key may be.
 
     Args:
-        hint: its type.
+      hint: its type.
 
     Returns:
-        Its words; `@file` among them where text is taken, and none where only numbers are.
+      Its words; `@file` among them where text is taken, and none where only numbers are.
     """
     found: list[str] = []
     for option in section.options(hint):

@@ -19,7 +19,7 @@ def main() -> int:
     """Run what the command line asks for.
 
     Returns:
-        The exit code, 2 for an error of the user's; a command ends the process with its own.
+      The exit code, 2 for an error of the user's; a command ends the process with its own.
     """
     name, *rest = sys.argv[1:] or ["--help"]
     try:

@@ -30,9 +30,9 @@ class Newest(NamedTuple):
     """A replay of a run's newest policy.
 
     Attributes:
-        update: updates that the policy was trained for.
-        sentence: what is seen.
-        page: of HTML.
+      update: updates that the policy was trained for.
+      sentence: what is seen.
+      page: of HTML.
     """
 
     update: int
@@ -44,13 +44,13 @@ def record(settings: WatchConfig, history: History | None) -> Newest:
     """Replays a level by the newest policy.
 
     Args:
-        settings: of the page.
-        history: what the run has written down; None before the first update.
+      settings: of the page.
+      history: what the run has written down; None before the first update.
 
     Raises:
-        ConfigError: if the policy cannot be replayed as the settings say.
-        CheckpointError: if no checkpoint is sound.
-        PolicyError: if the policy is unsound.
+      ConfigError: if the policy cannot be replayed as the settings say.
+      CheckpointError: if no checkpoint is sound.
+      PolicyError: if the policy is unsound.
     """
     from swarmjax.run import checkpoint  # which takes JAX, for seconds
     from swarmjax.run.policy_export import write_policy

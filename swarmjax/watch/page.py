@@ -13,11 +13,11 @@ def page(run: Path) -> str:
     """Lays the page out.
 
     Args:
-        run: that it follows.
+      run: that it follows.
 
     Returns:
-        HTML in which the run's name is escaped. All else of the run comes as data, which the script
-        puts there as text.
+      HTML in which the run's name is escaped. All else of the run comes as data, which the script
+      puts there as text.
     """
     return builder.render(
         "watch/watch.html",

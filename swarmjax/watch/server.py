@@ -33,7 +33,7 @@ class Server(ThreadingHTTPServer):
         """Takes the port; 0 is any that is free.
 
         Raises:
-            ConfigError: if it cannot be had.
+          ConfigError: if it cannot be had.
         """
         self.views, self.page = views, page.page(views.run)
         try:

@@ -22,10 +22,10 @@ class Standing(NamedTuple):
     """How a run stands.
 
     Attributes:
-        state: `trains` or `elsewhere` while it goes on; `ended`, with its budget spent; `stopped`,
-            with all saved; `killed`, or broken, with the rest of its budget open; `silent`: gone,
-            or on another machine and not heard of.
-        sentence: says so to a person.
+      state: `trains` or `elsewhere` while it goes on; `ended`, with its budget spent; `stopped`,
+        with all saved; `killed`, or broken, with the rest of its budget open; `silent`: gone,
+        or on another machine and not heard of.
+      sentence: says so to a person.
     """
 
     state: Literal["trains", "elsewhere", "ended", "stopped", "killed", "silent"]
@@ -36,8 +36,8 @@ class Progress(NamedTuple):
     """How far a run is.
 
     Attributes:
-        done: updates that all seeds have written down.
-        seconds: that training took them; None if it was not written down.
+      done: updates that all seeds have written down.
+      seconds: that training took them; None if it was not written down.
     """
 
     done: int = 0
@@ -48,8 +48,8 @@ def progress(run: Path, seeds: int) -> Progress:
     """Reads how far a run is from the end of its metrics; a line without an end counts for nothing.
 
     Args:
-        run: its directory.
-        seeds: how many write an update down.
+      run: its directory.
+      seeds: how many write an update down.
     """
     try:
         with (run / directory.METRICS).open("rb") as file:
@@ -67,8 +67,8 @@ def stand(run: Path, trained: TrainConfig) -> Standing:
     """Says how a run stands now.
 
     Args:
-        run: its directory.
-        trained: its config.
+      run: its directory.
+      trained: its config.
     """
     if not (run / directory.CONFIG).exists():
         return Standing("silent", f"{run} is gone.")

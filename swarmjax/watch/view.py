@@ -36,10 +36,10 @@ class DrawnFigures(NamedTuple):
     """Figures of a run.
 
     Attributes:
-        version: rises with each drawing.
-        history: that they show; None before the first update.
-        figures: PNG files by the names in `NAMES`.
-        trouble: why there are no newer ones; empty if there are.
+      version: rises with each drawing.
+      history: that they show; None before the first update.
+      figures: PNG files by the names in `NAMES`.
+      trouble: why there are no newer ones; empty if there are.
     """
 
     version: int = 0
@@ -52,9 +52,9 @@ class Replayed(NamedTuple):
     """A replay.
 
     Attributes:
-        version: rises with each.
-        newest: what is shown; None before there is one.
-        trouble: why there is no newer one; empty if there is.
+      version: rises with each.
+      newest: what is shown; None before there is one.
+      trouble: why there is no newer one; empty if there is.
     """
 
     version: int = 0
@@ -69,7 +69,7 @@ class Views:
         """Reads the run's config.
 
         Raises:
-            ConfigError: if there is none that is sound.
+          ConfigError: if there is none that is sound.
         """
         self.settings, self.run = settings, Path(settings.run)
         self.trained = rows.read_config(self.run)
@@ -159,7 +159,7 @@ def figures(history: History) -> dict[str, bytes]:
     """Draws the figures of a run.
 
     Returns:
-        PNG files by the names in `NAMES`; those alone that say something.
+      PNG files by the names in `NAMES`; those alone that say something.
     """
     from swarmjax.pages import figures as drawing  # Matplotlib takes a second
     from swarmjax.report import figures as report_figures
