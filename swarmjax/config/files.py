@@ -299,7 +299,7 @@ def split_words(cls: type[Section], overrides: Sequence[str]) -> dict[str, str]:
     for key, word in words.items():
         _check_word(key, word, is_text=key in texts)
     if sum(word.count("${") for word in words.values()) > _MOST_REFERENCES:
-        raise ConfigError(f"the words refer to others by ${{...}}: do so {_MOST_REFERENCES} times.")
+        raise ConfigError(f"the words use ${{...}} too often: give at most {_MOST_REFERENCES}.")
     return {key: _quote(word) if key in texts else word for key, word in words.items()}
 
 
@@ -314,7 +314,7 @@ def _check_word(key: str, word: str, *, is_text: bool) -> None:
         )
     elif _depth(value) > _MOST_DEPTH:
         raise ConfigError(
-            f"{key} is {show(value)}: give at most {_MOST_DEPTH} lists in one another."
+            f"{key} is {show(value)}: nest lists at most {_MOST_DEPTH} deep."
         )
 
 

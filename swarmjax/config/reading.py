@@ -116,7 +116,9 @@ def parse_json(text: str, where: str) -> Any:
     except RecursionError:
         raise _too_deep(where) from None
     except json.JSONDecodeError as error:
-        raise ConfigError(f"{where} cannot be read: no JSON, {str(error).lower()}.") from None
+        raise ConfigError(
+            f"{where} cannot be read: it is not JSON, {str(error).lower()}."
+        ) from None
     except ValueError:
         raise ConfigError(f"{where} cannot be read: a number has too many digits.") from None
     _check_depth(found, where)
@@ -141,7 +143,7 @@ def _inside(value: object) -> Iterable[object]:
 
 def _too_deep(where: str) -> ConfigError:
     return ConfigError(
-        f"{where} cannot be read: more than {_MOST_DEPTH} lists or mappings lie in one another."
+        f"{where} cannot be read: lists or mappings are nested more than {_MOST_DEPTH} deep."
     )
 
 
@@ -221,7 +223,7 @@ def _measure(events: Iterable[Any], where: str) -> None:
 
 def _check_ended(anchor: str, within: list[_Open], where: str) -> None:
     if anchor in [each.anchor for each in within]:
-        raise ConfigError(f"{where} cannot be read: *{anchor} stands within itself.")
+        raise ConfigError(f"{where} cannot be read: *{anchor} contains itself.")
 
 
 def _check_scalar(value: str, where: str) -> None:

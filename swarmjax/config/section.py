@@ -187,7 +187,7 @@ def build[C: Section](cls: type[C], mapping: Mapping[str, Any], where: str = "")
     if not isinstance(mapping, Mapping):
         key = where.rstrip(": .")
         example = dataclasses.fields(cls)[0].name
-        raise ConfigError(f"{key} is {show(mapping)}: give keys of its own, as {where}{example}.")
+        raise ConfigError(f"{key} is {show(mapping)}: give its keys, such as {where}{example}.")
     known = {item.name: item for item in dataclasses.fields(cls)}
     for key in mapping:
         if key not in known:

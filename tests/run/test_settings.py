@@ -170,7 +170,7 @@ def test_import_needs_neither_jax_nor_hydra():
          "layout is fence: give 1 or more."),
         # Types and bounds.
         (["task.arrival=stay"], "task.arrival is 'stay': give latch or hold."),
-        (["task=3"], "task is 3: give keys of its own, as task.control_step."),
+        (["task=3"], "task is 3: give its keys, such as task.control_step."),
         (["algo.hidden_sizes=64"], "algo.hidden_sizes is 64: give a list, as in [64,64]."),
         (["algo.hidden_sizes=[]"], "algo.hidden_sizes is []: give at least one layer, as in "
         "[64,64]."),
