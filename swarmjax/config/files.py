@@ -313,9 +313,7 @@ def _check_word(key: str, word: str, *, is_text: bool) -> None:
             f"{key} is {show(value)}, of {len(value)} letters: give at most {_MOST_VALUE}."
         )
     elif _depth(value) > _MOST_DEPTH:
-        raise ConfigError(
-            f"{key} is {show(value)}: nest lists at most {_MOST_DEPTH} deep."
-        )
+        raise ConfigError(f"{key} is {show(value)}: nest lists at most {_MOST_DEPTH} deep.")
 
 
 def _depth(value: str) -> int:
