@@ -165,7 +165,7 @@ def _listed(cls: type[Section], topics: Sequence[str]) -> list[str]:
         found = {key for key in known if key == name or key.startswith(f"{name}.")}
         if topic != _ALL and not found:
             names = ", ".join([*section.sections(cls), _ALL])
-            raise ConfigError(f"--help {topic} is no topic: give a key, or one of {names}.")
+            raise ConfigError(f"--help {topic} is not a topic: give a key, or one of {names}.")
         chosen |= set(known) if topic == _ALL else found
     return section.describe_keys(cls, chosen)
 

@@ -338,7 +338,7 @@ def _check(piece: Piece, where: str) -> None:
     label = f"{where}: {piece.kind} {piece.name}"
     if not _NAME.fullmatch(piece.name):
         raise ConfigError(
-            f"{label} cannot be called so: give 1 to 40 lower-case letters, digits and _, a letter "
+            f"{label} is not a valid name: give 1 to 40 lower-case letters, digits and _, a letter "
             "first."
         )
     if piece.name in piece.taken:
@@ -347,9 +347,11 @@ def _check(piece: Piece, where: str) -> None:
         if not isinstance(piece.size, int) or not 1 <= piece.size <= 1000:
             raise ConfigError(f"{label} has size {show(piece.size)}: give 1 to 1000.")
         if not piece.scale:
-            raise ConfigError(f"{label} has scale 0: give another number, it divides.")
+            raise ConfigError(
+                f"{label} has scale 0, by which values are divided: give another number."
+            )
     if isinstance(piece, Network) and not isinstance(piece.function, type):
-        raise ConfigError(f"{label} is no class: decorate a flax.linen.Module.")
+        raise ConfigError(f"{label} is not a class: decorate a flax.linen.Module.")
 
 
 # Digests

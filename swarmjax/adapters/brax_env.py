@@ -69,7 +69,7 @@ class SwarmBraxEnv(_base.Env):
           ValueError: if there are not N keys.
         """
         if len(rng) != self.num_envs:
-            raise ValueError(f"num_envs is {len(rng)}: give {self.num_envs}, the robots there are.")
+            raise ValueError(f"num_envs is {len(rng)}: give {self.num_envs}, the number of robots.")
         now, zero = self.robots.swarm.reset(rng[0]), jnp.zeros(self.num_envs)
         info = dict.fromkeys(("truncation", "episode_done", "steps"), zero)
         seen, metrics = self.robots.observe(now), {"reached": zero}

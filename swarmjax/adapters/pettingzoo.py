@@ -113,7 +113,7 @@ class SwarmParallelEnv(_base):
         size = self.action_spaces[self.possible_agents[0]].shape[0]
         stacked = np.zeros((len(self.possible_agents), size), np.float32)
         if wrong := (set(self.agents) - set(actions)) | (set(actions) - set(self.possible_agents)):
-            raise errors.InvalidAction(f"actions lack, or have too many, {sorted(wrong)}.")
+            raise errors.InvalidAction(f"actions are missing or not expected for {sorted(wrong)}.")
         for agent in self.agents:
             action = np.asarray(actions[agent])
             if sentence := fault(action, (size,)):

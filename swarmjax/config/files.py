@@ -181,7 +181,9 @@ def read_choice(group: str, choice: str) -> dict[str, Any]:
     section.check_text(group, choice)
     found = read_yaml(Path(choice))
     if "defaults" in found:
-        raise ConfigError(f"{choice} has defaults, which only files of configs/ may have: drop it.")
+        raise ConfigError(
+            f"{choice} has defaults, which only files of configs/ may have: remove it."
+        )
     return found
 
 
@@ -196,7 +198,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         return {}
     if not isinstance(mapping, dict):
         raise ConfigError(
-            f"{reading.called(path)} is no list of keys and values: write key: value."
+            f"{reading.called(path)} is not a list of keys and values: write key: value."
         )
     return {str(key): value for key, value in mapping.items()}
 

@@ -76,7 +76,7 @@ def read_text(path: Path, most: int = MOST_TYPED) -> str:
     try:
         return read_bytes(path, most).decode()
     except UnicodeDecodeError:
-        raise ConfigError(f"{called(path)} cannot be read: it is no text in UTF-8.") from None
+        raise ConfigError(f"{called(path)} cannot be read: it is not UTF-8 text.") from None
 
 
 def called(path: Path | str) -> str:

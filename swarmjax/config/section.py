@@ -127,7 +127,7 @@ class Section:
         self._check()
 
     def _check(self) -> None:
-        """Refuses values that no single bound excludes. Messages name keys within this section."""
+        """Refuses invalid combinations of values. Messages name keys within this section."""
 
 
 class ByName(dict[str, Any]):
@@ -437,7 +437,7 @@ def convert(hint: object, value: object, key: str) -> object:
         mapping = typing.cast(Mapping[str, Any], value)
         return build(section, mapping, key if key.endswith(": ") else f"{key}.")
     if hint is None and value is not None:
-        raise ConfigError(f"{key} is {show(value)}, but is not built yet: leave it out.")
+        raise ConfigError(f"{key} is {show(value)}, but is not implemented yet: leave it out.")
     if isinstance(value, str) and str in options(hint):
         check_text(key, value)
     for option in options(hint):

@@ -216,7 +216,7 @@ class Checkpoints:
             ),
         )
         if not saved:
-            raise FileExistsError("a newer one is there")
+            raise FileExistsError("a newer checkpoint exists")
         step = self._folder / str(update)
         directory.write_json(step / _MANIFEST, _file_digests(step))
         best = practised.best(leaves)
@@ -402,7 +402,7 @@ def of_seed(leaves: Leaves, lane: int, seeds: int) -> Leaves:
     if found != (seeds,):
         raise CheckpointError(
             f"the checkpoint holds {found[0] if found else 'no axis of'} seeds, but the config "
-            f"says {seeds}: it is of another run."
+            f"says {seeds}: it belongs to another run."
         )
     return {name: leaf[lane] for name, leaf in leaves.items()}
 
@@ -454,7 +454,7 @@ def find(run: Path, update: int | None = None) -> Kept:
                 skipped.append(f"checkpoint {step} of {run} cannot be used ({reason})")
                 continue
             told = "seal" in meta
-            notes = [] if told else [f"checkpoint {step} of {run} does not say which run it is of"]
+            notes = [] if told else [f"checkpoint {step} of {run} does not record its run"]
             scale = meta.get("rate_scale", 1.0)
             return Kept(leaves, step, meta.get("logs", {}), scale, skipped, notes)
     raise CheckpointError(f"{run} has no sound checkpoint: {'; '.join(skipped)}.")
@@ -475,11 +475,11 @@ def _read(
     meta = dict(found["meta"])
     seal = meta.pop("seal", None)
     if (seal is None and set(meta) != _OLD_META) or (seal is not None and seal != _seal(meta)):
-        raise CheckpointError("what it says of itself does not match its digest")
+        raise CheckpointError("its metadata does not match its digest")
     if digest(leaves) != meta["digest"]:
         raise CheckpointError("its contents do not match its digest")
     if meta["update"] != step or np.any(leaves.get("update", step) != step):
-        raise CheckpointError(f"it is of update {meta['update']}")
+        raise CheckpointError(f"it belongs to update {meta['update']}")
     if seal is None:
         return leaves, meta
     _check_binding(meta["of"], bound)
@@ -491,7 +491,7 @@ def _check_binding(found: list[Any] | None, bound: Binding | None) -> None:
     if bound is None or found is None:
         return
     if found[0] != bound.run:
-        raise CheckpointError(f"it is of run {found[0]}, and this is run {bound.run}")
+        raise CheckpointError(f"it belongs to run {found[0]}, but this is run {bound.run}")
     if found[1] != bound.config:
         raise CheckpointError("it was written with another config.json")
 

@@ -173,6 +173,6 @@ def write_policy(path: Path, leaves: Leaves, trained: TrainConfig, update: int, 
     if found != (trained.learners, expected):
         raise CheckpointError(
             f"the checkpoint holds {found[0]} learners of layers {list(widths)}, but the config "
-            f"says {trained.learners} of {list(expected)}: it is of another run."
+            f"says {trained.learners} of {list(expected)}: it belongs to another run."
         )
     policy_file.write(path, _squashed(arrays, trained.algo), policy_meta(trained, update, seed))

@@ -96,7 +96,7 @@ class RunConfig(Section):
         metadata=about("index of this process, from 0 [coordinator=HOST:PORT]", 0, 2**16),
     )
     deterministic: bool = field(
-        default=False, metadata=about("make GPU results identical bit by bit each time; slower")
+        default=False, metadata=about("make results on a GPU bit-for-bit repeatable; slower")
     )
     dry: bool = field(default=False, metadata=about("check and describe the run; train nothing"))
     compile_cache: Literal["auto"] | str | None = field(
@@ -268,8 +268,8 @@ class TrainConfig(ProgramConfig):
         self._check_hearing()
         if self.algo.exploration == "scheduled" and self.budget > MAX_COUNT:
             raise ConfigError(
-                f"budget is {self.budget}, but algo.exploration is scheduled by control steps that "
-                f"are counted in 32 bits: give at most {MAX_COUNT}."
+                f"budget is {self.budget}, but algo.exploration=scheduled counts control steps in "
+                f"32 bits: give at most {MAX_COUNT}."
             )
         if self.curriculum.normalizer == "relearn" and not self.algo.normalize_observations:
             raise ConfigError(
@@ -288,7 +288,7 @@ class TrainConfig(ProgramConfig):
         if count and self.algo.network not in (None, "mlp"):
             raise ConfigError(
                 f"algo.network is {self.algo.network}, but task.neighbours.count is {count}, which "
-                "goes with hidden layers alone: give algo.network=mlp or task.neighbours.count=0."
+                "works only with hidden layers: give algo.network=mlp or task.neighbours.count=0."
             )
 
     def _check_budget(self) -> None:
@@ -339,7 +339,7 @@ def read_config(run: Path) -> dict:
         raise ConfigError(f"{run} is no run directory: it has no {CONFIG}.")
     found = reading.read_json(path)
     if not isinstance(found, dict):
-        raise ConfigError(f"{path} is no run's config: it holds no JSON object.")
+        raise ConfigError(f"{path} is not a run's config: it holds no JSON object.")
     return found
 
 
@@ -540,8 +540,8 @@ def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, A
     if changed:
         shown = ", ".join(f"{k} is {show(mine[k])} and not {show(its.get(k))}" for k in changed[:3])
         raise ConfigError(
-            f"resume is auto, but {run} holds a run of other settings: {shown}. Of a run that goes "
-            f"on, {', '.join(_RESUME_KEYS)} may change: give its own settings, or another run.dir."
+            f"resume is auto, but {run} holds a run with other settings: {shown}. A resumed run "
+            f"may change only {', '.join(_RESUME_KEYS)}: give its own settings, or another run.dir."
         )
 
 

@@ -258,9 +258,9 @@ class Saves:
     """Decides when to write a checkpoint, by time and by share of the budget, and when to wait.
 
     A run that is killed while it writes a checkpoint goes back to the previous one. A kill should
-    cost at most one interval of training. So each checkpoint begins early. The lead is the last
-    writing time plus the length of the next call, but at most half the interval. If writing takes
-    longer than that, the run waits for it.
+    cost at most one interval of training. So each checkpoint begins early: by the time that the
+    last one took to write plus the length of the next call, but at most by half the interval. If
+    writing takes longer than that, the run waits for it.
     """
 
     def __init__(self, settings: TrainConfig, done: int) -> None:
@@ -294,7 +294,7 @@ class Saves:
     ) -> bool:
         """Returns whether an interval since `since` ends within the next `ahead` updates.
 
-        The look-ahead is at most the fraction `most` of the interval.
+        `ahead` counts for at most the fraction `most` of the interval.
         """
         seconds, updates = time.monotonic() - since[0], tally.update - since[1]
         by_time = seconds + min(ahead * _pace(tally), most * self._seconds) > self._seconds

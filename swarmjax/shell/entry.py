@@ -41,7 +41,7 @@ def _run(name: str, rest: Sequence[str]) -> int:
     else:
         near = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"did you mean {near[0]}?" if near else f"give one of {', '.join(COMMANDS)}."
-        raise ConfigError(f"{show(name)} is no command: {hint}")
+        raise ConfigError(f"{show(name)} is not a command: {hint}")
     return 0
 
 

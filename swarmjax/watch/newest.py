@@ -94,7 +94,7 @@ def _seed(settings: WatchConfig, trained: TrainConfig) -> int:
         return every[0]
     if settings.seed not in every:
         raise ConfigError(
-            f"seed is {settings.seed}, but {settings.run} was trained with {every[0]} to "
+            f"seed is {settings.seed}, but {settings.run} was trained with seeds {every[0]} to "
             f"{every[-1]}: give one of them."
         )
     return settings.seed

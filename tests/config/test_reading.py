@@ -82,7 +82,7 @@ def test_what_is_no_plain_file_is_refused(path: Path) -> None:
 def test_text_that_is_no_unicode_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_bytes(b"a: \xff\n")
-    assert refusal(reading.read_text, path) == f"{path} cannot be read: it is no text in UTF-8."
+    assert refusal(reading.read_text, path) == f"{path} cannot be read: it is not UTF-8 text."
 
 
 def test_a_large_file_is_refused_unread(tmp_path: Path) -> None:

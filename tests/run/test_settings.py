@@ -253,7 +253,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["task.neighbours.count=2", "algo.update_backend=fused"], "algo.update_backend is fused, "
          "but task.neighbours.count is 2: give auto or autodiff, or task.neighbours.count=0."),
         (["task.neighbours.count=2", "algo.network=mine"], "algo.network is mine, but "
-         "task.neighbours.count is 2, which goes with hidden layers alone: give algo.network=mlp "
+         "task.neighbours.count is 2, which works only with hidden layers: give algo.network=mlp "
          "or task.neighbours.count=0."),
         (["realism.packet_loss=1.5"], "realism.packet_loss is 1.5: give 0 to 1."),
         (["robot.track=0.08"], "robot.track is 0.08, but hull_radius is 0.037 and the wheels lie "

@@ -287,7 +287,7 @@ def test_code_that_a_run_names_is_not_run(tmp_path: Path) -> None:
 
 def test_a_seed_that_the_run_has_not_is_refused(tmp_path: Path) -> None:
     run = write(tmp_path / "run", [row(0)])
-    with pytest.raises(ConfigError, match=r"^seed is 4, but .* was trained with 0 to 0"):
+    with pytest.raises(ConfigError, match=r"^seed is 4, but .* was trained with seeds 0 to 0"):
         newest.record(WatchConfig(run=str(run), seed=4), None)
 
 
