@@ -86,7 +86,7 @@ def test_an_edited_file_is_read_again(tmp_path: Path) -> None:
          r"a\.py: reward Speed is not a valid name: give 1 to 40 lower-case letters"),
         ("@observation(size=0)\ndef a(view): return 0", r"a\.py: observation a has size 0: give 1 "
         ""),
-        ("@observation(scale=0)\ndef a(view): return 0", r"a\.py: observation a has scale 0: "),
+        ("@observation(scale=0)\ndef a(view): return 0", r"a\.py: observation a has scale 0, "),
         ("@reward_term\ndef a(step): return 0",
          r"a\.py does not import: TypeError: write @reward_term\(weight=\.\.\.\), with a weight"),
         ("@observation\ndef a(view): return 0",
