@@ -111,7 +111,7 @@ def run(
     except OSError as error:
         if error.filename is None:
             raise
-        # No command foresaw that this file cannot be read or made.
+        # A file that cannot be read or written, where no command handles the error itself.
         name, reason = reading.called(str(error.filename)), error.strerror
         sys.stderr.write(f"{module}: error: {name} cannot be used: {reason}.\n")
         return USER_ERROR

@@ -261,7 +261,7 @@ def check_choice(group: str, choice: str, key: str) -> None:
         if not Path(choice).exists():
             raise ConfigError(f"{key} is {show(choice)}, and there is no such file.")
     elif choice not in names:
-        # Short names such as s7 and s6 share half their letters: below difflib's default of 0.6.
+        # Short names such as s7 and s6 share half their letters. difflib's default requires 0.6.
         near = difflib.get_close_matches(choice, names, n=1, cutoff=0.5)
         hint = f" (nearest: {near[0]})" if near else ""
         file = ", or a file .yaml" if group == "stage" else ""

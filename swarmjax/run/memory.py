@@ -53,7 +53,7 @@ def check_buffer(settings: TrainConfig, needed: int, available: int | None) -> N
       available: memory of the device, bytes; None if unknown, and then nothing is refused.
 
     Raises:
-      ConfigError: if the buffer cannot fit, with a size that is certainly too large.
+      ConfigError: if the buffer cannot fit. The message names a size that is certainly too large.
     """
     if available is not None and needed > available:
         levels = settings.curriculum.levels.buffer or 0
@@ -74,8 +74,8 @@ def check_state(settings: TrainConfig, needed: int, available: int | None) -> No
       available: memory of the device, bytes; None if unknown, and then nothing is refused.
 
     Raises:
-      ConfigError: if the state cannot fit, with a number of arenas that is certainly too large:
-        training takes many times the memory of its state.
+      ConfigError: if the state cannot fit. The message names a number of arenas that is certainly
+        too large, because training takes many times the memory of its state.
     """
     if available is not None and needed > available:
         advice = _advice(settings, "less than", settings.arenas * available / needed)
@@ -91,7 +91,7 @@ def check(settings: TrainConfig, needed: int, available: int | None) -> None:
       available: memory of the device, bytes; None if unknown, and then nothing is refused.
 
     Raises:
-      ConfigError: if the program does not fit, with a number of arenas that should.
+      ConfigError: if the program does not fit. The message names a number of arenas that should.
     """
     if available is not None and needed > available:
         most = MARGIN * settings.arenas * available / needed

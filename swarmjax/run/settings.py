@@ -26,7 +26,7 @@ from swarmjax.task.config import check_realism
 from swarmjax.task.stage_config import make_room
 from swarmjax.training.config import ProgramConfig
 
-# Most arenas, over all seeds, whose episodes are logged: with more, thousands end every second.
+# Most arenas of all seeds with run.episodes=true. With more, thousands of episodes end per second.
 MOST_LOGGED = 8192
 AUTO = "auto"  # `arenas` accepts it in place of a number
 

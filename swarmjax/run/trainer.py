@@ -286,7 +286,7 @@ class Saves:
         return due
 
     def must_wait(self, tally: Tally) -> bool:
-        """Returns whether the next call ends over an interval after the second newest save."""
+        """Returns whether the next call ends more than an interval after the save before last."""
         return self._is_over(self._before, tally, self._call, most=1.0)
 
     def _is_over(
