@@ -1,8 +1,9 @@
 #!/usr/bin/env bash
-# Trains one run on all NVIDIA GPUs of this machine, a process for each:
+# Trains one run on all NVIDIA GPUs of this machine, with one process per GPU:
 #   uv sync --extra gpu        once
-#   bash launch/local.sh DIR [key=value ...]     e.g. bash launch/local.sh runs/all arenas=131072 budget=2e9
-# GPUS=2 takes the first two. The same command goes on with a run that was stopped.
+#   bash launch/local.sh DIR [key=value ...]
+#   e.g. bash launch/local.sh runs/all arenas=131072 budget=2e9
+# GPUS=2 uses only the first two. The same command continues a run that was stopped.
 set -euo pipefail
 run=${1:?give a run directory, as in: bash launch/local.sh runs/all}
 shift
@@ -19,7 +20,7 @@ start() {
 }
 
 processes=()
-# Bash lets processes in the background ignore Ctrl-C, so they are told.
+# Background processes of bash ignore Ctrl-C, so this trap passes it on.
 trap 'kill -TERM "${processes[@]}" 2>/dev/null || true' INT TERM
 for ((i = 0; i < gpus; i++)); do
   start "$i" "$@" &
@@ -27,7 +28,7 @@ for ((i = 0; i < gpus; i++)); do
 done
 code=0
 for process in "${processes[@]}"; do
-  # A signal ends `wait` before the process has ended.
+  # A signal interrupts `wait` before the process has ended.
   while kill -0 "$process" 2>/dev/null; do
     wait "$process" || code=$?
   done

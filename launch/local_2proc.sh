@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Trains one run in two processes of this machine, with a CPU device each, over gloo:
+# Trains one run in two processes on this machine, with one CPU device each, connected by gloo:
 #   bash launch/local_2proc.sh DIR [key=value ...]
-# It shows that several processes work where there are no GPUs; one process is faster on one machine.
+# It shows that several processes work without GPUs. On one machine, one process is faster.
 set -euo pipefail
 run=${1:?give a run directory, as in: bash launch/local_2proc.sh runs/two}
 shift

@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Runs a command for a Slurm job, hands SIGUSR1 on to it, and asks for the job again if it ends with
-# 75: saved, to be started again.
+# Runs a command for a Slurm job and passes SIGUSR1 on to it. Requeues the job if the command ends
+# with code 75: it has saved, and should be started again.
 #   bash launch/requeue.sh COMMAND [ARGUMENT ...]
 set -euo pipefail
 
 "$@" &
 command=$!
-# `scancel --signal` reaches all tasks of a job step; a command without steps gets the signal itself.
+# `scancel --signal` reaches all tasks of a job step. A command without steps is signalled directly.
 if [ "${STEPS:-0}" -eq 1 ]; then
   trap 'scancel --signal=USR1 "$SLURM_JOB_ID"' USR1
 else
@@ -14,7 +14,7 @@ else
 fi
 code=0
 wait "$command" || code=$?
-# A trapped signal ends `wait` before the command has ended.
+# A trapped signal interrupts `wait` before the command has ended.
 while kill -0 "$command" 2>/dev/null; do
   code=0
   wait "$command" || code=$?

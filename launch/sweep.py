@@ -1,11 +1,12 @@
-"""Trains a grid of settings, a job for each cell, and prints one table at the end.
+"""Trains a grid of settings, with one job per cell, and prints a table at the end.
 
     python launch/sweep.py dir=runs/grid grid.algo.epochs=1,2 grid.arenas=64,128 seeds=5 stage=s3
 
 trains four cells with five seeds each into `runs/grid/algo.epochs=1_arenas=64` and so on. Words
-that are no keys of this command are those of `python -m swarmjax.train`. A job that saves and ends
-with 75 is submitted again. Started again with the same words, the command goes on with what is
-done. `sweep.json` has the table too. Needs the extra `sweep`: uv sync --extra gpu --extra sweep.
+with other keys than this command's go to `python -m swarmjax.train`. A job that saves and ends with
+code 75 is submitted again. If the command is started again with the same words, it skips finished
+cells and resumes the others. `sweep.json` also has the table. Needs the extra `sweep`: uv sync
+--extra gpu --extra sweep.
 """
 
 import importlib.util
@@ -31,39 +32,42 @@ from swarmjax.run.errors import CheckpointError
 from swarmjax.run.grid import MOST_CELLS, GridCell, multiply
 
 _TICK_S = 1.0
-_SAVE_S = 180  # from the signal that a job under Slurm gets to its end
+_SAVE_S = 180  # from the signal of Slurm to the end of a job
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepConfig(Section):
-    """Where the cells of a grid are trained."""
+    """Where and how to train the cells of a grid."""
 
     command: ClassVar[str] = ""
 
-    dir: str = field(metadata=about("folder of the sweep, which all jobs must see"))
+    dir: str = field(metadata=about("folder of the sweep, visible to all jobs"))
     cluster: Literal["slurm", "local", "debug"] = field(
-        default="slurm", metadata=about("local: processes of this machine; debug: this process")
+        default="slurm",
+        metadata=about(
+            "slurm: jobs of Slurm; local: processes on this machine; debug: this process"
+        ),
     )
     minutes: int = field(
         default=240,
-        metadata=about("of a job, after which it saves and is submitted again", 5, 100_000),
+        metadata=about("length of a job, after which it saves and is resubmitted", 5, 100_000),
     )
-    cpus: int = field(default=8, metadata=about("of a job [slurm]", 1, 1024))
+    cpus: int = field(default=8, metadata=about("CPUs of a job [slurm]", 1, 1024))
     gpus: int | None = field(
-        default=None, metadata=about("of a job; null: as many as its devices [slurm]", 0, 64)
+        default=None, metadata=about("GPUs of a job; null: its number of devices [slurm]", 0, 64)
     )
-    tries: int = field(default=10, metadata=about("times that a job is submitted", 1, 1000))
+    tries: int = field(default=10, metadata=about("how often a job may be submitted", 1, 1000))
     at_once: int | None = field(
         default=None,
-        metadata=about("jobs at once; null: all [slurm], one [local, debug]", 1, MOST_CELLS),
+        metadata=about("most jobs at once; null: all [slurm], one [local, debug]", 1, MOST_CELLS),
     )
 
 
 def parse(arguments: Sequence[str]) -> tuple[SweepConfig, list[GridCell]]:
-    """Makes the settings and the cells of a sweep of its `key=value` words.
+    """Makes the settings and the cells of a sweep from its `key=value` words.
 
     Raises:
-      ConfigError: if a word is unsound, or jobs cannot be submitted here.
+      ConfigError: if a word is invalid, or jobs cannot be submitted here.
     """
     known = section.names(SweepConfig)
     mine = {key: value for key, _, value in (word.partition("=") for word in arguments)}
@@ -84,11 +88,11 @@ def parse(arguments: Sequence[str]) -> tuple[SweepConfig, list[GridCell]]:
 
 
 def train(arguments: Sequence[str], visible: str | None) -> int:
-    """Trains one cell: what a job does.
+    """Trains one cell, inside a job.
 
     Args:
-      arguments: of `python -m swarmjax.train`.
-      visible: CUDA_VISIBLE_DEVICES, where submitit has put something else there.
+      arguments: arguments for `python -m swarmjax.train`.
+      visible: value to restore in CUDA_VISIBLE_DEVICES, which submitit changes; None: keep it.
 
     Returns:
       The exit code of that command.
@@ -109,7 +113,7 @@ def train(arguments: Sequence[str], visible: str | None) -> int:
 
 
 def work(cells: Sequence[GridCell], settings: SweepConfig) -> dict[str, int]:
-    """Trains cells in jobs, again where they save and want to go on.
+    """Trains cells in jobs, and resubmits jobs that have saved but are not done.
 
     Returns:
       The last exit code of each cell, by its label.
@@ -142,15 +146,16 @@ def submit(cell: GridCell, settings: SweepConfig, *, is_first: bool = True) -> A
     """Submits the job of a cell.
 
     Args:
-      cell: to train.
-      settings: of the sweep.
-      is_first: whether no other job runs whose end may make room for this one.
+      cell: the cell to train.
+      settings: settings of the sweep.
+      is_first: whether no other job of the sweep is running. If one is, Slurm may accept this job
+        after that one ends.
 
     Returns:
-      submitit's handle of it; None if Slurm takes no more jobs now.
+      submitit's handle of the job; None if Slurm accepts no more jobs at present.
 
     Raises:
-      ConfigError: if Slurm takes none at all.
+      ConfigError: if Slurm accepts no job at all.
     """
     import submitit
     from submitit.core.utils import FailedJobError
@@ -174,10 +179,10 @@ def submit(cell: GridCell, settings: SweepConfig, *, is_first: bool = True) -> A
 
 
 def _code(job: Any, label: str) -> int:
-    """Takes the exit code of a job that has ended, and says how it ended."""
+    """Returns the exit code of a finished job, and prints how it ended."""
     try:
         code = job.result()
-    except Exception as error:  # of a job that was killed
+    except Exception as error:  # the job was killed
         code, why = FAILED, f"died ({type(error).__name__})"
     else:
         why = {0: "done", REQUEUE: "saved"}.get(code, f"failed with code {code}")
@@ -193,7 +198,7 @@ def _say(sentence: str) -> None:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Runs the command; returns its exit code, 75 if cells have saved and are not done."""
+    """Runs the command and returns its exit code: 75 if some cells have saved but are not done."""
     settings, cells = parse(arguments)
     folder = Path(settings.dir)
     folder.mkdir(parents=True, exist_ok=True)
@@ -210,6 +215,6 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    for number in (signal.SIGTERM, signal.SIGHUP):  # as Ctrl-C: jobs are cancelled
+    for number in (signal.SIGTERM, signal.SIGHUP):  # like Ctrl-C, they cancel the jobs
         signal.signal(number, signal.default_int_handler)
     sys.exit(command.run("sweep", main, SweepConfig))

@@ -1,4 +1,4 @@
-"""Files that are replaced whole or not at all."""
+"""Replaces files completely or not at all."""
 
 import os
 from collections.abc import Iterator
@@ -8,19 +8,19 @@ from pathlib import Path
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Gives a place to write to, and moves what was written to `path` unless something failed.
+    """Yields a temporary path to write to, and moves it to `path` if no error occurs.
 
     Args:
-        path: Of the file; folders that are missing are made.
+      path: path of the file. Missing folders are made.
 
     Yields:
-        Another path with the same ending.
+      A temporary path with the same extension.
 
     Raises:
-        OSError: If it cannot be written.
+      OSError: if the file cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Beside the file, so that the move stays within one file system and cannot stop half way.
+    # In the same folder, so that the move stays within one file system and is atomic.
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         yield temporary

@@ -1,4 +1,4 @@
-"""What all commands share: `--help`, and errors of the user's in one sentence with exit code 2."""
+"""Handles `--help` and the user's errors (one sentence, exit code 2) for all commands."""
 
 import inspect
 import os
@@ -12,8 +12,8 @@ from swarmjax.exit_codes import INTERRUPTED, USER_ERROR
 from swarmjax.policy import PolicyError
 
 HELP = {"-h", "--help"}
-_ALL = "all"  # topic of the help that is every key
-# By the command's module, what to type after `python -m` and it, and what that does.
+_ALL = "all"  # the help topic that lists every key
+# For each command's module: words to type after the module's name, and what they do.
 EXAMPLES: dict[str, dict[str, str]] = {
     "swarmjax.train": {
         "": "the default curriculum, into a new folder of runs/",
@@ -47,14 +47,14 @@ EXAMPLES: dict[str, dict[str, str]] = {
         "runs=runs/first,runs/array,'runs/cell*'": "a table of several runs, arrays and sweeps",
     },
     "swarmjax.watch": {
-        "run=runs/first": "a page on this machine, whose address is printed",
+        "run=runs/first": "serve a page on this machine, and print its address",
         "run=runs/first port=8000 seconds=10": "on a port of your choice, with more replays",
         "run=runs/first level=7 seed=1": "another level, by another seed's policy",
     },
     "swarmjax.replay": {
         "policy=runs/first/policy.npz": "level 0 of its last stage, into replay.html",
         "policy=runs/first/policy.npz level=0,7,12": "several levels",
-        "policy=runs/first/policy.npz worst=5": "the five of 1,000 that it does worst in",
+        "policy=runs/first/policy.npz worst=5": "its five worst levels out of 1,000",
         "policy=a.npz,b.npz worst=3": "two policies side by side",
         "policy=runs/first/policy.npz stage=s3 robot=planar": "another stage and body",
         "policy=runs/first/policy.npz video=replay.mp4": "a video as well",
@@ -63,7 +63,7 @@ EXAMPLES: dict[str, dict[str, str]] = {
         "": "all arms, ten seeds each: hours",
         "seeds=3 budget=100000": "a first look, in minutes",
         "'arms=[curriculum,baseline]' device=cpu": "two arms, without the GPU",
-        "minutes=55 out=runs/paper": "stop in time, with all saved",
+        "minutes=55 out=runs/paper": "stop after 55 minutes, with all saved",
         "resume=runs/paper": "go on with a reproduction that was stopped",
     },
     "swarmjax.verify": {
@@ -71,7 +71,7 @@ EXAMPLES: dict[str, dict[str, str]] = {
         "run=runs/first updates=500": "up to update 500",
     },
     "swarmjax.suite": {
-        "suite=headline": "draw the levels and hold them to the digests in the suite's file",
+        "suite=headline": "draw the levels, and check them against the digests in the suite's file",
         "suite=headline out=headline.npz": "write all levels to a file that evaluate reads",
         "suite=my_suite.yaml write=true": "put the digests into a suite of your own",
     },
@@ -87,13 +87,13 @@ def run(
     """Runs a command on the command line's arguments.
 
     Args:
-      name: of the command, `train` say.
-      main: takes the arguments, returns the exit code.
+      name: name of the command, such as `train`.
+      main: takes the arguments and returns the exit code.
       settings: the dataclass of the command's keys, for `--help`.
-      also: further errors that are the user's to mend.
+      also: further errors that the user can fix.
 
     Returns:
-      The exit code: 2 for an error of the user's, which is printed in one sentence.
+      The exit code: 2 for the user's errors, which are printed in one sentence.
     """
     arguments = sys.argv[1:]
     module = _module(name)
@@ -111,24 +111,24 @@ def run(
     except OSError as error:
         if error.filename is None:
             raise
-        # Of a file that became unreadable, or cannot be made, where no command foresaw it.
+        # A file that cannot be read or written, where no command handles the error itself.
         name, reason = reading.called(str(error.filename)), error.strerror
         sys.stderr.write(f"{module}: error: {name} cannot be used: {reason}.\n")
         return USER_ERROR
 
 
 def line(name: str, *arguments: str) -> str:
-    """Write a command that can be pasted into a shell.
+    """Formats a command so that it can be pasted into a shell.
 
     Args:
-        name: of the command, `evaluate` say.
-        arguments: its `key=value` words.
+      name: name of the command, such as `evaluate`.
+      arguments: its `key=value` words.
     """
     return shlex.join(["python", "-m", f"swarmjax.{name}", *arguments])
 
 
 def _module(name: str) -> str:
-    """The command as `python -m` names it, or the path of a script: not all are in the package."""
+    """Returns the name for `python -m`, or a script's path for a command outside the package."""
     main = sys.modules["__main__"]
     script = getattr(main, "__file__", None) or ""
     spec = getattr(main, "__spec__", None)
@@ -139,25 +139,25 @@ def _module(name: str) -> str:
 
 
 def help_text(cls: type[Section], module: str, topics: Sequence[str] = ()) -> str:
-    """Describe a command's settings.
+    """Describes a command's settings.
 
     Args:
-        cls: the command's dataclass.
-        module: the command as `python -m` names it, such as `swarmjax.train`, or a script's path.
-        topics: sections or keys to list, or `all`; none for usage, examples, groups and the keys
-            that are in no section.
+      cls: the command's dataclass.
+      module: name for `python -m`, such as `swarmjax.train`, or a script's path.
+      topics: sections or keys to list, or `all`. Without topics, the text has usage, examples,
+        groups and the keys outside sections.
 
     Returns:
-        Lines for a terminal, without a newline at the end.
+      Lines for a terminal, without a newline at the end.
 
     Raises:
-        ConfigError: there is no such topic.
+      ConfigError: if there is no such topic.
     """
     return "\n".join(_listed(cls, topics) if topics else _overview(cls, module))
 
 
 def _listed(cls: type[Section], topics: Sequence[str]) -> list[str]:
-    """List the keys that topics name."""
+    """Lists the keys of topics."""
     known = section.keys(cls)
     chosen: set[str] = set()
     for topic in topics:
@@ -165,13 +165,13 @@ def _listed(cls: type[Section], topics: Sequence[str]) -> list[str]:
         found = {key for key in known if key == name or key.startswith(f"{name}.")}
         if topic != _ALL and not found:
             names = ", ".join([*section.sections(cls), _ALL])
-            raise ConfigError(f"--help {topic} is no topic: give a key, or one of {names}.")
+            raise ConfigError(f"--help {topic} is not a topic: give a key, or one of {names}.")
         chosen |= set(known) if topic == _ALL else found
     return section.describe_keys(cls, chosen)
 
 
 def _overview(cls: type[Section], module: str) -> list[str]:
-    """Say how a command is used, without the keys of its sections."""
+    """Describes how to use a command, without the keys of its sections."""
     command = f"python {module}" if module.endswith(".py") else f"python -m {module}"
     lines = [f"usage: {command} key=value ..."]
     examples = EXAMPLES.get(module, {})

@@ -1,9 +1,9 @@
-"""Your own pieces: reward terms, observations, level drawings and networks, from a file of yours.
+"""Your own pieces: reward terms, observations, level drawings and networks, from your own file.
 
-A piece is a function (a network is a Flax module) with one of the decorators below. Commands take
-the file as `extensions=FILE`; `make_env` and `train_policy` also take a module or a list of pieces.
-Everything in a file is used unless a key says otherwise; docs/extending.md has an example of each.
-Loading a file runs it. Importing this module imports no JAX.
+A piece is a function with one of the decorators below; a network is a Flax module. Commands take
+the file as `extensions=FILE`. `make_env` and `train_policy` also take a module or a list of pieces.
+All pieces of a file are used unless a key says otherwise. docs/extending.md has an example of each
+kind. Loading a file executes it. Importing this module does not import JAX.
 """
 
 import ast
@@ -29,13 +29,13 @@ _CONSTANTS = (bool, int, float, str, bytes, tuple, frozenset, type(None))
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Piece:
-    """A function of yours, and what it is called.
+    """A function of yours with its name.
 
     Attributes:
-        kind: what it is, as sentences and policy files call it.
-        taken: names of this kind that the package itself uses.
-        name: as keys and policy files call it.
-        function: what it computes.
+      kind: the kind of piece, as messages and policy files call it.
+      taken: names of this kind that the package itself uses.
+      name: its name in keys and policy files.
+      function: the function.
     """
 
     kind: ClassVar[str] = ""
@@ -46,14 +46,14 @@ class Piece:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of its code and of what it uses of its own file, without comments."""
+        """SHA-256 of its code and of the code that it uses from its file, without comments."""
         texts = sorted(_sources(self.function, {}).items())
         return hashlib.sha256(repr(texts).encode()).hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RewardTerm(Piece):
-    """A term of the reward: `(swarmjax.task.reward.Step) -> [R]`, times its weight."""
+    """A term of the reward: `(swarmjax.task.reward.Step) -> [R]`, multiplied by its weight."""
 
     kind: ClassVar[str] = "reward"
     taken: ClassVar[tuple[str, ...]] = (
@@ -72,9 +72,9 @@ class RewardTerm(Piece):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observation(Piece):
-    """More entries of the observation: `(swarmjax.task.observation.View) -> [R]` or `[R, size]`.
+    """Extra entries of the observation: `(swarmjax.task.observation.View) -> [R]` or `[R, size]`.
 
-    The policy sees (value - offset) / scale.
+    The policy receives (value - offset) / scale.
     """
 
     kind: ClassVar[str] = "observation"
@@ -95,7 +95,7 @@ class Observation(Piece):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LevelDrawing(Piece):
-    """A way of drawing levels: `(swarmjax.task.level.Level, key) -> Level`, of one arena."""
+    """A way to draw levels, for one arena: `(swarmjax.task.level.Level, key) -> Level`."""
 
     kind: ClassVar[str] = "level"
     taken: ClassVar[tuple[str, ...]] = (
@@ -116,14 +116,14 @@ KINDS = (RewardTerm, Observation, LevelDrawing, Network)
 
 
 def reward_term(weight: float, name: str | None = None) -> Callable[[Callable], RewardTerm]:
-    """Make a function a term of the reward.
+    """Turns a function into a term of the reward.
 
     Args:
-        weight: what it is multiplied by; `task.reward.extra.NAME` overrides it.
-        name: of the term; None: the function's.
+      weight: factor on the function's value. `task.reward.extra.NAME` overrides it.
+      name: name of the term; None: the function's name.
 
     Raises:
-        TypeError: it stands without parentheses.
+      TypeError: if the decorator is used without parentheses.
     """
     if callable(weight):
         raise TypeError("write @reward_term(weight=...), with a weight")
@@ -139,17 +139,17 @@ def observation(
     scale: float = 1.0,
     name: str | None = None,
 ) -> Callable[[Callable], Observation]:
-    """Make a function an observation.
+    """Turns a function into an observation.
 
     Args:
-        size: how many entries each robot gets.
-        unit: of the values, for the policy file.
-        offset: is subtracted, in that unit.
-        scale: divides, in that unit.
-        name: of the observation; None: the function's.
+      size: number of entries for each robot.
+      unit: unit of the values, for the policy file.
+      offset: subtracted from the values, in that unit.
+      scale: divisor of the values, in that unit.
+      name: name of the observation; None: the function's name.
 
     Raises:
-        TypeError: it stands without parentheses.
+      TypeError: if the decorator is used without parentheses.
     """
     if callable(size):
         raise TypeError("write @observation(), with parentheses")
@@ -164,17 +164,17 @@ def observation(
 
 
 def level_drawing(function: Callable) -> LevelDrawing:
-    """Make a function a way of drawing levels, for stages whose `level` is its name."""
+    """Turns a function into a way to draw levels. A stage uses it if its `level` is its name."""
     return LevelDrawing(name=function.__name__, function=function)
 
 
 def network(module: type) -> Network:
-    """Make a Flax module the network of actor and critic, `algo.network` its name."""
+    """Turns a Flax module into a network for actor and critic, which `algo.network` selects."""
     return Network(name=_snake(module.__name__), function=module)
 
 
 def _snake(name: str) -> str:
-    """Turn the name of a class into that of a key: ResidualNet into residual_net."""
+    """Turns the name of a class into the name of a key: ResidualNet into residual_net."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
 
 
@@ -182,10 +182,10 @@ class Extensions(NamedTuple):
     """The pieces of a file, a module or a list.
 
     Attributes:
-        rewards: terms of the reward.
-        observations: more entries of the observation.
-        levels: ways of drawing levels.
-        networks: networks of actor and critic.
+      rewards: terms of the reward.
+      observations: extra entries of the observation.
+      levels: ways to draw levels.
+      networks: networks of actor and critic.
     """
 
     rewards: tuple[RewardTerm, ...] = ()
@@ -194,7 +194,7 @@ class Extensions(NamedTuple):
     networks: tuple[Network, ...] = ()
 
     def digests(self) -> ByName:
-        """Return the digest of each piece, by kind and name."""
+        """Returns the digest of each piece, by kind and name."""
         kinds = zip(KINDS, self, strict=True)
         return ByName(
             {
@@ -211,26 +211,26 @@ NONE = Extensions()
 # Loading
 
 _files: dict[tuple[str, str], Extensions] = {}  # by path and SHA-256 of the content
-_handed: dict[str, Extensions] = {}  # pieces that Python handed over, by the word for them
-_HANDED = "python:"  # what such a word begins with; no file can be meant by it
+_handed: dict[str, Extensions] = {}  # pieces from `hand_over`, by the word that stands for them
+_HANDED = "python:"  # prefix of such a word, which is not a file path
 
 
 def load(source: str | None) -> Extensions:
-    """Return the pieces that the key `extensions` names.
+    """Returns the pieces that the key `extensions` names.
 
     Args:
-        source: path of a Python file, a word of `hand_over`, or None for no pieces.
+      source: path of a Python file, a word from `hand_over`, or None for no pieces.
 
     Raises:
-        ConfigError: the file is missing or does not import, or a piece is unsound.
+      ConfigError: if the file is missing or does not import, or a piece is invalid.
     """
     if source is None:
         return NONE
     if source.startswith(_HANDED):
         if source not in _handed:
             raise ConfigError(
-                f"extensions is {source}, pieces that a Python program handed over and that only "
-                "it has: put them into a file and give extensions=FILE."
+                f"extensions is {source}, which stands for pieces that only the Python program "
+                "itself had: put them into a file and give extensions=FILE."
             )
         return _handed[source]
     path = Path(source)
@@ -246,13 +246,13 @@ def load(source: str | None) -> Extensions:
 
 
 def hand_over(given: object) -> str | None:
-    """Return what the key `extensions` is to be for pieces that a Python program gives.
+    """Returns the value of the key `extensions` for pieces from a Python program.
 
     Args:
-        given: None, a path, a module, a piece, or several pieces.
+      given: None, a path, a module, a piece, or several pieces.
 
     Raises:
-        ConfigError: it is nothing of the kind, or a piece is unsound.
+      ConfigError: if it is something else, or a piece is invalid.
     """
     if given is None or isinstance(given, str):
         return given
@@ -279,7 +279,7 @@ def hand_over(given: object) -> str | None:
 
 
 def _import(path: Path, content: bytes, digest: str) -> types.ModuleType:
-    """Run a file as a module of its own, so that it cannot stand in the way of another."""
+    """Runs a file as a module with a unique name, so that it cannot shadow another module."""
     name = f"_swarmjax_extension_{digest[:16]}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None:
@@ -287,7 +287,8 @@ def _import(path: Path, content: bytes, digest: str) -> types.ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
-        # Not from bytecode, nor with old lines: both go by size and whole seconds of a file's age.
+        # Do not use cached bytecode or lines. Both caches compare only the size of a file and its
+        # time in whole seconds, so they may be out of date.
         linecache.cache.pop(str(path), None)
         exec(compile(content, str(path), "exec"), vars(module))
     except Exception as error:
@@ -299,26 +300,26 @@ def _import(path: Path, content: bytes, digest: str) -> types.ModuleType:
 
 
 def describe(error: BaseException) -> str:
-    """Put an error of a user's code in part of a sentence: its type and the first line it says."""
+    """Formats an error of a user's code for a message: its type and first line."""
     text = (str(error).strip() or "no reason given").splitlines()[0].rstrip(".")
     return f"{type(error).__name__}: {text}"
 
 
 def _pieces(names: Mapping[str, object]) -> list[Piece]:
-    """List the pieces among a module's names, each once."""
+    """Lists the pieces among a module's names, each once."""
     found = {id(value): value for value in names.values() if isinstance(value, Piece)}
     return list(found.values())
 
 
 def collect(pieces: Iterable[Piece], where: str) -> Extensions:
-    """Check pieces by themselves and sort them by kind.
+    """Checks each piece and sorts the pieces by kind.
 
     Args:
-        pieces: in any order.
-        where: what sentences call their source.
+      pieces: the pieces, in any order.
+      where: name of their source in messages.
 
     Raises:
-        ConfigError: a name cannot be one, or is used twice; a number is out of range.
+      ConfigError: if a name is invalid or used twice, or a number is out of range.
     """
     found: dict[str, dict[str, Any]] = {kind.kind: {} for kind in KINDS}
     for piece in pieces:
@@ -337,7 +338,7 @@ def _check(piece: Piece, where: str) -> None:
     label = f"{where}: {piece.kind} {piece.name}"
     if not _NAME.fullmatch(piece.name):
         raise ConfigError(
-            f"{label} cannot be called so: give 1 to 40 lower-case letters, digits and _, a letter "
+            f"{label} is not a valid name: give 1 to 40 lower-case letters, digits and _, a letter "
             "first."
         )
     if piece.name in piece.taken:
@@ -346,16 +347,18 @@ def _check(piece: Piece, where: str) -> None:
         if not isinstance(piece.size, int) or not 1 <= piece.size <= 1000:
             raise ConfigError(f"{label} has size {show(piece.size)}: give 1 to 1000.")
         if not piece.scale:
-            raise ConfigError(f"{label} has scale 0: give another number, it divides.")
+            raise ConfigError(
+                f"{label} has scale 0, by which values are divided: give another number."
+            )
     if isinstance(piece, Network) and not isinstance(piece.function, type):
-        raise ConfigError(f"{label} is no class: decorate a flax.linen.Module.")
+        raise ConfigError(f"{label} is not a class: decorate a flax.linen.Module.")
 
 
 # Digests
 
 
 def _sources(thing: Any, found: dict[str, str]) -> dict[str, str]:
-    """Return the syntax trees of a function or class and of what it uses of its own file."""
+    """Returns the syntax trees of a function or class and of all that it uses from its file."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(thing)))
     except (OSError, TypeError, SyntaxError):
@@ -378,7 +381,7 @@ def _sources(thing: Any, found: dict[str, str]) -> dict[str, str]:
 
 
 def _bare(tree: ast.Module) -> ast.Module:
-    """Takes the decorator and all docstrings off: what a decorator says, keys and layouts hold."""
+    """Removes the decorator and all docstrings. Keys and layouts already record its arguments."""
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             if node in tree.body:
@@ -390,7 +393,7 @@ def _bare(tree: ast.Module) -> ast.Module:
 
 
 def _names(tree: ast.AST) -> Iterator[str]:
-    """Yield the names that a tree reads, in alphabetical order."""
+    """Yields the names that a tree reads, in alphabetical order."""
     yield from sorted({node.id for node in ast.walk(tree) if isinstance(node, ast.Name)})
 
 
@@ -403,16 +406,16 @@ def check_needs(
     where: str,
     kinds: Iterable[str] = tuple(kind.kind for kind in KINDS),
 ) -> None:
-    """Refuse to run a policy without the pieces that it was trained with.
+    """Refuses to run a policy without the pieces that it was trained with.
 
     Args:
-        needs: the digests by kind and name, as the policy's `meta.extensions` holds them.
-        pieces: those that there are.
-        where: what a sentence calls the policy.
-        kinds: of the pieces that matter here.
+      needs: the digests by kind and name, as the policy's `meta.extensions` holds them.
+      pieces: the available pieces.
+      where: name of the policy in messages.
+      kinds: the kinds of pieces to check.
 
     Raises:
-        ConfigError: a piece is missing, or has changed.
+      ConfigError: if a piece is missing or has changed.
     """
     held = pieces.digests()
     for kind in kinds:
@@ -425,6 +428,6 @@ def check_needs(
                 )
             if there != digest:
                 raise ConfigError(
-                    f"{where} was trained with the {kind} {name} of digest {digest[:12]}, but that "
-                    f"of extensions has {there[:12]}: give the file as it was then."
+                    f"{where} was trained with the {kind} {name} of digest {digest[:12]}, but the "
+                    f"one in extensions has {there[:12]}: give the file as it was then."
                 )

@@ -1,4 +1,4 @@
-"""Where a result comes from: versions, commit and device. No JAX needed but for the device."""
+"""Describes where a result comes from: versions, commit and device. Only the device needs JAX."""
 
 import importlib.metadata
 import os
@@ -22,7 +22,7 @@ _PACKAGES = (
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that results depend on, where installed."""
+    """Returns the versions of Python and of all installed packages that results depend on."""
     found = {"python": platform.python_version()}
     for name in _PACKAGES:
         try:
@@ -33,10 +33,10 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str | None:
-    """Commit of the source tree, with `-dirty` if it was changed since; None without git.
+    """Returns the commit of the source tree, with `-dirty` if files have changed; None without git.
 
-    The environment variable `SWARMJAX_COMMIT` wins: it is for copies of the tree that left their
-    history behind, or brought another one along.
+    The environment variable `SWARMJAX_COMMIT` takes precedence. Use it for copies of the tree
+    without their own Git history, or inside another repository.
     """
     given = os.environ.get("SWARMJAX_COMMIT")
     if given:
@@ -51,7 +51,7 @@ def commit() -> str | None:
 
 
 def device() -> str:
-    """The accelerator's name, or the processor's with its number of cores."""
+    """Returns the number and name of the accelerators, or the processor and its cores."""
     import jax
 
     found = jax.devices()[0]
@@ -61,8 +61,8 @@ def device() -> str:
 
 
 def cores() -> int:
-    """How many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):  # Linux alone has it
+    """Returns the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # only on Linux
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 

@@ -1,11 +1,11 @@
-"""Arenas spread over devices: what each device holds, and how all of them agree.
+"""Spreads arenas over devices: each device's share, and how the devices agree.
 
-A program that is spread runs once on each device of a mesh (`jax.shard_map`), with the arenas of
-that device. What is learned, decided or reported is of all arenas: it is summed over the mesh, so
-that every device comes to the same numbers.
+The program runs once on each device of a mesh (`jax.shard_map`), with the arenas of that device.
+Learning, decisions and reports use all arenas: their numbers are summed over the mesh, so that all
+devices get the same result.
 
-Random numbers come in streams. An arena belongs to one of them on every device count, so a run
-with four streams draws the same on one, two or four devices.
+Random numbers come in streams. Each arena belongs to one stream, whatever the number of devices. So
+a run with four streams draws the same numbers on one, two or four devices.
 """
 
 from collections.abc import Callable
@@ -15,16 +15,17 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-AXIS = "arenas"  # of the mesh
+AXIS = "arenas"  # name of the mesh axis
 
 
 @dataclass(frozen=True)
 class Shards:
-    """How the arenas of a program are spread.
+    """How the arenas of a program are spread over devices and random streams.
 
     Attributes:
-      devices: D that share the arenas; with 1 there is no mesh.
-      streams: S of random numbers, a multiple of D. Stream i serves the arenas from i A / S on.
+      devices: D, the number of devices that share the arenas. With 1 there is no mesh.
+      streams: S, the number of random streams, a multiple of D. Stream i serves the arenas from
+        i A / S on.
     """
 
     devices: int = 1
@@ -32,50 +33,50 @@ class Shards:
 
     @property
     def local_streams(self) -> int:
-        """Streams that serve the arenas of one device."""
+        """Number of streams that serve the arenas of one device."""
         return self.streams // self.devices
 
     def sum[T](self, tree: T) -> T:
-        """Adds up what the devices hold; all get the sum."""
+        """Adds up the values of all devices, and gives each device the sum."""
         return tree if self.devices == 1 else jax.lax.psum(tree, AXIS)
 
     def any(self, found: Array) -> Array:
-        """Tells all devices whether something is true on one of them."""
+        """Returns, on all devices, whether something is true on at least one of them."""
         return found if self.devices == 1 else jax.lax.pmax(found.astype(jnp.int32), AXIS) > 0
 
     def gather(self, x: Array, axis: int) -> Array:
-        """Puts the arenas of all devices together.
+        """Joins the arenas of all devices.
 
         Args:
-          x: Those of this device along `axis`.
-          axis: Of the arenas.
+          x: the values of this device's arenas, along `axis`.
+          axis: the axis of arenas.
 
         Returns:
-          All arenas, in their order, on every device.
+          The values of all arenas, in order, on every device.
         """
         return x if self.devices == 1 else jax.lax.all_gather(x, AXIS, axis=axis, tiled=True)
 
     def own_key(self, key: Array) -> Array:
-        """Makes a random key for this device alone out of one that all have."""
+        """Derives a random key for this device from a key that all devices share."""
         return key if self.devices == 1 else jax.random.fold_in(key, jax.lax.axis_index(AXIS))
 
     def local(self, x: Array) -> Array:
-        """Takes the arenas of this device out of [A, ...], those of all devices."""
+        """Selects this device's arenas from the values [A, ...] of all arenas."""
         if self.devices == 1:
             return x
         size = x.shape[0] // self.devices
         return jax.lax.dynamic_slice_in_dim(x, jax.lax.axis_index(AXIS) * size, size)
 
     def draw(self, key: Array, sample: Callable[[Array], Array], axis: int = 0) -> Array:
-        """Draws random numbers for the arenas of this device, each stream with a key of its own.
+        """Draws random numbers for the arenas of this device, with a separate key per stream.
 
         Args:
-          key: Random key, the same on all devices, consumed.
-          sample: Draws for the arenas of one stream, which lie along `axis`.
-          axis: Of the arenas.
+          key: random key, the same on all devices; consumed.
+          sample: draws for the arenas of one stream, along `axis`.
+          axis: the axis of arenas.
 
         Returns:
-          What was drawn, with all arenas of the device along `axis`.
+          The random numbers, with all arenas of the device along `axis`.
         """
         if self.streams == 1:
             return sample(key)

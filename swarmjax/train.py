@@ -1,7 +1,8 @@
 """`python -m swarmjax.train stage=... key=value`: trains a swarm, from the command line.
 
-With no argument it trains the default curriculum. `--help` gives examples. JAX takes seconds to
-load, so it is imported only when the settings are known to be sound; signals are heard before that.
+Without arguments it trains the default curriculum. `--help` shows examples. JAX takes seconds to
+load, so it is imported only after the settings have passed their checks. Signals are handled even
+before that.
 """
 
 import sys
@@ -13,7 +14,7 @@ from swarmjax.run.signals import Stop
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Runs the command; returns its exit code."""
+    """Runs the command and returns its exit code."""
     with Stop() as stop:
         return _train(arguments, stop)
 

@@ -2,7 +2,7 @@
 
 Usage: python -m swarmjax.verify run=runs/NAME [updates=N]
 
-It exits with 0 if every state is bit for bit what the run saved, with 1 if one is not.
+It exits with 0 if every state equals the saved one bit for bit, and with 1 otherwise.
 """
 
 import math
@@ -24,7 +24,7 @@ from swarmjax.run.settings import TrainConfig, from_stored, read_config, settle
 
 @dataclass(frozen=True, kw_only=True)
 class VerifyConfig(Section):
-    """Which run is trained again, and how much of it."""
+    """Which run to train again, and for how many updates."""
 
     command: ClassVar[str] = "verify"
 
@@ -32,11 +32,12 @@ class VerifyConfig(Section):
     updates: int | None = field(
         default=None,
         metadata=about(
-            "most updates that are trained; null: to the first checkpoint", 1, MAX_COUNT
+            "train at most this many updates; null: to the first checkpoint", 1, MAX_COUNT
         ),
     )
     extensions: str | None = field(
-        default=None, metadata=about("Python file with the pieces that the run needs; it is run")
+        default=None,
+        metadata=about("Python file with the pieces that the run needs; it will be executed"),
     )
 
 
@@ -44,20 +45,20 @@ def load_digests(settings: VerifyConfig, trained: TrainConfig) -> dict[int, str]
     """Reads the digests that can be compared.
 
     Args:
-      settings: Of this command.
-      trained: Config of the run.
+      settings: settings of this command.
+      trained: config of the run.
 
     Returns:
-      Digest of the state by update, in their order.
+      Digests of the state by update, in ascending order.
 
     Raises:
-      ConfigError: if the run has written none of the updates asked for.
+      ConfigError: if the run has saved no digest that can be compared.
       CheckpointError: if its log is damaged.
     """
     log = Path(settings.run) / directory.SAVED
     rows = directory.read_rows(log, None)
     try:
-        # From the first checkpoint without arenas on, others may have been drawn.
+        # After a checkpoint without arenas, a resumed run may have drawn new ones.
         drawn = min((row["update"] for row in rows if row.get("arenas") is False), default=math.inf)
         found = {
             row["update"]: row["digest"]
@@ -69,9 +70,8 @@ def load_digests(settings: VerifyConfig, trained: TrainConfig) -> dict[int, str]
     if not found:
         raise ConfigError(
             f"run is {settings.run}, which has no digests in {directory.SAVED} that training from "
-            "its beginning leads to: give a run that has saved a checkpoint after its first "
-            "update, with its arenas and with the budget and the random streams that its "
-            "config.json has."
+            "the beginning could reproduce: give a run that has saved a checkpoint after its first "
+            "update, with its arenas, and with the budget and random streams of its config.json."
         )
     most = min(found) if settings.updates is None else settings.updates
     chosen = {update: found[update] for update in sorted(found) if update <= most}
@@ -84,10 +84,10 @@ def load_digests(settings: VerifyConfig, trained: TrainConfig) -> dict[int, str]
 
 
 def _is_replayable(row: directory.Row, trained: TrainConfig) -> bool:
-    """Tells whether training from the beginning leads to a checkpoint.
+    """Returns whether training from the beginning reproduces a checkpoint.
 
-    It does not with lower rates, nor with another budget, which the rates fall to 0 by, nor with
-    other random streams.
+    It does not if the run had lowered its learning rates, other random streams or another budget.
+    The budget matters because the learning rates fall to 0 over it.
     """
     same = {"rate_scale": 1.0, "budget": trained.budget, "streams": trained.stream_count}
     return row["update"] > 0 and all(row.get(key, value) == value for key, value in same.items())
@@ -97,11 +97,11 @@ def replay(trained: TrainConfig, updates: Sequence[int]) -> dict[int, str]:
     """Trains a run from its beginning.
 
     Args:
-      trained: its config.
-      updates: after which the state is looked at, in their order.
+      trained: the run's config.
+      updates: updates after which to compute a digest, ascending.
 
     Returns:
-      Digest of the state by update.
+      Digests of the state by update.
     """
     import numpy as np
 
@@ -121,7 +121,7 @@ def replay(trained: TrainConfig, updates: Sequence[int]) -> dict[int, str]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Runs the command; returns its exit code."""
+    """Runs the command and returns its exit code."""
     settings: VerifyConfig = files.load(VerifyConfig, arguments)
     trained = from_stored(read_config(Path(settings.run)), "stored ")
     if settings.extensions is not None:
@@ -134,7 +134,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _verdict(run: str, updates: list[int], differing: list[int]) -> str:
-    """Says what was found."""
+    """Describes the result."""
     if differing:
         return (
             f"{run} differs from update {differing[0]} on: another version, device or config "

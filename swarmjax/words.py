@@ -1,23 +1,23 @@
-"""Numbers in the lines that commands print: counts with their noun, and durations."""
+"""Formats numbers in the output of commands: counts with their noun, and durations."""
 
 
 def count(number: int, noun: str, plural: str | None = None) -> str:
-    """Writes how many there are.
+    """Formats a count with its noun.
 
     Args:
-        number: of things.
-        noun: one of them.
-        plural: several of them; None adds an s.
+      number: the count.
+      noun: the noun in the singular.
+      plural: the noun in the plural; None adds an s.
 
     Returns:
-        `1 arena` or `1,024 arenas`.
+      Text such as `1 arena` or `1,024 arenas`.
     """
     return f"{number:,} {noun if number == 1 else plural or noun + 's'}"
 
 
 def duration(seconds: float) -> str:
-    """Writes a time: seconds to three digits, however few they are, or minutes and seconds."""
-    if seconds < 59.95:  # which three digits round to a minute
+    """Formats a duration: seconds with three significant digits, minutes and seconds, or hours."""
+    if seconds < 59.95:  # larger values would round to 60.0 s
         return f"{seconds:.3g} s"
     minutes, rest = divmod(round(seconds), 60)
     if minutes < 60:

@@ -85,6 +85,6 @@ def test_every_section_says_how_it_is_listed() -> None:
 
 def test_a_topic_that_does_not_exist_is_refused() -> None:
     with pytest.raises(
-        ConfigError, match=r"^--help algos is no topic: give a key, or one of .*all"
+        ConfigError, match=r"^--help algos is not a topic: give a key, or one of .*all"
     ):
         command.help_text(TrainConfig, "swarmjax.train", ["algos"])

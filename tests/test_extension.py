@@ -83,15 +83,15 @@ def test_an_edited_file_is_read_again(tmp_path: Path) -> None:
         (TERM.replace("def speed", "def progress"),
          r"a\.py: reward progress is the name of a built-in reward: rename it"),
         (TERM.replace("def speed", "def Speed"),
-         r"a\.py: reward Speed cannot be called so: give 1 to 40 lower-case letters"),
+         r"a\.py: reward Speed is not a valid name: give 1 to 40 lower-case letters"),
         ("@observation(size=0)\ndef a(view): return 0", r"a\.py: observation a has size 0: give 1 "
         ""),
-        ("@observation(scale=0)\ndef a(view): return 0", r"a\.py: observation a has scale 0: "),
+        ("@observation(scale=0)\ndef a(view): return 0", r"a\.py: observation a has scale 0, "),
         ("@reward_term\ndef a(step): return 0",
          r"a\.py does not import: TypeError: write @reward_term\(weight=\.\.\.\), with a weight"),
         ("@observation\ndef a(view): return 0",
          r"a\.py does not import: TypeError: write @observation\(\), with parentheses"),
-        ("@network\ndef a(x): return x", r"a\.py: network a is no class: decorate a flax"),
+        ("@network\ndef a(x): return x", r"a\.py: network a is not a class: decorate a flax"),
     ],
 )  # fmt: skip
 def test_an_unsound_file_is_one_sentence(tmp_path: Path, body: str, sentence: str) -> None:
@@ -119,8 +119,8 @@ def test_pieces_are_handed_over_by_a_word() -> None:
 
 def test_a_word_of_another_program_is_refused() -> None:
     assert refusal(extension.load, "python:0123") == (
-        "extensions is python:0123, pieces that a Python program handed over and that only it has: "
-        "put them into a file and give extensions=FILE."
+        "extensions is python:0123, which stands for pieces that only the Python program itself "
+        "had: put them into a file and give extensions=FILE."
     )
 
 

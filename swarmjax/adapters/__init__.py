@@ -1,6 +1,6 @@
-"""How do other libraries step the swarm? One file for each of them (docs/adapters.md).
+"""Adapters that let other libraries step the swarm, one file per library (docs/adapters.md).
 
-Each takes what `swarmjax.make_env` returns. `robots.py` lists the robots of all arenas in a row,
-and `session.py` steps them from the host; the other files are named after their library. May
-import `environment`. Nothing here is imported by `import swarmjax`.
+Each adapter takes the result of `swarmjax.make_env`. `robots.py` lists the robots of all arenas in
+one row, and `session.py` steps them from the host. Each other file is named after its library. This
+package may import `environment`. `import swarmjax` imports nothing from here.
 """

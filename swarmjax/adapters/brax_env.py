@@ -1,4 +1,4 @@
-"""Brax: the robots of all arenas as a `brax.envs.base.Env`, for Brax's own PPO to train on."""
+"""Brax: the robots of all arenas as a `brax.envs.base.Env`, for training with Brax's PPO."""
 
 import contextlib
 from collections.abc import Iterator, Sequence
@@ -27,13 +27,13 @@ class SwarmBraxEnv(_base.Env):
                 num_eval_envs=environment.num_envs, max_devices_per_host=1, ...
             )
 
-    `wrap_env=False`, since arenas are mapped and restarted here: where an episode ends, the
-    observation is that of the next one. Brax's evaluator takes a robot's episode to end where it
-    arrives; its `eval/episode_reached` is the share of targets reached.
+    Use `wrap_env=False`, because this class already maps and restarts the arenas. When an episode
+    ends, the returned observation belongs to the next one. Brax's evaluator ends a robot's episode
+    when the robot arrives. Its `eval/episode_reached` is the share of targets reached.
 
-    Brax has no mask for transitions that nothing is to be learned from, those of a robot that has
-    arrived and waits for the others. They are marked as truncated, which makes Brax give them no
-    advantage and no value error; they stay in its batch. Absent robots are left out.
+    A robot that has arrived waits for the others, and its transitions must not be learned from.
+    Brax has no mask for that. So these transitions are marked as truncated, which gives them zero
+    advantage and zero value error in Brax, but they stay in its batch. Absent robots are left out.
     """
 
     def __init__(self, swarm: Swarm) -> None:
@@ -41,46 +41,50 @@ class SwarmBraxEnv(_base.Env):
 
     @property
     def num_envs(self) -> int:
-        """Robots of all arenas, N."""
+        """Number of robots in all arenas, N."""
         return len(self.robots)
 
     @property
     def observation_size(self) -> int:
-        """Numbers that a robot observes, O."""
+        """Size of a robot's observation, O."""
         return self.robots.swarm.observation_space.shape[0]
 
     @property
     def action_size(self) -> int:
-        """Numbers that a robot is commanded with."""
+        """Size of a robot's action."""
         return self.robots.action_size
 
     @property
     def backend(self) -> str:
-        """Brax asks for one of its own names."""
+        """Name of the backend. Brax requires one of its own names."""
         return "mjx"
 
     def reset(self, rng: Array) -> Any:
-        """Starts an episode in every arena; returns Brax's state, its fields [N, ...].
+        """Starts an episode in every arena, and returns Brax's state with fields [N, ...].
 
         Args:
-            rng: [N, 2] random keys, the first of which is used; else raises ValueError.
+          rng: [N, 2] random keys. Only the first one is used.
+
+        Raises:
+          ValueError: if there are not N keys.
         """
         if len(rng) != self.num_envs:
-            raise ValueError(f"num_envs is {len(rng)}: give {self.num_envs}, the robots there are.")
+            raise ValueError(f"num_envs is {len(rng)}: give {self.num_envs}, the number of robots.")
         now, zero = self.robots.swarm.reset(rng[0]), jnp.zeros(self.num_envs)
         info = dict.fromkeys(("truncation", "episode_done", "steps"), zero)
         seen, metrics = self.robots.observe(now), {"reached": zero}
         return _base.State(now, seen, zero, zero, metrics, info | {"episode_metrics": {}})
 
     def step(self, state: Any, action: Array) -> Any:
-        """Makes a control step; returns the state after.
+        """Makes a control step, and returns the state after it.
 
         Args:
-            state: before.
-            action: [N, U] floats; what is beyond -1..1 is clipped.
+          state: the state before the step.
+          action: [N, U] floats, clipped to -1..1.
 
         Raises:
-            ValueError: the action has a wrong shape; TypeError: a wrong dtype.
+          ValueError: if the action has a wrong shape.
+          TypeError: if the action has a wrong dtype.
         """
         check(action, (self.num_envs, self.action_size))
         steps = state.pipeline_state.arenas.clock[self.robots.arena] + 1.0
@@ -100,9 +104,10 @@ class SwarmBraxEnv(_base.Env):
 
 @contextlib.contextmanager
 def mended_jax() -> Iterator[None]:
-    """Gives JAX back `device_put_replicated` for a while, where it lacks it.
+    """Restores `device_put_replicated` to JAX in a `with` block, if JAX lacks it.
 
-    Brax 0.14.2 calls it, and JAX 0.10 has dropped it. It put a copy on each device, stacked.
+    Brax 0.14.2 calls this function, but JAX 0.10 has removed it. It put a stacked copy on each
+    device.
     """
 
     def replicate(tree: Any, devices: Sequence[Any]) -> Any:

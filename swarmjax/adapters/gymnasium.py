@@ -15,24 +15,25 @@ _batch_space: Any = find("gymnasium.vector.utils", "gymnasium", "batch_space")
 
 
 class SwarmVectorEnv(_vector.VectorEnv):
-    """Each robot is a sub-environment; all may share a policy.
+    """A vector environment with one sub-environment per robot. All may share a policy.
 
         envs = SwarmVectorEnv(swarmjax.make_env("s1", arenas=64))
         observation, info = envs.reset(seed=0)
         observation, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
 
-    The robots of an arena end together, when its episode does. One that has arrived stands until
-    then: its reward is 0, `info["valid"]` is False, and what it is told is ignored. In the last
-    step it is `terminated`; robots whose time ran out are `truncated`.
+    All robots of an arena end together, when its episode ends. A robot that has arrived stands
+    still until then: its reward is 0, `info["valid"]` is False, and its actions are ignored. In the
+    last step it is `terminated`. Robots that ran out of time are `truncated`.
 
-    Autoreset is `SAME_STEP`: where an episode ends, the observation is that of the next one, and
-    `info["final_obs"]` holds the last one of the old. Absent robots are left out.
+    Autoreset is `SAME_STEP`: when an episode ends, the returned observation belongs to the next
+    one, and `info["final_obs"]` holds the last observation of the old one. Absent robots are left
+    out.
 
     Attributes:
-        arena: [N] the arena of each sub-environment.
+      arena: [N] the arena of each sub-environment.
     """
 
-    metadata = {  # noqa: RUF012  # Gymnasium's own form
+    metadata = {  # noqa: RUF012  # Gymnasium's form
         "autoreset_mode": _modes.SAME_STEP,
         "render_modes": [],
     }
@@ -52,15 +53,15 @@ class SwarmVectorEnv(_vector.VectorEnv):
         """Starts an episode in every arena.
 
         Args:
-            seed: of all levels to come; None goes on with those of the last one.
-            options: none are known; `reset_mask` is refused, since arenas reset themselves.
+          seed: seed of all following levels. None continues with the last seed.
+          options: unused. `reset_mask` is refused, since arenas reset themselves.
 
         Returns:
-            [N, O] observations, and no info.
+          [N, O] observations, and an empty info.
 
         Raises:
-            Error: the seed is no whole number, or some sub-environments alone are to be reset.
-            ClosedEnvironmentError: it was closed.
+          Error: if the seed is not an integer, or only some sub-environments should be reset.
+          ClosedEnvironmentError: if the environment was closed.
         """
         if seed is not None and not isinstance(seed, int | np.integer):
             raise errors.Error(f"seed is {seed!r}: all arenas share one seed, a whole number.")
@@ -75,15 +76,15 @@ class SwarmVectorEnv(_vector.VectorEnv):
         """Makes a control step.
 
         Args:
-            actions: [N, 2] speed and turn rate, floats; what is beyond -1..1 is clipped.
+          actions: [N, 2] speed and turn rate, floats, clipped to -1..1.
 
         Returns:
-            [N, O] observations, [N] rewards, terminations and truncations, and the info.
+          [N, O] observations, [N] rewards, terminations and truncations, and the info.
 
         Raises:
-            InvalidAction: the actions have a wrong shape or dtype.
-            ResetNeeded: it was never reset.
-            ClosedEnvironmentError: it was closed.
+          InvalidAction: if the actions have a wrong shape or dtype.
+          ResetNeeded: if the environment was never reset.
+          ClosedEnvironmentError: if the environment was closed.
         """
         came = self._session.step(actions)
         every = np.ones(self.num_envs, bool)
@@ -96,9 +97,9 @@ class SwarmVectorEnv(_vector.VectorEnv):
             info |= {"final_obs": final, "_final_obs": came.over}
             info |= {"final_info": valid, "_final_info": came.over}
         terminated = came.over & ~came.truncated
-        reward = came.reward.astype(np.float64)  # as Gymnasium's own vector environments
+        reward = came.reward.astype(np.float64)  # as in Gymnasium's own vector environments
         return came.observation, reward, terminated, came.truncated, info
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Ends the session; `close` calls this."""
+        """Ends the session. `close` calls this method."""
         self._session.close()

@@ -1,4 +1,4 @@
-"""JaxMARL: the robots of one arena as a `MultiAgentEnv`, for `vmap` over arenas."""
+"""JaxMARL: the robots of one arena as a `MultiAgentEnv`. Use `vmap` for several arenas."""
 
 from functools import partial
 from typing import Any
@@ -17,16 +17,17 @@ _ByAgent = dict[str, Array]
 
 
 class SwarmMultiAgentEnv(_base):
-    """Each robot is an agent, `agent_0`, `agent_1` and so on.
+    """A JaxMARL environment with one agent per robot: `agent_0`, `agent_1` and so on.
 
         env = SwarmMultiAgentEnv(swarmjax.make_env("s1", arenas=1))
         observations, state = jax.vmap(env.reset)(jax.random.split(key, 64))
         observations, state, rewards, dones, info = jax.vmap(env.step)(keys, state, actions)
 
-    A robot that arrives is done, and stays so until all are or the time runs out, when `__all__`
-    is. Meanwhile it stands: its reward is 0, `info["valid"]` is False, and none of its actions is
-    available. `info` has arrays [N] over agents: `valid`, `terminated` (the robot arrived in this
-    step) and `truncated` (the time ran out on its way). `step` starts the next episode by itself.
+    A robot that arrives is done. The episode ends, and `__all__` is done, when all robots are done
+    or the time runs out. Until then an arrived robot stands still: its reward is 0, `info["valid"]`
+    is False, and none of its actions is available. `info` has arrays [N] over agents: `valid`,
+    `terminated` (the robot arrived in this step) and `truncated` (it ran out of time). `step`
+    starts the next episode automatically.
     """
 
     def __init__(self, swarm: Swarm) -> None:
@@ -41,12 +42,12 @@ class SwarmMultiAgentEnv(_base):
 
     @property
     def agent_classes(self) -> dict[str, list[str]]:
-        """All are robots of one kind."""
+        """Classes of agents: all are robots of one kind."""
         return {"robot": self.agents}
 
     @partial(jax.jit, static_argnums=0)
     def reset(self, key: Array) -> tuple[_ByAgent, SwarmState]:
-        """Starts an episode; returns [O] observations by agent, and the state."""
+        """Starts an episode, and returns [O] observations by agent and the state."""
         state = self.robots.swarm.reset(key)
         return self.get_obs(state), state
 
@@ -58,21 +59,21 @@ class SwarmMultiAgentEnv(_base):
         actions: _ByAgent,
         reset_state: SwarmState | None = None,
     ) -> tuple[_ByAgent, SwarmState, _ByAgent, _ByAgent, _ByAgent]:
-        """Makes a control step, and starts the next episode where this one ends.
+        """Makes a control step, and starts the next episode if this one ends.
 
         Args:
-            key: unused; the state has its own.
-            state: before.
-            actions: [2] floats by agent; what is beyond -1..1 is clipped.
-            reset_state: what to start from; None: a fresh level.
+          key: unused; the state has its own key.
+          state: the state before the step.
+          actions: [2] floats by agent, clipped to -1..1.
+          reset_state: the state to start the next episode from; None: a new level.
 
         Returns:
-            [O] observations by agent (of the next episode where `__all__` is done), the state,
-            rewards and dones by agent, and the info.
+          [O] observations by agent, the state, rewards and dones by agent, and the info. If
+          `__all__` is done, the observations belong to the next episode.
 
         Raises:
-            ValueError: an action is missing or has a wrong shape.
-            TypeError: an action is of a wrong dtype.
+          ValueError: if an action is missing or has a wrong shape.
+          TypeError: if an action has a wrong dtype.
         """
         _, state, rewards, dones, info = self.step_env(key, state, actions)
         if reset_state is not None:
@@ -83,18 +84,18 @@ class SwarmMultiAgentEnv(_base):
     def step_env(
         self, key: Array, state: SwarmState, actions: _ByAgent
     ) -> tuple[_ByAgent, SwarmState, _ByAgent, _ByAgent, _ByAgent]:
-        """As `step`, but the observation is the last one of the episode where that ends."""
+        """Does the same as `step`, but at an episode's end returns its last observation."""
         state, came = self.robots.step(state, self._stack(actions))
         info = {name: getattr(came, name) for name in ("valid", "terminated", "truncated")}
         dones = self._by_agent(_is_done(came)) | {"__all__": came.over[0]}
         return self._by_agent(came.last), state, self._by_agent(came.reward), dones, info
 
     def get_obs(self, state: SwarmState) -> _ByAgent:
-        """[O] what to act on, by agent."""
+        """Returns the [O] observations by agent."""
         return self._by_agent(self.robots.observe(state))
 
     def get_avail_actions(self, state: SwarmState) -> _ByAgent:
-        """[U] by agent: False where the robot stands and does not act."""
+        """Returns [U] by agent: False if the robot has arrived and does not act."""
         arrived = state.arenas.arrived[0, self.robots.index]
         free = ~arrived | (self.robots.swarm.world.task.arrival == "hold")
         return self._by_agent(jnp.repeat(free[:, None], self.robots.action_size, axis=1))
@@ -103,14 +104,14 @@ class SwarmMultiAgentEnv(_base):
         return {agent: x[i] for i, agent in enumerate(self.agents)}
 
     def _stack(self, actions: _ByAgent) -> Array:
-        """[N, U]."""
+        """Returns the actions of all agents, [N, U]."""
         if missing := sorted(set(self.agents) - set(actions)):
-            raise ValueError(f"actions lack {missing}: give one of each agent.")
+            raise ValueError(f"actions lack {missing}: give one for each agent.")
         for agent in self.agents:
             check(actions[agent], (self.robots.action_size,), f"{agent}: ")
         return jnp.stack([actions[agent] for agent in self.agents])
 
 
 def _is_done(came: RobotStep) -> Array:
-    """[N] who has ended: arrived now or before, or ran out of time."""
+    """Returns [N] whether each robot is done: it has arrived, or has run out of time."""
     return came.terminated | came.truncated | ~came.valid | came.over

@@ -1,11 +1,11 @@
-"""What adapters ask of another library, and of whoever uses it."""
+"""Imports other libraries for the adapters, and checks the actions that users pass to them."""
 
 import importlib
 from typing import Any
 
 
 def fault(action: Any, shape: tuple[int, ...]) -> str | None:
-    """Says in a sentence what is wrong with the shape or dtype of an action; None: nothing."""
+    """Describes what is wrong with an action's shape or dtype; None if nothing is."""
     if tuple(action.shape) != shape:
         return f"action has the shape {tuple(action.shape)}: give {shape}, speed and turn rate."
     if "float" not in str(action.dtype):
@@ -14,16 +14,16 @@ def fault(action: Any, shape: tuple[int, ...]) -> str | None:
 
 
 def check(action: Any, shape: tuple[int, ...], whose: str = "") -> None:
-    """Refuses an action, for libraries that have no errors of their own.
+    """Checks an action, for libraries without their own errors.
 
     Args:
-        action: what a robot or several are told.
-        shape: that it must have.
-        whose: put before the sentence.
+      action: action of one or several robots.
+      shape: the expected shape.
+      whose: prefix of the error message.
 
     Raises:
-        ValueError: it has another shape.
-        TypeError: it is of a wrong dtype.
+      ValueError: if the action has another shape.
+      TypeError: if the action has a wrong dtype.
     """
     if sentence := fault(action, shape):
         kind = ValueError if tuple(action.shape) != shape else TypeError
@@ -31,10 +31,10 @@ def check(action: Any, shape: tuple[int, ...], whose: str = "") -> None:
 
 
 def find(module: str, extra: str, name: str | None = None) -> Any:
-    """Imports a module of another library, or takes something out of it.
+    """Imports a module of another library, or one name from it.
 
     Raises:
-        ImportError: it is missing or too old; the sentence names the extra that brings it.
+      ImportError: if it is missing or too old. The message names the extra to install.
     """
     try:
         found = importlib.import_module(module)

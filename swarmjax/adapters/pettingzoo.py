@@ -14,7 +14,7 @@ _Floats = dict[str, np.ndarray]
 
 
 class SwarmParallelEnv(_base):
-    """Each robot is an agent, `robot_0`, `robot_1` and so on.
+    """A parallel environment with one agent per robot: `robot_0`, `robot_1` and so on.
 
         env = SwarmParallelEnv(swarmjax.make_env("s1", arenas=1))
         observations, infos = env.reset(seed=0)
@@ -22,16 +22,16 @@ class SwarmParallelEnv(_base):
             actions = {agent: env.action_space(agent).sample() for agent in env.agents}
             observations, rewards, terminations, truncations, infos = env.step(actions)
 
-    A robot that arrives is terminated and leaves `agents`; it stands where it is, and the others
-    drive on around it. When the time runs out, those that are left are truncated. With
-    `task.arrival=hold` all robots leave in the same step. Nothing resets by itself.
+    A robot that arrives is terminated and leaves `agents`. It stays where it is, and the others
+    drive around it. When the time runs out, the remaining agents are truncated. With
+    `task.arrival=hold` all robots leave in the same step. The environment never resets itself.
 
     Attributes:
-        agents: those that are on their way.
-        possible_agents: all robots.
+      agents: the robots that are still on their way.
+      possible_agents: all robots.
     """
 
-    metadata = {"name": "swarmjax_v0", "render_modes": []}  # noqa: RUF012  # PettingZoo's own form
+    metadata = {"name": "swarmjax_v0", "render_modes": []}  # noqa: RUF012  # PettingZoo's form
 
     def __init__(self, swarm: Swarm) -> None:
         """Raises ValueError if the swarm has several arenas."""
@@ -54,14 +54,17 @@ class SwarmParallelEnv(_base):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[_Floats, dict[str, dict[str, Any]]]:
-        """Starts an episode; raises ClosedEnvironmentError if it was closed.
+        """Starts an episode.
 
         Args:
-            seed: of all levels to come; None goes on with those of the last one.
-            options: none are known.
+          seed: seed of all following levels. None continues with the last seed.
+          options: unused.
 
         Returns:
-            [O] observations and no infos, by agent.
+          [O] observations and empty infos, by agent.
+
+        Raises:
+          ClosedEnvironmentError: if the environment was closed.
         """
         if seed is not None:
             self._random = np.random.default_rng(seed)
@@ -73,16 +76,16 @@ class SwarmParallelEnv(_base):
         """Makes a control step.
 
         Args:
-            actions: [2] floats by agent, of all in `agents`; those of robots that left are ignored.
+          actions: [2] floats by agent, for all in `agents`. Actions of robots that have left are
+            ignored.
 
         Returns:
-            Observations [O], rewards, terminations, truncations and infos, of the agents that
-            acted.
+          Observations [O], rewards, terminations, truncations and infos of the agents that acted.
 
         Raises:
-            InvalidAction: an action is missing, of no agent, or of a wrong shape or dtype.
-            ResetNeeded: no agent is left.
-            ClosedEnvironmentError: it was closed.
+          InvalidAction: if an action is missing, names no agent, or has a wrong shape or dtype.
+          ResetNeeded: if no agent is left.
+          ClosedEnvironmentError: if the environment was closed.
         """
         self._session.check_open()
         if not self.agents:
@@ -106,11 +109,11 @@ class SwarmParallelEnv(_base):
         self._session.close()
 
     def _stack(self, actions: dict[str, Any]) -> np.ndarray:
-        """[N, U] what all robots are told; 0 for those that stand."""
+        """Returns the actions of all robots, [N, U]; 0 for robots that have left."""
         size = self.action_spaces[self.possible_agents[0]].shape[0]
         stacked = np.zeros((len(self.possible_agents), size), np.float32)
         if wrong := (set(self.agents) - set(actions)) | (set(actions) - set(self.possible_agents)):
-            raise errors.InvalidAction(f"actions lack, or have too many, {sorted(wrong)}.")
+            raise errors.InvalidAction(f"actions are missing or not expected for {sorted(wrong)}.")
         for agent in self.agents:
             action = np.asarray(actions[agent])
             if sentence := fault(action, (size,)):

@@ -16,22 +16,24 @@ _config: Any = find("ml_collections.config_dict", "playground", "create")
 
 
 class SwarmMjxEnv(_playground.MjxEnv):
-    """One arena is one environment: a single policy sees and drives all of its robots.
+    """A Playground environment of one arena. A single policy sees and drives all its robots.
 
         environment = SwarmMjxEnv(swarmjax.make_env("s1", arenas=1))
         wrap = functools.partial(wrapper.wrap_for_brax_training, full_reset=True)
         ppo.train(environment, wrap_env_fn=wrap, episode_length=environment.episode_length, ...)
 
-    Playground has one agent an environment, and its wrappers map it. The observation is that of all
-    robots in a row, [N O], and so is the action, [N 2]; the reward is the sum of theirs. A robot
-    that has arrived stands and earns 0; what it is told is ignored. `done` says that all have
-    arrived, or that the physics broke. That the time ran out is left to Playground's wrapper, as
-    in its own environments: give it `episode_length`, no more. `full_reset=True` makes it draw new
-    levels, but Playground 0.2.0 then forgets that time ran out, and does not bootstrap; by default
-    it repeats the first level of each environment. To train a policy that each robot
-    has to itself, take `swarmjax.adapters.brax_env`.
+    Playground has one agent per environment, and its wrappers map over environments. The
+    observation joins those of all robots, [N O], and the action does the same, [N 2]. The reward is
+    the sum over robots. A robot that has arrived stands still: it earns 0, and its actions are
+    ignored. `done` means that all robots have arrived, or that the physics broke.
 
-    `state.data` is a `SwarmState`, so `render` is not there: see `swarmjax.replay`.
+    Playground's wrapper handles the time limit, as for its own environments. Give the wrapper an
+    `episode_length` no larger than the environment's. With `full_reset=True` it draws new levels,
+    but then Playground 0.2.0 ignores that time ran out, and does not bootstrap. By default it
+    repeats the first level of each environment. For a policy that controls one robot, use
+    `swarmjax.adapters.brax_env`.
+
+    `state.data` is a `SwarmState`, so `render` is not supported. Use `swarmjax.replay`.
     """
 
     def __init__(self, swarm: Swarm) -> None:
@@ -51,10 +53,10 @@ class SwarmMjxEnv(_playground.MjxEnv):
         """Starts an episode.
 
         Args:
-            rng: random key.
+          rng: random key.
 
         Returns:
-            Playground's state.
+          Playground's state.
         """
         state, nothing = self.robots.swarm.reset(rng), jnp.zeros(())
         metrics = {"reached": nothing}
@@ -65,15 +67,15 @@ class SwarmMjxEnv(_playground.MjxEnv):
         """Makes a control step.
 
         Args:
-            state: before.
-            action: [N 2] speed and turn rate of each robot, floats; beyond -1..1 is clipped.
+          state: the state before the step.
+          action: [N 2] speed and turn rate of each robot, floats, clipped to -1..1.
 
         Returns:
-            The state after; `metrics["reached"]` is the share of the robots that arrived in it.
+          The state after the step. `metrics["reached"]` is the share of robots that arrived in it.
 
         Raises:
-            ValueError: the action has a wrong shape.
-            TypeError: the action is of a wrong dtype.
+          ValueError: if the action has a wrong shape.
+          TypeError: if the action has a wrong dtype.
         """
         check(action, (self.action_size,))
         late = state.data.arenas.clock[0] + 1 >= self.episode_length
@@ -89,12 +91,12 @@ class SwarmMjxEnv(_playground.MjxEnv):
 
     @property
     def xml_path(self) -> str:
-        """None: the model is made by code."""
+        """Empty: the model is built by code."""
         return ""
 
     @property
     def action_size(self) -> int:
-        """Those of all robots: two each, and what they broadcast."""
+        """Size of the action of all robots: two numbers each, plus their messages."""
         return self.robots.action_size * len(self.robots)
 
     @property
@@ -104,7 +106,7 @@ class SwarmMjxEnv(_playground.MjxEnv):
 
     @functools.cached_property
     def mjx_model(self) -> Any:
-        """The model on the device, made when it is first asked for."""
+        """The model on the device, made on first use."""
         return find("mujoco.mjx", "playground").put_model(self.mj_model)
 
     def render(self, *args: Any, **kwargs: Any) -> Any:

@@ -1,6 +1,6 @@
-"""The robots of all arenas in a row, as libraries for one agent an environment want them.
+"""Lists the robots of all arenas in one row, for libraries with one agent per environment.
 
-Axes: A arenas, R robots of an arena, O observation, N robots that take part, of all arenas.
+Axes: A arenas, R robots of an arena, O observation, N present robots in all arenas.
 """
 
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ class RobotStep(NamedTuple):
     """The outcome of a control step, robot by robot.
 
     Attributes:
-        observation: [N, O] act on this: of the next episode where `over`.
-        last: [N, O] the observation after the step, before any reset.
-        reward: [N] 0 for robots that had arrived and stand.
-        terminated: [N] the robot arrived in this step.
-        truncated: [N] the time ran out on its way.
-        valid: [N] the robot was on its way: learn from these.
-        over: [N] the episode of the robot's arena ended.
+      observation: [N, O] the observation to act on. If `over`, it belongs to the next episode.
+      last: [N, O] the observation after the step, before any reset.
+      reward: [N] the reward; 0 for robots that had already arrived.
+      terminated: [N] whether the robot arrived in this step.
+      truncated: [N] whether the robot ran out of time.
+      valid: [N] whether the robot was on its way. Learn only from these steps.
+      over: [N] whether the episode of the robot's arena ended.
     """
 
     observation: Any
@@ -37,11 +37,11 @@ class RobotStep(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RobotRow:
-    """The robots of a swarm, without the places of absent ones.
+    """The robots of a swarm in one row, without absent robots.
 
     Attributes:
-        swarm: of `swarmjax.make_env`.
-        index: [N] of the places [A R] where there is a robot, ascending.
+      swarm: the result of `swarmjax.make_env`.
+      index: [N] indices of the present robots among all A * R places, ascending.
     """
 
     swarm: Swarm
@@ -57,22 +57,22 @@ class RobotRow:
 
     @property
     def action_size(self) -> int:
-        """Numbers of one robot's action, U: the command, then what it broadcasts, if it does."""
+        """Size of a robot's action, U: the command, then its message, if it sends one."""
         return self.swarm.world.action_size
 
     def observe(self, state: SwarmState) -> Array:
-        """[N, O] what to act on."""
+        """Returns the [N, O] observations to act on."""
         return self._gather(state.observation)
 
     def step(self, state: SwarmState, action: Array) -> tuple[SwarmState, RobotStep]:
-        """Moves all arenas on by one control step; those whose episode ends start another.
+        """Steps all arenas once. Arenas whose episode ends start the next one.
 
         Args:
-            state: before.
-            action: [N, U], -1..1 spans the commands; what is beyond is clipped.
+          state: the state before the step.
+          action: [N, U] actions, clipped to -1..1, which spans the range of commands.
 
         Returns:
-            The state after, and the outcome.
+          The state after the step, and the outcome.
         """
         arenas, robots = self.swarm.num_arenas, self.swarm.num_robots
         places = jnp.zeros((arenas * robots, self.action_size)).at[self.index].set(action)
@@ -88,22 +88,22 @@ class RobotRow:
         )
 
     def _gather(self, x: Array) -> Array:
-        """[A, R, ...] to [N, ...]."""
+        """Selects the present robots, from [A, R, ...] to [N, ...]."""
         return x.reshape(-1, *x.shape[2:])[self.index]
 
 
 def line_up(swarm: Swarm) -> RobotRow:
-    """Lists the robots of a swarm; arena i plays stage i modulo their number."""
+    """Lists the robots of a swarm. Arena i plays stage i modulo the number of stages."""
     stage = np.arange(swarm.num_arenas) % len(swarm.stages.robots)
     present = np.arange(swarm.num_robots) < np.asarray(swarm.stages.robots)[stage][:, None]
     return RobotRow(swarm, np.flatnonzero(present))
 
 
 def line_up_arena(swarm: Swarm) -> RobotRow:
-    """Lists the robots of a swarm of one arena.
+    """Lists the robots of a swarm with one arena.
 
     Raises:
-        ValueError: there are more arenas.
+      ValueError: if there are more arenas.
     """
     if swarm.num_arenas != 1:
         raise ValueError(

@@ -14,23 +14,23 @@ _base: Any = find("stable_baselines3.common.vec_env", "sb3", "VecEnv")
 
 
 class SwarmVecEnv(_base):
-    """Each robot is an environment of the VecEnv; all share the policy.
+    """A VecEnv with one environment per robot. All share the policy.
 
         model = PPO("MlpPolicy", SwarmVecEnv(swarmjax.make_env("s1", arenas=16)))
         model.learn(500_000)
 
-    That is what SuperSuit makes of robots that leave, with `black_death`. The robots of an arena
-    are done together, when its episode ends. One that has arrived stands until then: its reward is
-    0, and what it is told is ignored; its steps stay in the batch. In the last step, `infos` have
-    `terminal_observation`, and `TimeLimit.truncated` where the time ran out on the robot's way.
-    The observation is then that of the next episode. Absent robots are left out.
+    Robots that have arrived are handled as by SuperSuit's `black_death`. All robots of an arena are
+    done together, when its episode ends. A robot that has arrived stands still until then: its
+    reward is 0, its actions are ignored, and its steps stay in the batch. In the last step, each
+    info has `terminal_observation`. Its `TimeLimit.truncated` says whether the robot ran out of
+    time. The returned observation then belongs to the next episode. Absent robots are left out.
 
     Attributes:
-        arena: [N] the arena of each environment.
-        valid: [N] whether the robot was on its way in the last step.
+      arena: [N] the arena of each environment.
+      valid: [N] whether the robot was on its way in the last step.
     """
 
-    render_mode = None  # the base class overwrites it with itself
+    render_mode = None  # the base class reads it and assigns it again
 
     def __init__(self, swarm: Swarm) -> None:
         robots = line_up(swarm)
@@ -42,13 +42,13 @@ class SwarmVecEnv(_base):
         super().__init__(len(robots), *spaces(robots))
 
     def reset(self) -> np.ndarray:
-        """Starts an episode in every arena, by the seed given to `seed`, if any.
+        """Starts an episode in every arena, with the seed given to `seed`, if any.
 
         Returns:
-            [N, O] observations.
+          [N, O] observations.
 
         Raises:
-            ClosedEnvironmentError: of Gymnasium; it was closed.
+          gymnasium.error.ClosedEnvironmentError: if the environment was closed.
         """
         if self._seeds[0] is not None:
             self._random = np.random.default_rng(self._seeds[0])
@@ -61,12 +61,12 @@ class SwarmVecEnv(_base):
         """Starts a control step.
 
         Args:
-            actions: [N, 2] speed and turn rate, floats; what is beyond -1..1 is clipped.
+          actions: [N, 2] speed and turn rate, floats, clipped to -1..1.
 
         Raises:
-            InvalidAction: of Gymnasium; the actions have a wrong shape or dtype.
-            ResetNeeded: of Gymnasium; it was never reset.
-            ClosedEnvironmentError: of Gymnasium; it was closed.
+          gymnasium.error.InvalidAction: if the actions have a wrong shape or dtype.
+          gymnasium.error.ResetNeeded: if the environment was never reset.
+          gymnasium.error.ClosedEnvironmentError: if the environment was closed.
         """
         self._came = self._session.begin(actions)
 
@@ -74,10 +74,10 @@ class SwarmVecEnv(_base):
         """Waits for the step.
 
         Returns:
-            [N, O] observations, [N] rewards, [N] dones and the infos.
+          [N, O] observations, [N] rewards, [N] dones and the infos.
 
         Raises:
-            NoAsyncCallError: of Gymnasium; no step was started.
+          gymnasium.error.NoAsyncCallError: if no step was started.
         """
         self._session.check_open()
         if self._came is None:
@@ -97,19 +97,19 @@ class SwarmVecEnv(_base):
         self._session.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Reads an attribute, the same for all environments."""
+        """Reads an attribute, which is the same for all environments."""
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Raises AttributeError: the environments are one program."""
+        """Raises AttributeError, since all environments are one program."""
         raise AttributeError(f"{attr_name} cannot be set: the robots are stepped by one program.")
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Raises AttributeError: the environments are one program."""
+        """Raises AttributeError, since all environments are one program."""
         raise AttributeError(f"{method_name} cannot be called: one program steps the robots.")
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> Sequence[bool]:
-        """None is."""
+        """Returns False for each environment: none is wrapped."""
         return [False for _ in self._get_indices(indices)]

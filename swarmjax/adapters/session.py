@@ -1,6 +1,6 @@
-"""Steps the robots of a swarm from the host, in NumPy, for libraries that live there.
+"""Steps the robots of a swarm from the host with NumPy arrays, for libraries that use them.
 
-They have Gymnasium's errors, which Gymnasium, PettingZoo and Stable-Baselines3 raise alike.
+All errors are Gymnasium's, for Gymnasium, PettingZoo and Stable-Baselines3 alike.
 """
 
 from typing import Any
@@ -23,7 +23,7 @@ def spaces(robots: RobotRow) -> tuple[Any, Any]:
 
 
 class Session:
-    """What is stepped, and whether it was reset and closed."""
+    """Steps the robots, and checks that the environment was reset and not closed."""
 
     def __init__(self, robots: RobotRow) -> None:
         self._robots = robots
@@ -35,13 +35,13 @@ class Session:
         """Starts an episode in every arena.
 
         Args:
-            seed: of the levels, not negative.
+          seed: seed of the levels, 0 or more.
 
         Returns:
-            [N, O] what to act on.
+          [N, O] observations to act on.
 
         Raises:
-            ClosedEnvironmentError: it was closed.
+          ClosedEnvironmentError: if the environment was closed.
         """
         self.check_open()
         state: SwarmState = self._reset(jax.random.key(seed))
@@ -52,15 +52,15 @@ class Session:
         """Starts a control step, and does not wait for it.
 
         Args:
-            action: [N, U] floats; what is beyond -1..1 is clipped.
+          action: [N, U] floats, clipped to -1..1.
 
         Returns:
-            What it comes to, on the device.
+          The outcome, on the device.
 
         Raises:
-            ClosedEnvironmentError: it was closed.
-            ResetNeeded: it was never reset.
-            InvalidAction: the action has a wrong shape or dtype.
+          ClosedEnvironmentError: if the environment was closed.
+          ResetNeeded: if the environment was never reset.
+          InvalidAction: if the action has a wrong shape or dtype.
         """
         self.check_open()
         if self._state is None:
@@ -72,15 +72,15 @@ class Session:
         return came
 
     def step(self, action: Any) -> RobotStep:
-        """Makes a control step, as `begin` does; returns arrays of NumPy's, the caller's own."""
+        """Makes a control step as `begin` does, and returns NumPy arrays that the caller owns."""
         return fetch(self.begin(action))
 
     def close(self) -> None:
-        """Lets go of the state; nothing else may be called afterwards."""
+        """Releases the state. No other method may be called afterwards."""
         self._state, self._closed = None, True
 
     def check_open(self) -> None:
-        """Raises ClosedEnvironmentError if it was closed."""
+        """Raises ClosedEnvironmentError if the environment was closed."""
         if self._closed:
             raise errors.ClosedEnvironmentError("The environment was closed: make another one.")
 

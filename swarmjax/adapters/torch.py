@@ -1,4 +1,4 @@
-"""PyTorch: the robots of all arenas, stepped with tensors that are never copied."""
+"""PyTorch: steps the robots of all arenas with tensors, without copying them."""
 
 from typing import Any
 
@@ -12,23 +12,23 @@ _torch: Any = find("torch", "torch")
 
 
 class SwarmTorchEnv:
-    """Steps with PyTorch's tensors, which are JAX's own memory (DLPack), on a CPU and on a GPU.
+    """Steps with PyTorch tensors that share JAX's memory (DLPack), on a CPU or a GPU.
 
         env = SwarmTorchEnv(swarmjax.make_env("s1", arenas=64))
         observation = env.reset(seed=0)  # [N, O]
         came = env.step(policy(observation))  # [N, 2]
 
-    Each robot is a row; all may share a policy. A step returns `RobotStep`: act on `observation`,
-    bootstrap from `last` where `truncated`, learn where `valid`. A robot is `terminated` in the
-    step in which it arrives; from then on it is not `valid` and its reward is 0, until its arena is
-    `over` and starts the next episode by itself. Absent robots are left out.
+    Each robot is a row. All may share a policy. A step returns a `RobotStep`: act on `observation`,
+    bootstrap from `last` where `truncated`, and learn where `valid`. A robot is `terminated` in the
+    step in which it arrives. After that it is not `valid` and its reward is 0, until its arena is
+    `over` and starts the next episode automatically. Absent robots are left out.
 
-    JAX takes its arrays for unchangeable: do not write into a tensor that came from here, and not
-    into an action before the next step has returned. Actions are read without gradients, and from
-    the device on which JAX computes.
+    JAX assumes that its arrays never change. So do not write into a tensor from here, or into an
+    action before the next step has returned. Actions are read without gradients, from the device on
+    which JAX computes.
 
     Attributes:
-        arena: [N] the arena of each row.
+      arena: [N] the arena of each row.
     """
 
     def __init__(self, swarm: Swarm) -> None:
@@ -46,13 +46,13 @@ class SwarmTorchEnv:
         """Starts an episode in every arena.
 
         Args:
-            seed: of the levels, not negative.
+          seed: seed of the levels, 0 or more.
 
         Returns:
-            [N, O] a tensor to act on.
+          [N, O] tensor of observations to act on.
 
         Raises:
-            ValueError: it was closed.
+          ValueError: if the environment was closed.
         """
         self._check_open()
         state: SwarmState = self._reset(jax.random.key(seed))
@@ -63,14 +63,14 @@ class SwarmTorchEnv:
         """Makes a control step.
 
         Args:
-            action: [N, U] float32 tensor; what is beyond -1..1 is clipped.
+          action: [N, U] float32 tensor, clipped to -1..1.
 
         Returns:
-            Tensors.
+          The outcome, as tensors.
 
         Raises:
-            ValueError: the action has a wrong shape, or it was closed or never reset.
-            TypeError: the action is of a wrong dtype.
+          ValueError: if the action has a wrong shape, or the environment was closed or never reset.
+          TypeError: if the action has a wrong dtype.
         """
         self._check_open()
         if self._state is None:
@@ -80,7 +80,7 @@ class SwarmTorchEnv:
         return RobotStep(*map(to_torch, came))
 
     def close(self) -> None:
-        """Lets go of the state; nothing else may be called afterwards."""
+        """Releases the state. No other method may be called afterwards."""
         self._state, self._closed = None, True
 
     def _check_open(self) -> None:
@@ -89,14 +89,14 @@ class SwarmTorchEnv:
 
 
 def to_torch(array: jax.Array) -> Any:
-    """Shows an array of JAX's to PyTorch, without a copy: do not write into the tensor."""
+    """Gives PyTorch a JAX array without copying it. Do not write into the tensor."""
     return _torch.from_dlpack(array)
 
 
 def to_jax(tensor: Any) -> jax.Array:
-    """Shows a tensor to JAX, without its gradient.
+    """Gives JAX a tensor without its gradient.
 
-    It is not copied if its memory is in one piece and, on a CPU, begins at a multiple of 64 bytes,
-    as that of whole tensors of PyTorch's does.
+    The tensor is not copied if its memory is contiguous. On a CPU it must also begin at a multiple
+    of 64 bytes. Whole PyTorch tensors do.
     """
     return jax.dlpack.from_dlpack(tensor.detach().contiguous())

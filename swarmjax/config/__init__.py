@@ -1,9 +1,9 @@
-"""Settings without a subject: the strict converter, and the files of configs/ put together.
+"""Loads and checks settings of any kind: a strict converter, and a composer for configs/.
 
-`section.py` turns plain data into frozen dataclasses and refuses mistakes in one sentence each;
-`files.py` composes the files of configs/ with the words of a command line. Every section of
-settings lies in the room that it configures, in its `config.py`. This room imports none of the
-others. Start with `section.build`.
+`section.py` turns plain data into frozen dataclasses, and refuses each mistake in one sentence.
+`files.py` composes the files of configs/ with the words of a command line. Each section of settings
+lies in the `config.py` of the package that it configures. This package imports none of the others.
+Start with `section.build`.
 """
 
 from swarmjax.config.section import ConfigError, Section, about, build, show, to_dict

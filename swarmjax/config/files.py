@@ -1,8 +1,7 @@
-"""From the files of configs/ and the words of a command line to plain data, through Hydra.
+"""Composes the files of configs/ and the words of a command line into plain data, with Hydra.
 
-Hydra composes the YAML files with the `key=value` words and nothing else: it sets up no logging
-and changes no directory, and is imported when it is used. What comes out is for
-`section.build`.
+Hydra only composes the YAML files with the `key=value` words. It sets up no logging, does not
+change the directory, and is imported on first use. `section.build` takes the result.
 """
 
 import contextlib
@@ -22,32 +21,32 @@ if TYPE_CHECKING:
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
-# Of a word of the command line: longer ones take Hydra's grammar seconds to read.
+# Limits on a word of the command line. Hydra's grammar takes seconds to read longer ones.
 _MOST_KEY = 200  # letters
-_MOST_VALUE = 5000
-_MOST_DEPTH = 32  # brackets in one another
-# In all words: each may stand for several others, so that a few more would fill the memory.
+_MOST_VALUE = 5000  # letters
+_MOST_DEPTH = 32  # nested brackets
+# In all words together. A reference may contain several others, so a few more fill the memory.
 _MOST_REFERENCES = 16
 
-# Given what was composed and the choice of each group: the keys and values to check.
+# Takes the composed data and the choice of each group, and returns the keys and values to check.
 Complete = Callable[[dict[str, Any], dict[str, str]], dict[str, Any]]
 
 
 def compose(
     cls: type[Section], command: str, overrides: Sequence[str]
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Let Hydra put the files and the words together.
+    """Composes a command's files and words with Hydra.
 
     Args:
-        cls: the command's dataclass, for the keys it has.
-        command: name of its file in configs/.
-        overrides: `key=value` words.
+      cls: the command's dataclass, which defines its keys.
+      command: name of its file in configs/.
+      overrides: `key=value` words.
 
     Returns:
-        The keys and values that were given anywhere, and the choice of each group.
+      The keys and values from all sources, and the choice of each group.
 
     Raises:
-        ConfigError: a word, a choice or a file is unsound.
+      ConfigError: if a word, a choice or a file is invalid.
     """
     words = split_words(cls, overrides)
     groups = {key: choice_of(word) for key, word in words.items() if choices(key)}
@@ -57,7 +56,7 @@ def compose(
     for key in words.keys() - groups.keys():
         _parse(words[key])
     for group, choice in (defaults(command) | groups).items():
-        read_choice(group, choice)  # names a broken file, where Hydra would not
+        read_choice(group, choice)  # its error names a broken file; Hydra's does not
     forced = [word if key in groups else f"++{word}" for key, word in words.items()]
     composed, chosen = _hydra(command, [word for word in forced if not _is_of(word, own)])
     mapping = _resolve(composed)
@@ -68,22 +67,22 @@ def compose(
 
 
 def choice_of(word: str) -> str:
-    """Return the choice that a word makes for a group."""
+    """Returns the choice that a word makes for a group."""
     return word.partition("=")[2].strip("'\"")
 
 
 def is_path(choice: str) -> bool:
-    """Tell whether the choice of a group is a file of the user's rather than one of configs/."""
+    """Returns whether the choice of a group is a user's file, and not a name in configs/."""
     return choice.endswith((".yaml", ".yml"))
 
 
 def _is_of(word: str, groups: Mapping[str, str]) -> bool:
-    """Tell whether a word chooses one of these groups, or sets a key in it."""
+    """Returns whether a word chooses a file for one of these groups, or sets a key in one."""
     return word.removeprefix("++").partition("=")[0].partition(".")[0] in groups
 
 
 def _merge(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Set keys of nested plain data, leaving the others."""
+    """Returns nested plain data with some keys replaced."""
     found = dict(base)
     for key, value in over.items():
         inner = found.get(key)
@@ -94,19 +93,19 @@ def _merge(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def load[C: Section](cls: type[C], overrides: Sequence[str], complete: Complete | None = None) -> C:
-    """Makes a command's settings from its files and its `key=value` words: every command's loader.
+    """Makes a command's settings from its files and its `key=value` words. All commands use it.
 
     Args:
-        cls: the command's dataclass; its `command` names the file in configs/.
-        overrides: the words.
-        complete: given what was composed and the choice of each group, returns the keys and values
-            to check; None checks what was composed.
+      cls: the command's dataclass. Its `command` names the file in configs/.
+      overrides: the words.
+      complete: takes the composed data and the choice of each group, and returns the keys and
+        values to check. None checks the composed data.
 
     Returns:
-        The settings.
+      The settings.
 
     Raises:
-        ConfigError: a word, a choice, a file or a value is unsound.
+      ConfigError: if a word, a choice, a file or a value is invalid.
     """
     mapping, chosen = compose(cls, cls.command, overrides)
     return section.build(cls, complete(mapping, chosen) if complete else mapping)
@@ -116,12 +115,12 @@ def load[C: Section](cls: type[C], overrides: Sequence[str], complete: Complete 
 
 
 def choices(group: str) -> list[str]:
-    """Return the names of a group's files, or none if it is no group."""
+    """Returns the names of a group's files; empty if it is not a group."""
     return sorted(path.stem for path in (_config_dir() / group).glob("*.yaml"))
 
 
 def defaults(command: str) -> dict[str, str]:
-    """Return the groups of a command and the choices that its file makes."""
+    """Returns the groups of a command and the choices in its file."""
     entries = read_file(command).get("defaults", [])
     return {
         str(group): str(choice)
@@ -132,7 +131,7 @@ def defaults(command: str) -> dict[str, str]:
 
 
 def describe_groups(cls: type[Section]) -> list[str]:
-    """Return a line for each group of a command: its default and its choices."""
+    """Returns a line for each group of a command: its default and its choices."""
     found = defaults(cls.command) | {
         group: f"<{text}>" for group, text in cls.inherited.items() if choices(group)
     }
@@ -143,11 +142,11 @@ def describe_groups(cls: type[Section]) -> list[str]:
 
 
 def _config_dir() -> Path:
-    """Find configs/: at the root of the source tree, otherwise inside the installed package."""
+    """Finds configs/: at the root of the source tree, otherwise inside the installed package."""
     root = _PACKAGE.parent
     source, installed = root / "configs", _PACKAGE / "configs"
-    # The folder above an installed package holds other packages too, so a folder configs/ there
-    # is ours only beside the project file.
+    # The folder above an installed package also holds other packages. A folder configs/ there is
+    # ours only if the project file is next to it.
     if (root / "pyproject.toml").is_file() and source.is_dir():
         return source
     if installed.is_dir():
@@ -156,64 +155,66 @@ def _config_dir() -> Path:
 
 
 def read_file(name: str) -> dict[str, Any]:
-    """Read one file of configs/ as it stands.
+    """Reads one file of configs/ without composing it.
 
     Args:
-        name: its path there without the ending, such as `stage/s6`.
+      name: its path there without the ending, such as `stage/s6`.
 
     Raises:
-        ConfigError: it cannot be read.
+      ConfigError: if it cannot be read.
     """
     return read_yaml(_config_dir() / f"{name}.yaml")
 
 
 def read_choice(group: str, choice: str) -> dict[str, Any]:
-    """Read the file that the choice of a group names.
+    """Reads the file that the choice of a group names.
 
     Args:
-        group: a folder of configs/.
-        choice: the name of a file in it, or the path of another file.
+      group: a folder of configs/.
+      choice: the name of a file in it, or the path of another file.
 
     Raises:
-        ConfigError: it cannot be read, or is a file of the user's that chooses other files.
+      ConfigError: if it cannot be read, or if it is a user's file that chooses other files.
     """
     if not is_path(choice):
         return read_file(f"{group}/{choice}")
     section.check_text(group, choice)
     found = read_yaml(Path(choice))
     if "defaults" in found:
-        raise ConfigError(f"{choice} has defaults, which only files of configs/ may have: drop it.")
+        raise ConfigError(
+            f"{choice} has defaults, which only files of configs/ may have: remove it."
+        )
     return found
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a file of keys and values as it stands.
+    """Reads a file of keys and values without composing it.
 
     Raises:
-        ConfigError: it cannot be read, or is nothing of the kind.
+      ConfigError: if it cannot be read, or does not hold keys and values.
     """
     mapping = reading.read_yaml(path)
     if mapping is None:
         return {}
     if not isinstance(mapping, dict):
         raise ConfigError(
-            f"{reading.called(path)} is no list of keys and values: write key: value."
+            f"{reading.called(path)} is not a list of keys and values: write key: value."
         )
     return {str(key): value for key, value in mapping.items()}
 
 
 def read_preset(group: str, choice: str) -> dict[str, Any]:
-    """Read a file of a group that stands for itself, such as `realism` and `real`.
+    """Reads a preset, which is one file of a group, such as `real` of the group `realism`.
 
     Raises:
-        ConfigError: there is none of this name.
+      ConfigError: if there is no such file.
     """
     check_choice(group, choice, group)
     return read_file(f"{group}/{choice}")
 
 
 def preset_of(group: str, held: Section) -> str:
-    """Name the file of a group whose numbers a section has, or `custom` if there is none."""
+    """Returns the name of the preset whose values a section has, or `custom` if there is none."""
     derived = section.keys(type(held), derived=True)
 
     def numbers(of: Section) -> dict[str, Any]:
@@ -226,10 +227,10 @@ def preset_of(group: str, held: Section) -> str:
 
 
 def suite_path(choice: str) -> Path:
-    """Return the file of a suite: of this name in configs/suites/, or at this path.
+    """Returns the file of a suite, given its name in configs/suites/ or its path.
 
     Raises:
-        ConfigError: there is no such suite.
+      ConfigError: if there is no such suite.
     """
     section.check_text("suite", choice)
     path = Path(choice)
@@ -244,15 +245,15 @@ def _example(group: str) -> str:
 
 
 def check_choice(group: str, choice: str, key: str) -> None:
-    """Refuse a choice that is no file of a group.
+    """Refuses a choice that is not a file of a group.
 
     Args:
-        group: a folder of configs/.
-        choice: the name of a file in it, or the path of another file.
-        key: what a sentence calls it.
+      group: a folder of configs/.
+      choice: the name of a file in it, or the path of another file.
+      key: its name in messages.
 
     Raises:
-        ConfigError: there is none of this name.
+      ConfigError: if there is no such file.
     """
     names = choices(group)
     if is_path(choice):
@@ -260,7 +261,7 @@ def check_choice(group: str, choice: str, key: str) -> None:
         if not Path(choice).exists():
             raise ConfigError(f"{key} is {show(choice)}, and there is no such file.")
     elif choice not in names:
-        # Names as short as s7 and s6 share half their letters, below difflib's own cutoff of 0.6.
+        # Short names such as s7 and s6 share half their letters. difflib's default requires 0.6.
         near = difflib.get_close_matches(choice, names, n=1, cutoff=0.5)
         hint = f" (nearest: {near[0]})" if near else ""
         file = ", or a file .yaml" if group == "stage" else ""
@@ -271,18 +272,18 @@ def check_choice(group: str, choice: str, key: str) -> None:
 
 
 def split_words(cls: type[Section], overrides: Sequence[str]) -> dict[str, str]:
-    """Return the words of a command line by key; of a key given twice, the last.
+    """Returns the words of a command line by key. If a key is given twice, the last word counts.
 
     Args:
-        cls: the command's dataclass.
-        overrides: `key=value` words.
+      cls: the command's dataclass.
+      overrides: `key=value` words.
 
     Returns:
-        The words, texts in them quoted for Hydra's grammar.
+      The words, with text quoted for Hydra's grammar.
 
     Raises:
-        ConfigError: a word is no `key=value`, begins with a key that `cls` does not have, or sets
-            what the choice of a file sets.
+      ConfigError: if a word is not `key=value`, has a key that `cls` does not have, or sets a key
+        that only the choice of a file sets.
     """
     roots, derived = section.names(cls), section.keys(cls, derived=True)
     words = {}
@@ -300,12 +301,12 @@ def split_words(cls: type[Section], overrides: Sequence[str]) -> dict[str, str]:
     for key, word in words.items():
         _check_word(key, word, is_text=key in texts)
     if sum(word.count("${") for word in words.values()) > _MOST_REFERENCES:
-        raise ConfigError(f"the words refer to others by ${{...}}: do so {_MOST_REFERENCES} times.")
+        raise ConfigError(f"the words use ${{...}} too often: give at most {_MOST_REFERENCES}.")
     return {key: _quote(word) if key in texts else word for key, word in words.items()}
 
 
 def _check_word(key: str, word: str, *, is_text: bool) -> None:
-    """Refuse what would keep Hydra's grammar busy, or what no text may be."""
+    """Refuses words that would take Hydra's grammar too long, and invalid text."""
     value = word.partition("=")[2]
     if is_text or choices(key):
         section.check_text(key, value)
@@ -314,25 +315,23 @@ def _check_word(key: str, word: str, *, is_text: bool) -> None:
             f"{key} is {show(value)}, of {len(value)} letters: give at most {_MOST_VALUE}."
         )
     elif _depth(value) > _MOST_DEPTH:
-        raise ConfigError(
-            f"{key} is {show(value)}: give at most {_MOST_DEPTH} lists in one another."
-        )
+        raise ConfigError(f"{key} is {show(value)}: nest lists at most {_MOST_DEPTH} deep.")
 
 
 def _depth(value: str) -> int:
-    """Count the brackets of a word that are open at once."""
+    """Returns the maximum depth of nested brackets in a word."""
     steps = (("[{(".count(letter)) - ("]})".count(letter)) for letter in value)
     return max(itertools.accumulate(steps), default=0)
 
 
 def values(words: Mapping[str, str]) -> dict[str, Any]:
-    """Return the values of words as nested plain data.
+    """Returns the values of words as nested plain data.
 
     Args:
-        words: as `split_words` returns them.
+      words: the words, as `split_words` returns them.
 
     Raises:
-        ConfigError: Hydra's grammar has no value for a word, or two words contradict each other.
+      ConfigError: if Hydra's grammar cannot read a word, or two words contradict each other.
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
@@ -348,7 +347,7 @@ def values(words: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _quote(word: str) -> str:
-    """Quote a text for Hydra's grammar, so that a path may hold `=`, a comma or a space."""
+    """Quotes a text for Hydra's grammar, so that a path may contain `=`, a comma or a space."""
     key, _, value = word.partition("=")
     if value in ("", "null") or value[0] in "'\"":
         return word
@@ -356,21 +355,21 @@ def _quote(word: str) -> str:
 
 
 def quote(text: str) -> str:
-    """Write a text so that Hydra's grammar reads it as it is."""
+    """Quotes a text so that Hydra's grammar reads it unchanged."""
     from hydra.core.override_parser.types import Quote, QuotedString
 
     return QuotedString(text=text, quote=Quote.single).with_quotes()
 
 
 def _parse(word: str) -> object:
-    """Parse one word with Hydra's grammar and return its value."""
+    """Parses one word with Hydra's grammar and returns its value."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
     key = word.partition("=")[0]
     try:
         parsed = OverridesParser.create().parse_override(f"++{word}")
-    except (ValueError, OverflowError):  # of a number that is too long, as Hydra does not say
+    except (ValueError, OverflowError):  # a number is too long; Hydra has no error for this
         raise ConfigError(f"{show(word)} cannot be used: give a number of fewer digits.") from None
     except HydraException:
         raise ConfigError(
@@ -388,9 +387,9 @@ def _parse(word: str) -> object:
 
 
 def _hydra(command: str, overrides: list[str]) -> tuple["DictConfig", dict[str, str]]:
-    """Compose in a Hydra of our own, and leave one that the caller may have as it was.
+    """Composes with a separate Hydra instance, and restores the caller's, if there is one.
 
-    The choice of each group comes from Hydra too: a file may choose those of other groups.
+    Hydra also returns the choice of each group, because a file may choose files of other groups.
     """
     import hydra
     from hydra.core.global_hydra import GlobalHydra
@@ -419,7 +418,7 @@ def _hydra(command: str, overrides: list[str]) -> tuple["DictConfig", dict[str, 
 
 @contextlib.contextmanager
 def _explained(words: Iterable[str]) -> Iterator[None]:
-    """Say which key goes on where there is a list: OmegaConf takes its next part for an index."""
+    """Explains the error if a key continues inside a list, where OmegaConf expects an index."""
     try:
         yield
     except (TypeError, ValueError) as error:
@@ -433,7 +432,7 @@ def _explained(words: Iterable[str]) -> Iterator[None]:
 
 
 def _resolve(config: "DictConfig") -> dict[str, Any]:
-    """Return what Hydra composed as plain data, its interpolations filled in."""
+    """Returns Hydra's composed config as plain data, with its interpolations resolved."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 

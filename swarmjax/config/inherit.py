@@ -1,6 +1,6 @@
-"""What a command takes from a run or a policy, as words that come before those that were typed.
+"""Turns the settings of a run or policy into words that a command puts before the typed ones.
 
-The last word for a key counts, so that what is typed wins.
+The last word for a key counts, so typed words win.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -13,17 +13,17 @@ from swarmjax.config.section import Section
 def group_words(
     cls: type[Section], group: str, held: Section, typed: Sequence[str], skip: Iterable[str] = ()
 ) -> list[str]:
-    """Write the values of a section as words, but not those that a typed choice of a file sets.
+    """Writes the values of a section as words, except those that a typed choice of a file sets.
 
     Args:
-        cls: the command's dataclass.
-        group: the section's name there, such as `robot`.
-        held: the section of the run or policy.
-        typed: the words of the command line.
-        skip: keys of the section that are not taken.
+      cls: the command's dataclass.
+      group: the section's name in it, such as `robot`.
+      held: the section of the run or policy.
+      typed: the words of the command line.
+      skip: keys of the section to leave out.
 
     Returns:
-        A word for each value that is not the default.
+      A word for each value that differs from its default.
     """
     words = files.split_words(cls, typed)
     own = files.read_choice(group, files.choice_of(words[group])) if group in words else {}
@@ -38,16 +38,17 @@ def group_words(
 
 
 def preset_words(cls: type[Section], group: str, held: Any, typed: Sequence[str]) -> list[str]:
-    """Write a section that a preset stands for whole: none of it if another preset is typed.
+    """Writes a section as its preset and the values that differ from it.
 
     Args:
-        cls: the command's dataclass.
-        group: the section's name there, such as `realism`.
-        held: the section of the run or policy; its `name` is that of the preset.
-        typed: the words of the command line.
+      cls: the command's dataclass.
+      group: the section's name in it, such as `realism`.
+      held: the section of the run or policy. Its `name` is the name of its preset.
+      typed: the words of the command line.
 
     Returns:
-        The choice of the preset, and a word for each value that is not the preset's.
+      The choice of the preset, and a word for each value that differs from the preset. Nothing if
+      another preset is typed.
     """
     if group in files.split_words(cls, typed):
         return []
@@ -57,7 +58,7 @@ def preset_words(cls: type[Section], group: str, held: Any, typed: Sequence[str]
 
 
 def write(value: object) -> str:
-    """Write plain data so that Hydra's grammar reads the same value."""
+    """Writes plain data so that Hydra's grammar reads the same value."""
     if isinstance(value, str):
         return files.quote(value)
     if value is None or isinstance(value, bool):
@@ -68,7 +69,7 @@ def write(value: object) -> str:
 
 
 def _differences(held: Mapping[str, Any], other: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield dotted keys and values that are not those of another section."""
+    """Yields the dotted keys and values that differ from another section."""
     for key, value in held.items():
         if isinstance(value, Mapping):
             inner = _differences(value, other.get(key, {}))

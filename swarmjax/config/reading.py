@@ -1,7 +1,8 @@
-"""What a user gives, read without trust: files, and the YAML and JSON in them.
+"""Reads untrusted files from users, with YAML or JSON in them.
 
-A file is opened only if it is one (a pipe would wait for ever) and not too large. YAML is walked
-through before anything is made of it, because a few of its lines may stand for billions of values.
+Only regular files are read, because reading a pipe could block forever, and only up to a maximum
+size. YAML is measured before it is loaded, because a few lines of it may expand to billions of
+values.
 """
 
 import contextlib
@@ -14,35 +15,35 @@ from typing import Any, BinaryIO
 
 from swarmjax.config.section import ConfigError, show
 
-MOST_TYPED = 2**20  # bytes of a file that a person writes; those of configs/ take a thousandth
-MOST_MADE = 2**24  # bytes of one that the project writes, such as a run's config
-_MOST_LINE = 2**24  # bytes of a line of those that have one object a line
-_MOST_NODES = 200_000  # values of a YAML file, what its aliases stand for counted each time
-_MOST_DEPTH = 32  # lists and mappings in one another
-_MOST_SCALAR = 5000  # letters of one value; a path has 4096
+MOST_TYPED = 2**20  # bytes of a file that a person writes; files of configs/ are 1000 times smaller
+MOST_MADE = 2**24  # bytes of a file that the project writes, such as a run's config
+_MOST_LINE = 2**24  # bytes of a line in a file with one object per line
+_MOST_NODES = 200_000  # values in a YAML file, after its aliases are expanded
+_MOST_DEPTH = 32  # nested lists and mappings
+_MOST_SCALAR = 5000  # letters of one value; a path may have 4096
 
 
 def read_bytes(path: Path, most: int = MOST_TYPED) -> bytes:
-    """Read a whole file.
+    """Reads a whole file.
 
     Args:
-        path: of the file.
-        most: bytes that it may have.
+      path: the file.
+      most: maximum size, bytes.
 
     Raises:
-        ConfigError: it is missing, no plain file or too large, or cannot be read.
+      ConfigError: if it is missing, not a regular file, too large or unreadable.
     """
     with _explained(path), _open(path) as file:
         size = os.fstat(file.fileno()).st_size
         content = file.read(most + 1) if size <= most else b""
-    if max(size, len(content)) > most:  # the system's own files say that they have none
+    if max(size, len(content)) > most:  # the system's virtual files report a size of 0
         raise ConfigError(f"{called(path)} cannot be read: it has more than {most} bytes.")
     return content
 
 
 def _open(path: Path) -> BinaryIO:
-    """Open a plain file, and nothing that reading would wait for or never end with."""
-    # Otherwise a pipe without a writer would wait here, before anything can be asked of it.
+    """Opens a regular file, and refuses pipes and devices, on which reading could block."""
+    # Without O_NONBLOCK, opening a pipe without a writer would block before it can be checked.
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
@@ -52,7 +53,7 @@ def _open(path: Path) -> BinaryIO:
 
 @contextlib.contextmanager
 def _explained(path: Path) -> Iterator[None]:
-    """Put what keeps a file from being read in a sentence."""
+    """Turns errors while reading a file into one sentence."""
     try:
         yield
     except (OSError, ValueError) as error:
@@ -63,23 +64,23 @@ def _explained(path: Path) -> Iterator[None]:
 
 
 def read_text(path: Path, most: int = MOST_TYPED) -> str:
-    """Read a whole file of text in UTF-8.
+    """Reads a whole file of UTF-8 text.
 
     Args:
-        path: of the file.
-        most: bytes that it may have.
+      path: the file.
+      most: maximum size, bytes.
 
     Raises:
-        ConfigError: as `read_bytes`, or it is no such text.
+      ConfigError: as `read_bytes`, or if it is not UTF-8 text.
     """
     try:
         return read_bytes(path, most).decode()
     except UnicodeDecodeError:
-        raise ConfigError(f"{called(path)} cannot be read: it is no text in UTF-8.") from None
+        raise ConfigError(f"{called(path)} cannot be read: it is not UTF-8 text.") from None
 
 
 def called(path: Path | str) -> str:
-    """Write a path in a sentence: on one line, and not for pages."""
+    """Formats a path for a message, on one line and not too long."""
     text = str(path)
     return text if text.isprintable() and len(text) <= 300 else show(text)
 
@@ -88,34 +89,36 @@ def called(path: Path | str) -> str:
 
 
 def read_json(path: Path, most: int = MOST_MADE) -> Any:
-    """Read a file that is one JSON value.
+    """Reads a file with one JSON value.
 
     Args:
-        path: of the file.
-        most: bytes that it may have.
+      path: the file.
+      most: maximum size, bytes.
 
     Raises:
-        ConfigError: as `read_text`, or it is no JSON.
+      ConfigError: as `read_text`, or if it is not JSON.
     """
     return parse_json(read_text(path, most), called(path))
 
 
 def parse_json(text: str, where: str) -> Any:
-    """Return the value that a text of JSON stands for.
+    """Parses a JSON text.
 
     Args:
-        text: all of it.
-        where: what a sentence calls it.
+      text: the whole text.
+      where: its name in messages.
 
     Raises:
-        ConfigError: it is none, or is nested too deeply or holds too long a number.
+      ConfigError: if it is not JSON, is nested too deeply, or holds a number with too many digits.
     """
     try:
         found = json.loads(text)
     except RecursionError:
         raise _too_deep(where) from None
     except json.JSONDecodeError as error:
-        raise ConfigError(f"{where} cannot be read: no JSON, {str(error).lower()}.") from None
+        raise ConfigError(
+            f"{where} cannot be read: it is not JSON, {str(error).lower()}."
+        ) from None
     except ValueError:
         raise ConfigError(f"{where} cannot be read: a number has too many digits.") from None
     _check_depth(found, where)
@@ -123,7 +126,7 @@ def parse_json(text: str, where: str) -> Any:
 
 
 def _check_depth(found: object, where: str) -> None:
-    """Refuse what writing or comparing it would find too deep, level by level."""
+    """Refuses deep nesting, which would break writing or comparing the value later."""
     level = [found]
     for _ in range(_MOST_DEPTH + 1):
         level = [inner for each in level for inner in _inside(each)]
@@ -140,18 +143,18 @@ def _inside(value: object) -> Iterable[object]:
 
 def _too_deep(where: str) -> ConfigError:
     return ConfigError(
-        f"{where} cannot be read: more than {_MOST_DEPTH} lists or mappings lie in one another."
+        f"{where} cannot be read: lists or mappings are nested more than {_MOST_DEPTH} deep."
     )
 
 
 def read_lines(path: Path) -> Iterator[bytes]:
-    """Yield the lines of a file of any length, with their ends.
+    """Yields the lines of a file of any length, with their line ends.
 
     Args:
-        path: of the file.
+      path: the file.
 
     Raises:
-        ConfigError: it is missing, no plain file or cannot be read, or a line is too long.
+      ConfigError: if it is missing, not a regular file or unreadable, or if a line is too long.
     """
     with _explained(path), _open(path) as file:
         while line := file.readline(_MOST_LINE + 1):
@@ -164,16 +167,16 @@ def read_lines(path: Path) -> Iterator[bytes]:
 
 
 def read_yaml(path: Path) -> Any:
-    """Read a file of YAML.
+    """Reads a YAML file.
 
     Args:
-        path: of the file.
+      path: the file.
 
     Returns:
-        What it stands for, as plain data: a number with an exponent is one, a date is text.
+      Its content as plain data. Text such as `1e6` is read as a number, and a date as text.
 
     Raises:
-        ConfigError: as `read_text`, or it is no YAML, or stands for too much.
+      ConfigError: as `read_text`, or if it is not YAML or expands to too many values.
     """
     import yaml
 
@@ -186,19 +189,19 @@ def read_yaml(path: Path) -> Any:
         raise
     except yaml.YAMLError as error:
         raise ConfigError(f"{where} cannot be read: {_first_line(error)}.") from None
-    except (ValueError, TypeError, OverflowError) as error:  # of a number or of a key
+    except (ValueError, TypeError, OverflowError) as error:  # an invalid number or key
         raise ConfigError(f"{where} cannot be read: {_first_line(error)}.") from None
 
 
 class _Open:
-    """A list or mapping that has begun: its anchor, and how many values it has so far."""
+    """A list or mapping that is still open: its anchor, and the number of its values so far."""
 
     def __init__(self, anchor: str | None) -> None:
         self.anchor, self.values = anchor, 1
 
 
 def _measure(events: Iterable[Any], where: str) -> None:
-    """Refuse a text that stands for too many values, or for values too deep in one another."""
+    """Refuses a YAML text that expands to too many values or is nested too deeply."""
     import yaml
 
     anchors, within = dict[str | None, int](), [_Open(None)]
@@ -220,7 +223,7 @@ def _measure(events: Iterable[Any], where: str) -> None:
 
 def _check_ended(anchor: str, within: list[_Open], where: str) -> None:
     if anchor in [each.anchor for each in within]:
-        raise ConfigError(f"{where} cannot be read: *{anchor} stands within itself.")
+        raise ConfigError(f"{where} cannot be read: *{anchor} contains itself.")
 
 
 def _check_scalar(value: str, where: str) -> None:
@@ -237,7 +240,7 @@ def _check_room(within: list[_Open], where: str) -> None:
 
 
 def _loader() -> Any:
-    """Make the loader that Hydra reads the files of configs/ with, in C where that is there."""
+    """Makes the YAML loader with Hydra's rules, in C if available."""
     import yaml
     from omegaconf._utils import get_yaml_loader
 
@@ -263,6 +266,6 @@ def _check_once(keys: Iterable[str]) -> None:
 
 
 def _first_line(error: Exception) -> str:
-    """Put what YAML says in part of a sentence, with its place."""
+    """Shortens a YAML error, with its position, to a part of a sentence."""
     text = " ".join(str(error).split()) or type(error).__name__
     return (text if len(text) <= 200 else f"{text[:197]}...").rstrip(".")

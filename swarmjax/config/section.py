@@ -1,8 +1,8 @@
-"""Sections of settings: strict conversion, bounds, and mistakes put in one sentence each.
+"""Sections of settings: strict conversion, bounds, and one-sentence errors.
 
-A section is a frozen dataclass whose fields say with `about` what they mean and which numbers
-they take. `build` makes one from plain data, `to_dict` turns it back. What the settings are for
-is not known here.
+A section is a frozen dataclass. Each field carries its meaning and bounds as `about` metadata.
+`build` makes a section from plain data, and `to_dict` converts it back. This module does not know
+what the settings are for.
 """
 
 import dataclasses
@@ -16,40 +16,40 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
 MAX_COUNT = 2**31 - 1  # counts and seeds are int32 on the device
-# All else is computed in float32: nothing lies beyond, and nearer to 0 a device computes with 0.
+# Other numbers are float32. It holds nothing larger, and a device rounds smaller sizes to 0.
 _LARGEST, _SMALLEST = 3.4e38, 1.2e-38
-_MOST_NAME = 255  # bytes of the name of a file, by Linux, macOS and Windows
-_MOST_PATH = 4095  # bytes of a path on Linux, which has most
-_MOST_BITS = 13_000  # of a number that is written; Python refuses to write more than 4300 digits
-_SHOWN = 80  # letters that a sentence has of a value
+_MOST_NAME = 255  # bytes in a file name, on Linux, macOS and Windows
+_MOST_PATH = 4095  # bytes in a path on Linux, which allows the most
+_MOST_BITS = 13_000  # of a number to print; Python refuses to print more than 4300 digits
+_SHOWN = 80  # letters of a value to show in a message
 
 
 class ConfigError(ValueError):
-    """A setting that is refused, in one sentence for the person who typed it."""
+    """Says in one sentence, to the person who typed it, why a setting is refused."""
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """The numbers that a setting takes: low..high with its ends, above..below without them."""
+    """The numbers that a setting accepts: low..high inclusive, above..below exclusive."""
 
     low: float = -math.inf
     high: float = math.inf
     above: float = -math.inf
     below: float = math.inf
-    reason: str = ""  # why no more is taken than `high`, and what to do about it
+    reason: str = ""  # why `high` is the limit, and how to raise it
 
     def hold(self, value: float) -> bool:
-        """Tell whether a number lies within, and float32 can hold it."""
+        """Returns whether a number lies within the bounds and float32 can hold it."""
         inside = self.low <= value <= self.high and self.above < value < self.below
         return inside and _fits(value)
 
     def refuse(self, key: str, value: object, number: float) -> ConfigError:
-        """Say what to give instead of a number.
+        """Makes the error for a number out of bounds.
 
         Args:
-            key: what a sentence calls the setting.
-            value: all that was given.
-            number: that of it which does not hold.
+          key: name of the setting in the message.
+          value: the whole value that was given.
+          number: the number in it that is out of bounds.
         """
         why = f"; {self.reason}" if self.reason and number > self.high else ""
         if number != 0 and self.low <= number <= self.high and not _fits(number):
@@ -69,7 +69,7 @@ class Bounds:
         return ", ".join(given) or "any finite number"
 
 
-def about(  # noqa: PLR0913  # most fields give two or three
+def about(  # noqa: PLR0913  # most calls give two or three
     meaning: str,
     low: float = -math.inf,
     high: float = math.inf,
@@ -81,18 +81,18 @@ def about(  # noqa: PLR0913  # most fields give two or three
     renamed: Mapping[str, str] | None = None,
     reason: str = "",
 ) -> dict[str, Any]:
-    """Return the metadata of a field.
+    """Returns the metadata of a field.
 
     Args:
-        meaning: what it is, with its unit.
-        low: the least number it takes.
-        high: the largest.
-        above: a number that it must exceed.
-        below: a number that it must not reach.
-        derived: whether it follows from the files chosen, and is no key of the command line.
-        stored: whether `to_dict` keeps it; what is not stored is worked out again.
-        renamed: values that have a new name, by the old one.
-        reason: why `high` is the largest and how to raise it, for whoever gives more.
+      meaning: the meaning of the key, with its unit.
+      low: the smallest number it accepts.
+      high: the largest number it accepts.
+      above: a number that it must exceed.
+      below: a number that it must stay below.
+      derived: whether the chosen files determine it, so that the command line cannot set it.
+      stored: whether `to_dict` keeps it. Other fields are computed again.
+      renamed: new names of values, by old name.
+      reason: why `high` is the limit and how to raise it, for the error message.
     """
     bounds = Bounds(low, high, above, below, reason)
     found = {"meaning": meaning, "bounds": bounds, "renamed": renamed or {}}
@@ -101,13 +101,13 @@ def about(  # noqa: PLR0913  # most fields give two or three
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A group of settings, whose numbers are held to their bounds when it is made.
+    """A group of settings, whose numbers are checked against their bounds when it is made.
 
     Attributes:
-        command: name of the command's file in configs/, of a section that is all of a command's.
-        removed: why a key is gone, by its old name.
-        renamed: a key's new name, by its old one.
-        inherited: what a section's values are where no word sets them, by the section's name.
+      command: name of the command's file in configs/, if the section holds all keys of a command.
+      removed: why a key was removed, by its old name.
+      renamed: new names of keys, by old name.
+      inherited: where a section's values come from if no word sets them, by the section's name.
     """
 
     command: ClassVar[str] = ""
@@ -127,23 +127,23 @@ class Section:
         self._check()
 
     def _check(self) -> None:
-        """Refuse what no single bound can say; keys are named from this section on."""
+        """Refuses invalid combinations of values. Messages name keys within this section."""
 
 
 class ByName(dict[str, Any]):
-    """Values by names that the section does not know; never edited, so that settings hash."""
+    """Values by names that the section does not define. Never edited, so that settings can hash."""
 
     def __hash__(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         return hash(frozenset(self.items()))
 
 
 def _fits(number: float) -> bool:
-    """Tell whether a number is 0 or of a size that float32 holds."""
+    """Returns whether a number is 0 or has a size that float32 holds."""
     return number == 0 or _SMALLEST <= abs(number) <= _LARGEST
 
 
 def _leaves(value: object) -> Iterator[object]:
-    """Yield a value, or what stands in nested tuples and by name."""
+    """Yields a value, or the values within nested tuples and `ByName`."""
     if isinstance(value, tuple | ByName):
         for item in value.values() if isinstance(value, ByName) else value:
             yield from _leaves(item)
@@ -152,7 +152,7 @@ def _leaves(value: object) -> Iterator[object]:
 
 
 def _ranges(hint: object, value: object) -> Iterator[tuple[Any, ...]]:
-    """Yield the ranges that a value is or holds."""
+    """Yields the value if it is a range, or the ranges that it holds."""
     if isinstance(value, tuple) and _is_list(hint):
         for item in value:
             yield from _ranges(typing.get_args(hint)[0], item)
@@ -168,26 +168,26 @@ def _check_range(key: str, value: tuple[Any, ...]) -> None:
 
 
 def build[C: Section](cls: type[C], mapping: Mapping[str, Any], where: str = "") -> C:
-    """Make a section from plain data, strictly.
+    """Makes a section from plain data, strictly.
 
     Whole floats and numeric strings become integers, integers become floats, and lists become
-    tuples; nothing else is converted, and no key is dropped.
+    tuples. Nothing else is converted, and no key is dropped.
 
     Args:
-        cls: the dataclass to make.
-        mapping: its keys and values, as `to_dict`, JSON or YAML give them.
-        where: what comes before its keys in a sentence, such as `sim.`.
+      cls: the dataclass to make.
+      mapping: its keys and values, as `to_dict`, JSON or YAML give them.
+      where: the prefix of its keys in messages, such as `sim.`.
 
     Returns:
-        An instance of `cls`.
+      An instance of `cls`.
 
     Raises:
-        ConfigError: an unknown or missing key, a wrong type, or a value out of bounds.
+      ConfigError: if a key is unknown or missing, or a value has a wrong type or is out of bounds.
     """
     if not isinstance(mapping, Mapping):
         key = where.rstrip(": .")
         example = dataclasses.fields(cls)[0].name
-        raise ConfigError(f"{key} is {show(mapping)}: give keys of its own, as {where}{example}.")
+        raise ConfigError(f"{key} is {show(mapping)}: give its keys, such as {where}{example}.")
     known = {item.name: item for item in dataclasses.fields(cls)}
     for key in mapping:
         if key not in known:
@@ -207,7 +207,7 @@ def build[C: Section](cls: type[C], mapping: Mapping[str, Any], where: str = "")
 
 
 def _refuse_renamed(item: dataclasses.Field[Any], value: object, key: str) -> None:
-    """Refuse a value's old name with its new one."""
+    """Refuses a value's old name, and names the new one."""
     renamed = item.metadata.get("renamed", {})
     if isinstance(value, str) and value in renamed:
         new = renamed[value]
@@ -215,7 +215,7 @@ def _refuse_renamed(item: dataclasses.Field[Any], value: object, key: str) -> No
 
 
 def to_dict(config: Section) -> dict[str, Any]:
-    """Return a section as plain data for JSON, from which `build` makes it again."""
+    """Returns a section as plain data for JSON. `build` reverses this."""
     found = {}
     for item in dataclasses.fields(config):
         value = getattr(config, item.name)
@@ -225,15 +225,15 @@ def to_dict(config: Section) -> dict[str, Any]:
 
 
 def modernise(cls: type[Section], stored: Any) -> Any:
-    """Give stored settings the names of this version, so that `build` takes them.
+    """Translates stored settings to the names of this version, so that `build` accepts them.
 
     Args:
-        cls: the section that they are of.
-        stored: plain data of this version or of an older one.
+      cls: their section.
+      stored: plain data of this version or an older one.
 
     Returns:
-        The same with keys and values by their new names, and without keys that are gone; what is
-        no section is left as it is, for `build` to refuse.
+      The same data with new names of keys and values, and without removed keys. Data that is not a
+      section is returned unchanged, and `build` will refuse it.
     """
     if not isinstance(stored, Mapping):
         return stored
@@ -259,7 +259,7 @@ def _modernise_value(item: dataclasses.Field[Any], value: Any) -> Any:
 
 
 def _plain(value: object) -> object:
-    """Turn sections into dictionaries, and tuples into lists."""
+    """Turns sections into dictionaries, and tuples into lists."""
     if isinstance(value, Section):
         return to_dict(value)
     if isinstance(value, dict):
@@ -273,19 +273,19 @@ def _plain(value: object) -> object:
 
 
 def names(cls: type[Section]) -> list[str]:
-    """Return the keys and sections that a word of the command line may begin with."""
+    """Returns the keys and sections with which a word of the command line may begin."""
     return [item.name for item in dataclasses.fields(cls) if not _is_derived(item)]
 
 
 def keys(
     cls: type[Section], where: str = "", *, derived: bool = False
 ) -> dict[str, dataclasses.Field[Any]]:
-    """Return the dotted keys of the command line and the fields they set.
+    """Returns the dotted keys of the command line and the fields that they set.
 
     Args:
-        cls: the section they are of.
-        where: what comes before its keys.
-        derived: return the derived fields instead, which the command line does not set.
+      cls: the section.
+      where: the prefix of its keys.
+      derived: whether to return the derived fields instead, which the command line cannot set.
     """
     found = {}
     for item in dataclasses.fields(cls):
@@ -298,19 +298,19 @@ def keys(
 
 
 def sections(cls: type[Section]) -> dict[str, type[Section]]:
-    """Return the sections within a section, by their names."""
+    """Returns the sections within a section, by name."""
     found = {item.name: _section(item.type) for item in dataclasses.fields(cls)}
     return {name: inner for name, inner in found.items() if inner is not None}
 
 
 class KeyLine(NamedTuple):
-    """What is said about a key, as text.
+    """The documentation of a key, as text.
 
     Attributes:
-        key: dotted.
-        default: as it would be typed, or in angle brackets where it comes from.
-        meaning: what it is, with its unit; empty where nothing was written.
-        allowed: the type and the bounds of its values.
+      key: the dotted key.
+      default: its default as it would be typed, or the source of its default in angle brackets.
+      meaning: its meaning, with its unit; empty if the field has none.
+      allowed: the type and bounds of its values.
     """
 
     key: str
@@ -320,11 +320,11 @@ class KeyLine(NamedTuple):
 
 
 def list_keys(cls: type[Section], chosen: Collection[str] | None = None) -> list[KeyLine]:
-    """Return the documentation of each key.
+    """Returns the documentation of each key.
 
     Args:
-        cls: the section that they are of.
-        chosen: the keys to list; None for all.
+      cls: the section.
+      chosen: the keys to list; None for all.
     """
     known = keys(cls).items()
     return [_key_line(cls, key, item) for key, item in known if chosen is None or key in chosen]
@@ -345,11 +345,11 @@ def _key_line(cls: type[Section], key: str, item: dataclasses.Field[Any]) -> Key
 
 
 def describe_keys(cls: type[Section], chosen: Collection[str] | None = None) -> list[str]:
-    """Return a line for each key: its default, its meaning and what it takes.
+    """Returns a line for each key: its default, its meaning and its allowed values.
 
     Args:
-        cls: the section that they are of.
-        chosen: the keys to describe; None for all.
+      cls: the section.
+      chosen: the keys to describe; None for all.
     """
     return [
         f"  {f'{line.key}={line.default}':<38}  {line.meaning} ({line.allowed})"
@@ -358,12 +358,12 @@ def describe_keys(cls: type[Section], chosen: Collection[str] | None = None) -> 
 
 
 def unknown_key(key: str, cls: type[Section], where: str = "") -> ConfigError:
-    """Say that a key does not exist, and which one was probably meant.
+    """Makes the error for a key that does not exist, with the key that was probably meant.
 
     Args:
-        key: as it was given, without what stands before it.
-        cls: the section that has no such key.
-        where: what stands before it, such as `sim.`.
+      key: the key as it was given, without its prefix.
+      cls: the section that has no such key.
+      where: the prefix of the key, such as `sim.`.
     """
     if key in cls.removed:
         return ConfigError(f"{where}{key} is no longer a key: {cls.removed[key]}")
@@ -380,7 +380,7 @@ def unknown_key(key: str, cls: type[Section], where: str = "") -> ConfigError:
 
 
 def _near(key: str, meant: Mapping[str, str]) -> list[str]:
-    """Return what the name nearest to a key stands for, if one is near."""
+    """Returns the meaning of the name nearest to a key, if one is near."""
     return [meant[name] for name in difflib.get_close_matches(key, meant, n=1)]
 
 
@@ -396,20 +396,20 @@ def _is_required(item: dataclasses.Field[Any]) -> bool:
 
 
 def options(hint: object) -> tuple[Any, ...]:
-    """Return the members of a union, or the type itself."""
+    """Returns the members of a union, or the type itself."""
     if typing.get_origin(hint) in (types.UnionType, typing.Union):
         return typing.get_args(hint)
     return (types.NoneType,) if hint is None else (hint,)
 
 
 def _section(hint: object) -> type[Section] | None:
-    """Return the section that a field holds, alone or in a tuple, if it holds one."""
+    """Returns the section type of a field, which may be within a tuple; None if it has none."""
     inner = typing.get_args(hint)[0] if typing.get_origin(hint) is tuple else hint
     return inner if isinstance(inner, type) and issubclass(inner, Section) else None
 
 
 def _is_range(hint: object) -> bool:
-    """Tell whether a type is that of two numbers, the lower first."""
+    """Returns whether a type is a range: two numbers, the lower first."""
     return typing.get_origin(hint) is tuple and Ellipsis not in typing.get_args(hint)
 
 
@@ -418,15 +418,15 @@ def _is_list(hint: object) -> bool:
 
 
 def convert(hint: object, value: object, key: str) -> object:
-    """Turn plain data into what a field's type says.
+    """Converts plain data to a field's type.
 
     Args:
-        hint: the type.
-        value: the data.
-        key: what a sentence calls it.
+      hint: the type.
+      value: the data.
+      key: its name in messages.
 
     Raises:
-        ConfigError: it cannot be turned into that.
+      ConfigError: if the data cannot be converted.
     """
     section, lists = _section(hint), [each for each in options(hint) if _is_list(each)]
     if lists and not (value is None and type(None) in options(hint)):
@@ -437,7 +437,7 @@ def convert(hint: object, value: object, key: str) -> object:
         mapping = typing.cast(Mapping[str, Any], value)
         return build(section, mapping, key if key.endswith(": ") else f"{key}.")
     if hint is None and value is not None:
-        raise ConfigError(f"{key} is {show(value)}, but is not built yet: leave it out.")
+        raise ConfigError(f"{key} is {show(value)}, but is not implemented yet: leave it out.")
     if isinstance(value, str) and str in options(hint):
         check_text(key, value)
     for option in options(hint):
@@ -449,7 +449,7 @@ def convert(hint: object, value: object, key: str) -> object:
 
 
 def _listed(hint: object, value: object, key: str) -> tuple[object, ...]:
-    """Convert a list of values of one type."""
+    """Converts a list of values of one type."""
     if not isinstance(value, list | tuple):
         raise ConfigError(f"{key} is {show(value)}: give {_describe(hint)}.")
     inner = typing.get_args(hint)[0]
@@ -461,7 +461,7 @@ def _listed(hint: object, value: object, key: str) -> tuple[object, ...]:
 
 
 def _by_name(hint: object, value: object, key: str) -> "ByName":
-    """Convert values of one type, by names that the section does not know."""
+    """Converts values of one type, by names that the section does not define."""
     if not isinstance(value, Mapping):
         raise ConfigError(f"{key} is {show(value)}: give values by name, as in {key}.NAME=1.")
     for name in value:
@@ -470,7 +470,7 @@ def _by_name(hint: object, value: object, key: str) -> "ByName":
 
 
 def _item_key(key: str, items: Sequence[Any], index: int) -> str:
-    """Name one of several sections, by its name where it has one."""
+    """Returns the name of one of several sections: its own name, or its index."""
     if len(items) == 1:
         return key
     item = items[index]
@@ -479,7 +479,7 @@ def _item_key(key: str, items: Sequence[Any], index: int) -> str:
 
 
 def _scalar(hint: object, value: object) -> object:
-    """Convert to one scalar type or range, or raise an error that `convert` puts in words."""
+    """Converts to one scalar type or range, or raises an error for `convert` to explain."""
     if typing.get_origin(hint) is Literal:
         if isinstance(value, str) and value in typing.get_args(hint):
             return value
@@ -494,14 +494,15 @@ def _scalar(hint: object, value: object) -> object:
 
 
 def check_text(key: str, text: str) -> None:
-    """Refuse text that no path or name can be, before anything is done with it.
+    """Refuses text that cannot be a path or name, before anything is done with it.
 
     Args:
-        key: what a sentence calls it.
-        text: a path, a name, or several with commas between them.
+      key: its name in messages.
+      text: a path, a name, or several separated by commas.
 
     Raises:
-        ConfigError: it has a control character, is no Unicode, or names what no file can be called.
+      ConfigError: if it has a control character, is not valid Unicode, or is too long for a file
+        name or path.
     """
     if any(ord(letter) < 32 or 127 <= ord(letter) < 160 for letter in text):
         raise ConfigError(f"{key} is {show(text)}: give text without control characters.")
@@ -520,7 +521,7 @@ def check_text(key: str, text: str) -> None:
 
 
 def _number(kind: type[int] | type[float], value: object) -> int | float:
-    """Convert a number, or a string that is one; true and false are no numbers."""
+    """Converts a number or a numeric string. True and false are not numbers."""
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise TypeError
     try:
@@ -538,7 +539,7 @@ def _number(kind: type[int] | type[float], value: object) -> int | float:
 
 
 def _describe(hint: object, bounds: str = "") -> str:
-    """Put a field's type in words, and the bounds of its numbers if they are given."""
+    """Describes a field's type in words, with the bounds of its numbers if given."""
     if _is_list(hint):
         examples = {int: "[64,64]", str: "[s1,s2]", float | tuple[float, float]: "[0.7,[0.8,1.2]]"}
         inner = typing.get_args(hint)[0]
@@ -562,11 +563,11 @@ def _describe(hint: object, bounds: str = "") -> str:
 
 
 def show(value: object, quote: str = "'") -> str:
-    """Write a value as it would be typed, and short.
+    """Formats a value as it would be typed, and shortens it.
 
     Args:
-        value: plain data.
-        quote: what stands around text.
+      value: plain data.
+      quote: the quotation mark around text.
     """
     if isinstance(value, str):
         value = value[:_SHOWN]

@@ -6,7 +6,7 @@ from typing import Literal
 from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.config.section import MAX_COUNT
 
-# The options of a curriculum that not all modes take: those that do, and what null stands for.
+# Options that only some modes accept: these modes, and the default that null means.
 _STEPWISE = ("sequential", "mixed")
 
 
@@ -24,14 +24,14 @@ _MODE_OPTIONS: dict[str, tuple[tuple[str, ...], float | str | None]] = {
     "exploration": (_STEPWISE, "keep"),
     "newcomers": (_STEPWISE, "copy"),
 }
-# Options that say when a stage is left, which the adaptive mode does where it has prerequisites.
+# Options for when to leave a stage. The adaptive mode accepts them if it has prerequisites.
 _LEAVING = ("threshold", "budget_share")
 
 
 _BUFFERED = ("learnability", "value_loss")
 
 
-# The options of a curriculum over levels that has a buffer, and what null stands for.
+# Options of a curriculum over levels with a buffer, and the default that null means.
 _LEVEL_OPTIONS: dict[str, float | int] = {
     "buffer": 4096,
     "replay": 0.5,
@@ -47,22 +47,22 @@ _MOST_LEVELS = 2**20
 class LevelsConfig(Section):
     """Which levels of a stage are trained on.
 
-    An option of the modes with a buffer is null without one, and may be null with one, where it
-    then takes its default.
+    Modes without a buffer require null for the options of a buffer. In modes with one, null means
+    the default.
     """
 
     mode: Literal["random", "learnability", "value_loss"] = field(
         default="random",
         metadata=about(
-            "random: a new level every episode; learnability: a buffer of those with the largest "
-            "p (1 - p) of success p; value_loss: of those with the largest positive value loss"
+            "random: a new level every episode; learnability: a buffer of the levels with the "
+            "largest p (1 - p), where p is their success; value_loss: a buffer of the levels with "
+            "the largest positive value loss"
         ),
     )
     buffer: int | None = field(
         default=None,
         metadata=about(
-            "levels that are kept, an equal part for each stage; null: 4096 "
-            "[learnability, value_loss]",
+            "levels to keep, an equal number for each stage; null: 4096 [learnability, value_loss]",
             1,
             _MOST_LEVELS,
         ),
@@ -79,8 +79,8 @@ class LevelsConfig(Section):
     mutation: float | None = field(
         default=None,
         metadata=about(
-            "share of those that begin on a mutated one: a wall, a box, a start or a target has "
-            "moved; null: 0 [learnability, value_loss]",
+            "share of replayed episodes that begin on a mutated level, with one wall, box, start "
+            "or target moved; null: 0 [learnability, value_loss]",
             0.0,
             1.0,
         ),
@@ -88,7 +88,7 @@ class LevelsConfig(Section):
     temperature: float | None = field(
         default=None,
         metadata=about(
-            "replay goes as rank^(-1 / temperature); null: 2 [learnability, value_loss]",
+            "replay is proportional to rank^(-1 / temperature); null: 2 [learnability, value_loss]",
             0.01,
             100.0,
         ),
@@ -96,8 +96,8 @@ class LevelsConfig(Section):
     staleness: float | None = field(
         default=None,
         metadata=about(
-            "share of the replay by how long a level was not played; null: 0.1 "
-            "[learnability, value_loss]",
+            "share of the replay that depends on the time since a level was last played; "
+            "null: 0.1 [learnability, value_loss]",
             0.0,
             1.0,
         ),
@@ -105,8 +105,8 @@ class LevelsConfig(Section):
     minimum_episodes: int | None = field(
         default=None,
         metadata=about(
-            "episodes, 16 at most remembered, that a level has had before it is mutated; null: 4 "
-            "[learnability, value_loss]",
+            "episodes that a level needs before it can be mutated (the newest 16 are remembered); "
+            "null: 4 [learnability, value_loss]",
             1,
             16,
         ),
@@ -137,22 +137,25 @@ class LevelsConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class CurriculumConfig(Section):
-    """Who trains on which stage, when that changes, and what a promotion does to the learners.
+    """Which arenas train on which stage, when that changes, and what a promotion changes.
 
-    An option of some modes only, as its meaning says, is null in the others and may be null in
-    its own, where it then takes its default.
+    Some options work only in the modes that their meanings name in brackets. Other modes accept
+    only the initial value of such an option. In its own modes, null means the default.
     """
 
     mode: Literal["sequential", "mixed", "adaptive"] = field(
         default="mixed",
         metadata=about(
-            "sequential: all on the newest stage; mixed: some on earlier ones; adaptive: on all "
-            "stages, most where most is learned"
+            "sequential: all arenas on the newest stage; mixed: some on earlier stages; adaptive: "
+            "on all stages, most on those where the most is learned"
         ),
     )
     success: Literal["targets", "all"] = field(
         default="targets",
-        metadata=about("what decides: share of targets, or of episodes in which all arrived"),
+        metadata=about(
+            "measure of success; targets: share of targets reached; all: share of episodes in "
+            "which all robots arrived"
+        ),
     )
     threshold: float | None = field(
         default=None,
@@ -165,7 +168,8 @@ class CurriculumConfig(Section):
     demotion: float | None = field(
         default=None,
         metadata=about(
-            "success below which the stage before returns; null: never [sequential, mixed]",
+            "success below which a run returns to the previous stage; null: never "
+            "[sequential, mixed]",
             0.0,
             1.0,
         ),
@@ -173,7 +177,7 @@ class CurriculumConfig(Section):
     budget_share: float | None = field(
         default=None,
         metadata=about(
-            "share of the budget for all stages before the last, in equal parts; adaptive: at most "
+            "share of the budget for all stages before the last, in equal parts; adaptive: limit "
             "for the prerequisites; null: 0.5 [sequential, mixed, adaptive with prerequisites]",
             above=0.0,
             below=1.0,
@@ -188,14 +192,14 @@ class CurriculumConfig(Section):
     score: Literal["learnability", "progress", "failure"] | None = field(
         default=None,
         metadata=about(
-            "learnability: p (1 - p) of success p; progress: how fast it changes; failure: 1 - p; "
-            "null: learnability [adaptive]"
+            "score of a stage with success p; learnability: p (1 - p); progress: how fast p "
+            "changes; failure: 1 - p; null: learnability [adaptive]"
         ),
     )
     prerequisites: int | None = field(
         default=None,
         metadata=about(
-            "stages at the front that are practised alone until each of them succeeds; null: 0 "
+            "how many of the first stages to practise alone until each one succeeds; null: 0 "
             "[adaptive]",
             0,
             MAX_COUNT,
@@ -212,29 +216,32 @@ class CurriculumConfig(Section):
     shares: Literal["arenas", "robots"] | None = field(
         default=None,
         metadata=about(
-            "what is shared out; robots: a stage of many robots gets fewer arenas, so that samples "
-            "are shared as the weights say; null: arenas [adaptive]"
+            "what the weights divide among stages; robots: a stage with many robots gets fewer "
+            "arenas, so that the samples follow the weights; null: arenas [adaptive]"
         ),
     )
     optimizer: Literal["keep", "reset"] = field(
         default="keep",
-        metadata=about("moments of Adam at a promotion; reset: to 0 [sequential, mixed]"),
+        metadata=about("Adam's moments at a promotion; reset: set them to 0 [sequential, mixed]"),
     )
     normalizer: Literal["keep", "relearn"] = field(
         default="keep",
         metadata=about(
-            "at a promotion; relearn: from the next batch, without the past [sequential, mixed]"
+            "observation normaliser at a promotion; relearn: from the next batch on, without the "
+            "past [sequential, mixed]"
         ),
     )
     exploration: Literal["keep", "reset"] = field(
         default="keep",
-        metadata=about("at a promotion; reset: to algo.initial_std [sequential, mixed]"),
+        metadata=about(
+            "exploration at a promotion; reset: set it to algo.initial_std [sequential, mixed]"
+        ),
     )
     newcomers: Literal["copy", "fresh"] = field(
         default="copy",
         metadata=about(
-            "independent policies of robots that a promotion adds; copy: of those that trained, "
-            "in turn [sequential, mixed]"
+            "independent policies of robots that a promotion adds; copy: copies of the trained "
+            "ones, in turn; fresh: untrained [sequential, mixed]"
         ),
     )
     levels: LevelsConfig = field(default_factory=LevelsConfig)

@@ -1,11 +1,14 @@
-"""Checkpoints: everything that changes in a run, and a digest of it. Resuming is exact.
+"""Checkpoints hold everything that changes in a run, and a digest of it. Resuming is exact.
 
-Orbax writes the steps; what it lacks is added here: a digest that notices damage (one flipped bit
-restores silently otherwise), a binding to update, config and run that notices a swapped, renamed or
-foreign step, and going back to the newest step that is sound.
-A checkpoint is a flat dictionary from names such as `learners/params/actor/mean/kernel` to
-arrays, so that it can be read without the program that wrote it. Those of a run have a leading
-axis of seeds.
+Orbax writes the steps. This module adds three things that Orbax lacks:
+
+- A digest detects damage. Without it, Orbax restores a flipped bit silently.
+- A binding to update, config and run detects a swapped, renamed or foreign step.
+- Reading falls back to the newest sound step.
+
+A checkpoint is a flat dictionary from names such as `learners/params/actor/mean/kernel` to arrays.
+So it can be read without the program that wrote it. The arrays of a run have a leading axis of
+seeds.
 """
 
 import errno
@@ -31,28 +34,28 @@ from swarmjax.policy import digest
 from swarmjax.run import directory, heap, hosts, practised
 from swarmjax.run.errors import CheckpointError, TrainingError
 
-# Orbax takes half a second to import, which a run spends while it compiles (`trainer`).
+# Importing Orbax takes half a second. A run does it while XLA compiles (`trainer`).
 if TYPE_CHECKING:
     import orbax.checkpoint as ocp
 
 Leaves = dict[str, np.ndarray]
 
 FOLDER = hosts.CHECKPOINTS
-ARENAS = "arenas/"  # of the names of leaves
-_OLD_META = {"digest", "update"}  # all that checkpoints held before they were bound to their run
-# In each step: the SHA-256 of its files. Given damaged files Orbax fails too, but it prints the
-# tracebacks of its threads as well.
+ARENAS = "arenas/"  # prefix of the arenas' leaves
+_OLD_META = {"digest", "update"}  # the whole metadata before checkpoints were bound to their run
+# The SHA-256 of each file of a step. Orbax fails on damaged files too, but prints the tracebacks
+# of its threads.
 _MANIFEST = "files.json"
-_REMOVAL = 0.5  # s, which removing a directory may take from its checkpoints to its config
-_UNFINISHED = "*.orbax-checkpoint-tmp*"  # what Orbax renames when it is whole
+_REMOVAL = 0.5  # s, longest time between removing a directory's checkpoints and its config
+_UNFINISHED = "*.orbax-checkpoint-tmp*"  # Orbax renames such a folder when it is complete
 
 
 class Binding(NamedTuple):
-    """What a checkpoint is of.
+    """The run and config that a checkpoint belongs to.
 
     Attributes:
-      run: Id of the run; None before runs had one.
-      config: Digest of what the run's config fixes.
+      run: id of the run; None before runs had one.
+      config: digest of the config's fixed keys.
     """
 
     run: str | None
@@ -63,12 +66,12 @@ class Kept(NamedTuple):
     """A sound checkpoint.
 
     Attributes:
-      leaves: As `to_leaves` gave them.
-      update: Updates that were done.
-      logs: Bytes of each log that belong to it, by name; empty in older checkpoints.
-      rate_scale: What the learning rates were multiplied by.
-      skipped: A sentence for each newer checkpoint that is damaged.
-      notes: Sentences about what is not known of this one.
+      leaves: the arrays, as `to_leaves` gave them.
+      update: updates that were done.
+      logs: bytes of each log at this checkpoint, by name; empty in older checkpoints.
+      rate_scale: factor on the learning rates.
+      skipped: a sentence for each newer checkpoint that is damaged.
+      notes: sentences about what this checkpoint does not record.
     """
 
     leaves: Leaves
@@ -80,12 +83,12 @@ class Kept(NamedTuple):
 
     @property
     def has_arenas(self) -> bool:
-        """Whether the state is whole; without arenas a run draws others when it goes on."""
+        """Whether the checkpoint holds the arenas. If not, a resumed run draws new ones."""
         return any(name.startswith(ARENAS) for name in self.leaves)
 
 
 def binding(run: Path) -> Binding | None:
-    """Reads what the checkpoints of a run directory must be of; None without a config."""
+    """Reads the binding that a run directory's checkpoints must have; None without a config."""
     try:
         stored = json.loads((run / directory.CONFIG).read_text())
         return Binding(stored.get("run", {}).get("id"), directory.config_digest(stored))
@@ -94,21 +97,21 @@ def binding(run: Path) -> Binding | None:
 
 
 class Checkpoints:
-    """The checkpoints of one run directory, for writing. Close it, or use `with`.
+    """Writes the checkpoints of one run directory, in a `with` block.
 
-    A thread writes them while the run goes on. The newest are kept, and the one with the highest
-    score.
+    A thread writes them while training continues. The newest ones and the one with the highest
+    score are kept.
 
     Attributes:
-      write_seconds: That the newest one took to write.
+      write_seconds: time to write the newest checkpoint.
     """
 
     def __init__(self, run: Path, keep: int, update: int | None = None) -> None:
-        """Opens `run`/checkpoints, keeping the `keep` newest.
+        """Opens `run`/checkpoints, to keep the `keep` newest.
 
-        With `update`, where the run goes on, checkpoints after it are put aside: they were passed
-        over as damaged, and Orbax would save nothing before them. Otherwise nothing is done until
-        the first is saved, so that a run need not wait for Orbax before it begins.
+        A resumed run gives `update`. Later checkpoints were skipped as damaged, and Orbax would
+        save nothing before them, so they are moved aside. Nothing else is done until the first
+        save, so that a run need not wait for Orbax to begin.
         """
         self._run, self._keep = run, keep
         self._folder = (run / FOLDER).resolve()
@@ -141,18 +144,20 @@ class Checkpoints:
         rate_scale: float = 1.0,
         of: Mapping[str, Any] | None = None,
     ) -> None:
-        """Begins to write a state, unless its update is there or what it learned is not finite.
+        """Begins to write a state.
+
+        Does nothing if the update is already saved, or if what was learned is not finite.
 
         Args:
-          state: What changes in the run; it is copied before this returns.
-          update: Updates that are done.
-          logs: Bytes of each log that belong to it, by name.
-          score: How good it is; None if that is not known.
-          rate_scale: What the learning rates were multiplied by.
-          of: What else its line in the list of checkpoints says.
+          state: the training state; it is copied before this returns.
+          update: updates that are done.
+          logs: bytes of each log at this update, by name.
+          score: rates the checkpoint, higher is better; None if unknown.
+          rate_scale: factor on the learning rates.
+          of: further entries for its row in the list of checkpoints.
 
         Raises:
-          TrainingError: If the checkpoint before could not be written.
+          TrainingError: if the previous checkpoint could not be written.
         """
         state = hosts.gather(state)
         if not hosts.is_first():
@@ -160,15 +165,15 @@ class Checkpoints:
         self.wait()
         meta = {"update": update, "logs": dict(logs or {}), "rate_scale": rate_scale}
         told = {"score": score, "rate_scale": rate_scale, **(of or {})}
-        # The next call of the program writes over the state, which NumPy may share on a CPU.
+        # The next call of the program overwrites the state. On a CPU, NumPy may share its memory.
         leaves = {name: np.array(leaf) for name, leaf in to_leaves(state).items()}
         self._pending = self._thread.submit(self._write, leaves, meta, told)
 
     def wait(self) -> None:
-        """Waits until what was begun is written.
+        """Waits until the pending checkpoint is written.
 
         Raises:
-          TrainingError: If it could not be written.
+          TrainingError: if it could not be written.
         """
         pending, self._pending = self._pending, None
         if pending is not None:
@@ -177,22 +182,22 @@ class Checkpoints:
     def _write(self, leaves: Leaves, meta: dict[str, Any], told: directory.Row) -> None:
         update, began = meta["update"], time.perf_counter()
         try:
-            if self._is_gone():  # Orbax would make another directory, without a config
+            if self._is_gone():  # Orbax would create the directory again, without a config
                 raise FileNotFoundError
             if _is_sound(leaves) and update not in self._manager.all_steps():
                 self._write_step(leaves, meta, told)
-        except Exception as error:  # of any type that Orbax raises on a full disk
+        except Exception as error:  # on a full disk, Orbax raises errors of many types
             why = self._why(error)
             raise TrainingError(f"checkpoint {update} cannot be written: {why}.") from None
         heap.release()
         self.write_seconds = time.perf_counter() - began
 
     def _is_gone(self) -> bool:
-        """Tells whether somebody removed the directory of the run."""
+        """Returns whether the run's directory was removed."""
         return self._binding is not None and not (self._run / directory.CONFIG).exists()
 
     def _why(self, error: Exception) -> str:
-        """Says why a checkpoint could not be written."""
+        """Explains why a checkpoint could not be written, also after the run was removed."""
         why = _why(error)
         if not self._is_gone() and why != os.strerror(errno.ENOSPC):
             time.sleep(_REMOVAL)
@@ -211,7 +216,7 @@ class Checkpoints:
             ),
         )
         if not saved:
-            raise FileExistsError("a newer one is there")
+            raise FileExistsError("a newer checkpoint exists")
         step = self._folder / str(update)
         directory.write_json(step / _MANIFEST, _file_digests(step))
         best = practised.best(leaves)
@@ -222,7 +227,7 @@ class Checkpoints:
         self._prune()
 
     def _prune(self) -> None:
-        """Removes all but the newest and the best."""
+        """Removes all checkpoints except the newest ones and the best."""
         steps = sorted(self._manager.all_steps())
         rows = directory.read_rows(self._run / directory.SAVED, None, whole=False)
         scores = {
@@ -251,7 +256,7 @@ class Checkpoints:
 
 
 def _options() -> "ocp.CheckpointManagerOptions":
-    """Lets a process read and write by itself, without waiting for the others of its run."""
+    """Makes Orbax's options, so that a process reads and writes without waiting for others."""
     import orbax.checkpoint as ocp
 
     found = ocp.CheckpointManagerOptions(create=False, enable_async_checkpointing=False)
@@ -264,7 +269,7 @@ def _options() -> "ocp.CheckpointManagerOptions":
 
 
 def _put_aside(step: Path) -> None:
-    """Moves a step out of the folder of checkpoints, in place of one that was moved before."""
+    """Moves a step to `passed_over`, and replaces an older step of the same name there."""
     aside = step.parents[1] / "passed_over" / step.name
     shutil.rmtree(aside, ignore_errors=True)
     aside.parent.mkdir(exist_ok=True)
@@ -272,7 +277,7 @@ def _put_aside(step: Path) -> None:
 
 
 def _why(error: Exception) -> str:
-    """Says why a checkpoint could not be written; TensorStore names the reason at the very end."""
+    """Extracts the reason of a failed write. TensorStore gives it at the very end of its text."""
     full = os.strerror(errno.ENOSPC)
     if full in str(error):
         return full
@@ -281,10 +286,10 @@ def _why(error: Exception) -> str:
 
 @functools.cache
 def _quieten() -> None:
-    """Keeps Orbax from telling every step of its own, and its errors beside our sentence.
+    """Silences Orbax's progress messages, and the errors that it logs beside our own message.
 
-    When a file cannot be written, Orbax closes its event loop, and TensorStore goes on to tell it
-    about the other files.
+    When a file cannot be written, Orbax closes its event loop, but TensorStore still reports the
+    other files to it.
     """
     absl_logging.set_verbosity(absl_logging.FATAL)
     logging.getLogger("absl").setLevel(logging.CRITICAL)
@@ -299,13 +304,13 @@ def _quieten() -> None:
 
 
 def _is_sound(leaves: Leaves) -> bool:
-    """Tells whether what was learned is finite: a run must be able to go back to it."""
+    """Returns whether all learned values are finite, so that a run can go back to them."""
     learned = [x for name, x in leaves.items() if name.startswith("learners/")]
     return all(np.isfinite(x).all() for x in learned if np.issubdtype(x.dtype, np.floating))
 
 
 def _file_digests(step: Path) -> dict[str, str]:
-    """Returns the SHA-256 of each file of a step, in hexadecimal, by its path within."""
+    """Returns the SHA-256 of each file of a step, in hexadecimal, by its relative path."""
     files = sorted(path for path in step.rglob("*") if path.is_file() and path.name != _MANIFEST)
     found = {}
     for path in files:
@@ -315,10 +320,10 @@ def _file_digests(step: Path) -> dict[str, str]:
 
 
 def _check_files(step: Path) -> None:
-    """Refuses a step whose files are not those that were written.
+    """Refuses a step if its files have changed since they were written.
 
-    A run that is killed just after Orbax ended leaves a step that does not list its files, as
-    older versions did.
+    A step without a list of files passes. Older versions wrote such steps, and so does a run that
+    is killed just after Orbax finishes.
     """
     if not (step / _MANIFEST).exists():
         return
@@ -331,12 +336,12 @@ def _check_files(step: Path) -> None:
 
 
 def _seal(meta: Mapping[str, Any]) -> str:
-    """Returns the SHA-256 of what a checkpoint holds besides arrays, in hexadecimal."""
+    """Returns the SHA-256 of a checkpoint's metadata, in hexadecimal."""
     return hashlib.sha256(json.dumps(meta, sort_keys=True).encode()).hexdigest()
 
 
 def to_leaves(state: Any) -> Leaves:
-    """Flattens a state to names and arrays; keys become their data, empty arrays are left out."""
+    """Flattens a state to named arrays. PRNG keys become their data; empty arrays are dropped."""
     leaves = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(state):
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
@@ -347,17 +352,18 @@ def to_leaves(state: Any) -> Leaves:
 
 
 def from_leaves(leaves: Leaves, template: Any) -> Any:
-    """Fills a state of the template's structure.
+    """Rebuilds a state from its leaves.
 
     Args:
-      leaves: as `to_leaves` gave them.
-      template: a state, or what `jax.eval_shape` gives of one.
+      leaves: the arrays, as `to_leaves` gave them.
+      template: a state of the same structure, or its shapes from `jax.eval_shape`.
 
     Returns:
       The state.
 
     Raises:
-      CheckpointError: if a leaf is missing or of another shape or type: another run's.
+      CheckpointError: if a leaf is missing or has another shape or type, as in another run's
+        checkpoint.
     """
 
     def fill(path: tuple, leaf: Any) -> jax.Array:
@@ -379,24 +385,24 @@ def from_leaves(leaves: Leaves, template: Any) -> Any:
 
 
 def of_seed(leaves: Leaves, lane: int, seeds: int) -> Leaves:
-    """Takes one seed out of a run's checkpoint.
+    """Extracts one seed from a run's checkpoint.
 
     Args:
-      leaves: of a run, [N, ...] each.
-      lane: of the seed, 0..N-1.
-      seeds: N, as the config says.
+      leaves: [N, ...] arrays of a run.
+      lane: index of the seed, 0..N-1.
+      seeds: N, the number of seeds in the config.
 
     Returns:
-      The leaves of that seed, without the axis.
+      The leaves of that seed, without the leading axis.
 
     Raises:
-      CheckpointError: if the checkpoint has not that many seeds.
+      CheckpointError: if the checkpoint has another number of seeds.
     """
     found = leaves["update"].shape
     if found != (seeds,):
         raise CheckpointError(
             f"the checkpoint holds {found[0] if found else 'no axis of'} seeds, but the config "
-            f"says {seeds}: it is of another run."
+            f"says {seeds}: it belongs to another run."
         )
     return {name: leaf[lane] for name, leaf in leaves.items()}
 
@@ -405,14 +411,14 @@ def restore(run: Path, update: int | None = None) -> tuple[Leaves, int, list[str
     """Reads the newest sound checkpoint of a run, or the one of `update`, as `find` does.
 
     Returns:
-      The leaves, the update, and the sentences about what was skipped.
+      The leaves, the update, and a sentence for each skipped checkpoint.
     """
     kept = find(run, update)
     return kept.leaves, kept.update, kept.skipped
 
 
 def steps(run: Path) -> list[int]:
-    """Lists the updates that a run directory has checkpoints of, sound or not, newest first."""
+    """Lists the updates of a run's checkpoints, sound or not, newest first."""
     try:
         found = [path.name for path in (run / FOLDER).iterdir() if path.is_dir()]
     except OSError:
@@ -424,11 +430,11 @@ def find(run: Path, update: int | None = None) -> Kept:
     """Reads the newest sound checkpoint of a run, or the one of `update`.
 
     Args:
-      run: The run directory.
-      update: Which; None for the newest.
+      run: the run directory.
+      update: update of the checkpoint to read; None for the newest.
 
     Raises:
-      CheckpointError: If there is none that is sound.
+      CheckpointError: if there is no sound checkpoint.
     """
     import orbax.checkpoint as ocp
 
@@ -443,12 +449,12 @@ def find(run: Path, update: int | None = None) -> Kept:
         for step in [update] if update is not None else there:
             try:
                 leaves, meta = _read(manager, step, bound)
-            except Exception as error:  # of any type that Orbax raises
+            except Exception as error:  # Orbax raises errors of many types
                 reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
                 skipped.append(f"checkpoint {step} of {run} cannot be used ({reason})")
                 continue
             told = "seal" in meta
-            notes = [] if told else [f"checkpoint {step} of {run} does not say which run it is of"]
+            notes = [] if told else [f"checkpoint {step} of {run} does not record its run"]
             scale = meta.get("rate_scale", 1.0)
             return Kept(leaves, step, meta.get("logs", {}), scale, skipped, notes)
     raise CheckpointError(f"{run} has no sound checkpoint: {'; '.join(skipped)}.")
@@ -457,7 +463,7 @@ def find(run: Path, update: int | None = None) -> Kept:
 def _read(
     manager: "ocp.CheckpointManager", step: int, bound: Binding | None
 ) -> tuple[Leaves, dict[str, Any]]:
-    """Reads one step and checks its digest, and that it is of this update, config and run."""
+    """Reads one step, and checks its digests and that it belongs to this update, config and run."""
     import orbax.checkpoint as ocp
 
     _check_files(Path(manager.directory) / str(step))
@@ -469,11 +475,11 @@ def _read(
     meta = dict(found["meta"])
     seal = meta.pop("seal", None)
     if (seal is None and set(meta) != _OLD_META) or (seal is not None and seal != _seal(meta)):
-        raise CheckpointError("what it says of itself does not match its digest")
+        raise CheckpointError("its metadata does not match its digest")
     if digest(leaves) != meta["digest"]:
         raise CheckpointError("its contents do not match its digest")
     if meta["update"] != step or np.any(leaves.get("update", step) != step):
-        raise CheckpointError(f"it is of update {meta['update']}")
+        raise CheckpointError(f"it belongs to update {meta['update']}")
     if seal is None:
         return leaves, meta
     _check_binding(meta["of"], bound)
@@ -481,11 +487,11 @@ def _read(
 
 
 def _check_binding(found: list[Any] | None, bound: Binding | None) -> None:
-    """Refuses a checkpoint of another run or of another config."""
+    """Refuses a checkpoint of another run or config."""
     if bound is None or found is None:
         return
     if found[0] != bound.run:
-        raise CheckpointError(f"it is of run {found[0]}, and this is run {bound.run}")
+        raise CheckpointError(f"it belongs to run {found[0]}, but this is run {bound.run}")
     if found[1] != bound.config:
         raise CheckpointError("it was written with another config.json")
 

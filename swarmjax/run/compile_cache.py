@@ -1,9 +1,9 @@
-"""Compiled programs kept between runs, so that a second start need not compile.
+"""Keeps compiled programs between runs, so that a second start need not compile.
 
-JAX loads what lies in the cache's directory and runs it: who can write there can run code here.
-So the directory is the user's own, and one that others may write is not used. An environment, or a
-program around this one, that has set JAX's cache up itself is left alone. Entries are compressed
-with zlib, whose checksum tells those that are damaged; they are dropped and compiled anew.
+JAX loads and runs the files in the cache directory, so anyone who can write there can run code
+here. Therefore the directory belongs to the user, and one that others can write is not used. If the
+environment or a surrounding program has already configured JAX's cache, it is left unchanged. Zlib
+compresses the entries, and its checksum detects damaged ones, which are deleted and compiled again.
 """
 
 import contextlib
@@ -20,23 +20,23 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 
 AUTO = "auto"
-LARGEST = 2**30  # bytes; a program of the default run takes a thousandth of it
+LARGEST = 2**30  # bytes; a program of the default run takes one thousandth of this
 _OPTIONS = {
-    # Everything is kept: a start compiles a handful of programs, and on a GPU small ones take a
-    # tenth of a second each, below the second from which JAX keeps them by default.
+    # Keep every program. A start compiles only a handful, and on a GPU small ones take a tenth of
+    # a second each. By default, JAX keeps only those that take over a second.
     "jax_persistent_cache_min_compile_time_secs": 0.0,
 }
 _DIRECTORY = "jax_compilation_cache_dir"
-_ENTRY = re.compile(r"(.+)-[0-9a-f]{64}-cache")  # JAX's name of a program, and a SHA-256
+_ENTRY = re.compile(r"(.+)-[0-9a-f]{64}-cache")  # JAX's name for a program, then a SHA-256
 _TROUBLE = re.compile(
     r"Error (reading|writing) persistent compilation cache entry for '([^']+)': ([^\n]*)"
 )
 
 
 def default_directory() -> Path:
-    """Returns where the cache is unless somebody says otherwise: `swarmjax/xla` with the caches."""
+    """Returns the default cache directory: `swarmjax/xla` in the user's cache folder."""
     given = os.environ.get("XDG_CACHE_HOME", "")
-    # By the XDG Base Directory Specification a relative path there is to be ignored.
+    # The XDG Base Directory Specification says to ignore a relative path here.
     base = Path(given) if os.path.isabs(given) else Path.home() / ".cache"
     return base / "swarmjax" / "xla"
 
@@ -47,11 +47,11 @@ def _to_stderr(sentence: str) -> None:
 
 @contextlib.contextmanager
 def use(choice: str | None, say: Callable[[str], None] = _to_stderr) -> Iterator[None]:
-    """Keeps what is compiled while in a `with`; nothing that is wrong with the cache stops a run.
+    """Caches the programs that are compiled in a `with` block. Cache errors never stop a run.
 
     Args:
       choice: a directory, `auto` for `default_directory`, or None for no cache.
-      say: takes a sentence for each thing that is wrong.
+      say: receives a sentence for each problem.
     """
     set_up = getattr(jax.config, _DIRECTORY) or not jax.config.jax_enable_compilation_cache
     if choice is None or set_up:
@@ -60,10 +60,10 @@ def use(choice: str | None, say: Callable[[str], None] = _to_stderr) -> Iterator
     try:
         directory = default_directory() if choice == AUTO else Path(choice).absolute()
         _open(directory)
-        if choice == AUTO:  # in a directory that was given, programs may be somebody else's
+        if choice == AUTO:  # a directory that was given may hold programs of other users
             _shorten(directory)
-    except (OSError, RuntimeError) as error:  # RuntimeError: nobody knows where home is
-        say(f"nothing that is compiled will be kept: {error}.")
+    except (OSError, RuntimeError) as error:  # RuntimeError: the home directory is unknown
+        say(f"compiled programs will not be kept: {error}.")
         yield
         return
     with _configured(directory), _explained(directory, say):
@@ -71,30 +71,30 @@ def use(choice: str | None, say: Callable[[str], None] = _to_stderr) -> Iterator
 
 
 def _open(directory: Path) -> None:
-    """Makes the directory, for its owner alone, and looks whether it can be used.
+    """Makes the directory, private to its owner, and checks that it can be used.
 
     Raises:
-      OSError: it cannot be written, or others may write it.
+      OSError: if it cannot be written, or if others can write it.
     """
     directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=directory).close()
     found = directory.stat()
     mine = not hasattr(os, "geteuid") or found.st_uid == os.geteuid()
     if not mine or (os.name == "posix" and found.st_mode & 0o022):
-        raise OSError(f"{directory} can be written by others, who could run code by that")
+        raise OSError(f"others can write {directory}, and could run code through it")
 
 
 def _entries(directory: Path) -> list[tuple[str, Path]]:
-    """Finds the programs that JAX keeps there, by name; every other file is left alone."""
+    """Finds the programs in JAX's cache directory, by name, and ignores all other files."""
     found = [(_ENTRY.fullmatch(path.name), path) for path in directory.iterdir()]
     return [(match[1], path) for match, path in found if match is not None]
 
 
 def _shorten(directory: Path) -> None:
-    """Drops the programs that were used longest ago from a cache that has become too large."""
+    """Deletes the least recently used programs when the cache is too large."""
     found = []
     for _, path in _entries(directory):
-        with contextlib.suppress(FileNotFoundError):  # another run dropped it just now
+        with contextlib.suppress(FileNotFoundError):  # another run has just deleted it
             found.append((path, path.stat()))
     found.sort(key=lambda entry: max(entry[1].st_atime, entry[1].st_mtime), reverse=True)
     total = 0
@@ -106,7 +106,7 @@ def _shorten(directory: Path) -> None:
 
 @contextlib.contextmanager
 def _configured(directory: Path) -> Iterator[None]:
-    """Sets JAX's cache up, and puts everything back."""
+    """Configures JAX's cache, and restores the old configuration at the end."""
     options = _OPTIONS | {_DIRECTORY: str(directory)}
     before = {name: getattr(jax.config, name) for name in options}
     _update(options)
@@ -119,15 +119,15 @@ def _configured(directory: Path) -> Iterator[None]:
 def _update(options: Mapping[str, object]) -> None:
     for name, value in options.items():
         jax.config.update(name, value)
-    # JAX looks at the directory once, when it first compiles.
+    # JAX reads the directory's setting once, when it first compiles.
     compilation_cache.reset_cache()
 
 
 @contextlib.contextmanager
 def _explained(directory: Path, say: Callable[[str], None]) -> Iterator[None]:
-    """Turns JAX's warnings about the cache into sentences, and drops what cannot be read.
+    """Turns JAX's warnings about the cache into sentences, and deletes unreadable entries.
 
-    JAX itself compiles anew then, but does not write over an entry that is there.
+    JAX then compiles the program again, but does not overwrite an existing entry.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("always", message=_TROUBLE.pattern)
@@ -152,11 +152,11 @@ def _explained(directory: Path, say: Callable[[str], None]) -> Iterator[None]:
 
 
 def _sentence(directory: Path, verb: str, name: str, reason: str) -> str:
-    """Says what is wrong with an entry, which is dropped if it cannot be read."""
+    """Describes the problem with an entry, and deletes the entry if it cannot be read."""
     if verb == "writing":
         return f"{name} is not kept in {directory}: {reason}."
     with contextlib.suppress(OSError):
         for program, path in _entries(directory):
             if program == name:
                 path.unlink(missing_ok=True)
-    return f"what {directory} kept of {name} cannot be read and is compiled anew: {reason}."
+    return f"{name} in {directory} cannot be read and is compiled again: {reason}."

@@ -1,10 +1,10 @@
-"""How a run directory is written: one process at a time, whole files, and logs that only grow.
+"""Writes a run directory: one process at a time, complete files, and append-only logs.
 
-- A lock that dies with its process keeps a second one out.
-- `config.json` and `summary.json` are replaced whole or not at all.
-- Logs (JSON lines) are appended to. A checkpoint counts their bytes; a run that goes on cuts them
-  to that length, in one step, before it adds to them.
-- A run has an id. Its checkpoints hold it, with a digest of what its config fixes.
+- A lock keeps a second process out. It is released when its process dies.
+- `config.json` and `summary.json` are replaced completely or not at all.
+- Logs are files of JSON lines. Each checkpoint records their lengths in bytes. A resumed run first
+  truncates the logs to those lengths, in one step, and then appends.
+- Each run has an id. Its checkpoints store the id and a digest of the config's fixed keys.
 """
 
 import contextlib
@@ -26,8 +26,8 @@ from swarmjax.run.errors import CheckpointError
 CONFIG, SUMMARY, LOCK = "config.json", "summary.json", ".lock"
 METRICS, DECISIONS, EPISODES = "metrics.jsonl", "curriculum.jsonl", "episodes.jsonl"
 LOGS = (METRICS, DECISIONS, EPISODES)
-SAVED = "checkpoints.jsonl"  # a row for each checkpoint that was written, of those removed too
-# Keys of a stored config that may change when its run goes on: they fix nothing that was computed.
+SAVED = "checkpoints.jsonl"  # a row for each checkpoint written, including those removed since
+# Keys of a stored config that may change when a run is resumed: they do not affect past results.
 MAY_CHANGE = ("budget", "devices", "resume", "run", "streams")
 
 Row = dict[str, Any]
@@ -40,13 +40,13 @@ def new_id() -> str:
 
 @contextlib.contextmanager
 def locked(run: Path) -> Iterator[None]:
-    """Keeps other processes out of a run directory, which is made if it is missing.
+    """Keeps other processes out of a run directory, and makes it if it is missing.
 
     Args:
-      run: The directory.
+      run: the directory.
 
     Raises:
-      ConfigError: If another process writes it, or it cannot be written.
+      ConfigError: if another process is writing the directory, or it cannot be written.
     """
     made = _make(run)
     with contextlib.ExitStack() as held:
@@ -85,7 +85,7 @@ def _lock(run: Path, file: IO[str]) -> None:
 
 
 def _is_same(file: IO[str], path: Path) -> bool:
-    """Tells whether an open file is the one that a path names."""
+    """Returns whether an open file is the one at a path."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
     except OSError:
@@ -93,11 +93,11 @@ def _is_same(file: IO[str], path: Path) -> bool:
 
 
 class Writer(NamedTuple):
-    """The process that wrote a run directory last.
+    """The process that last wrote a run directory.
 
     Attributes:
-      process: its number there.
-      host: its machine; this one where the lock, of an older version, does not say.
+      process: its process id on its machine.
+      host: its machine. Locks of older versions do not name it; then it is this machine.
     """
 
     process: int
@@ -105,12 +105,12 @@ class Writer(NamedTuple):
 
     @property
     def is_here(self) -> bool:
-        """Whether it ran on this machine."""
+        """Whether the process ran on this machine."""
         return self.host == socket.gethostname()
 
 
 def writer(run: Path) -> Writer | None:
-    """Reads who holds or held the lock of a run directory, which is left alone; None if unknown."""
+    """Reads which process holds or held the lock of a run directory; None if unknown."""
     try:
         process, *host = (run / LOCK).read_text().splitlines()
         return Writer(int(process.removeprefix("process ")), (*host, socket.gethostname())[0])
@@ -119,10 +119,10 @@ def writer(run: Path) -> Writer | None:
 
 
 def is_writing(found: Writer) -> bool:
-    """Tells whether a process of this machine is still there.
+    """Returns whether a writer on this machine is still running.
 
-    Where Linux lists locks, it has to hold one: its number may be another's by now. Trying the lock
-    would keep a run out that begins in the same moment.
+    Where Linux lists locks, the process must hold one, because its id may have been reused.
+    Acquiring the lock as a test would keep out a run that begins at the same moment.
     """
     try:
         lines = Path("/proc/locks").read_text().splitlines()
@@ -133,13 +133,13 @@ def is_writing(found: Writer) -> bool:
         os.kill(found.process, 0)
     except ProcessLookupError:
         return False
-    except OSError:  # of somebody else's
+    except OSError:  # the process belongs to another user
         return True
     return True
 
 
 def _make(run: Path) -> list[Path]:
-    """Makes a directory; returns what had to be made, the innermost first."""
+    """Makes a directory, and returns all directories that were made, innermost first."""
     missing = [path for path in (run, *run.parents) if not path.exists()]
     try:
         run.mkdir(parents=True, exist_ok=True)
@@ -149,96 +149,97 @@ def _make(run: Path) -> list[Path]:
 
 
 def _sign(file: IO[str]) -> None:
-    """Writes down who holds the lock, for the sentence that refuses the next one."""
+    """Writes the lock's holder into it, for the message to the next process."""
     try:
         file.truncate(0)
         file.write(f"process {os.getpid()}\n{socket.gethostname()}\n")
         file.flush()
-    except OSError:  # a full disk: the lock holds without a name
+    except OSError:  # a full disk; the lock works without a name
         pass
 
 
 def _remove_empty(run: Path, made: list[Path]) -> None:
-    """Removes the directories that were made for a run which then wrote nothing."""
+    """Removes the directories that were made, if the run then wrote nothing."""
     try:
         if made and os.listdir(run) == [LOCK]:
             (run / LOCK).unlink()
             for path in made:
                 path.rmdir()
-    except OSError:  # gone, or somebody else's by now
+    except OSError:  # already removed, or owned by another user
         pass
 
 
 def check_regular(run: Path) -> None:
-    """Refuses a run directory that holds a pipe or a device, which would be waited for.
+    """Refuses a run directory that holds a pipe or a device, because reading it could block.
 
     Raises:
-      ConfigError: If it does.
+      ConfigError: if it holds one.
     """
     try:
         found = [path for path in run.iterdir() if not (path.is_file() or path.is_dir())]
-    except OSError:  # missing, or to be refused where it is read
+    except OSError:  # missing, or refused later where it is read
         return
-    odd = [path for path in found if path.exists()]  # a link to nothing is no danger
+    odd = [path for path in found if path.exists()]  # a broken link is harmless
     if odd:
         raise ConfigError(f"{odd[0]} is neither a file nor a folder: remove it.")
 
 
 def unwritable(run: Path, error: OSError | ValueError) -> ConfigError:
-    """Says why a run directory cannot be written."""
+    """Makes the error for a run directory that cannot be written."""
     reason = getattr(error, "strerror", None) or error
     return ConfigError(f"run.dir is {run}, which cannot be written: {reason}.")
 
 
 def write_json(path: Path, found: Mapping[str, Any]) -> None:
-    """Replaces a file of JSON, whole or not at all.
+    """Replaces a JSON file, completely or not at all.
 
     Raises:
-      OSError: If it cannot be written.
+      OSError: if it cannot be written.
     """
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(found, indent=2) + "\n")
 
 
 def kept_config(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
-    """Makes the config that a run which goes on writes.
+    """Makes the `config.json` of a resumed run.
 
     Args:
-      before: What its `config.json` holds, which any version may have written.
-      now: The config that it goes on with.
+      before: the stored config, written by any version.
+      now: the config that the run goes on with.
 
     Returns:
-      `before` with what may change as it is now, so that the digest stays that of the checkpoints.
+      `before`, with the keys of `MAY_CHANGE` taken from `now`. So the digest still matches the
+      checkpoints.
     """
     return {**before, **{key: now[key] for key in MAY_CHANGE if key in now}}
 
 
 def config_digest(stored: Mapping[str, Any]) -> str:
-    """Returns the SHA-256 of what a stored config fixes, in hexadecimal."""
+    """Returns the SHA-256 of a stored config's fixed keys, in hexadecimal."""
     fixed = {key: value for key, value in stored.items() if key not in MAY_CHANGE}
     return hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()
 
 
 class Log:
-    """A file of JSON lines that is appended to."""
+    """An append-only file of JSON lines."""
 
     def __init__(self, path: Path) -> None:
-        """Opens the file, which is made if it is missing."""
-        # Without a buffer, which a full disk would leave for `close` to fail on once more.
+        """Opens the file, and makes it if it is missing."""
+        # Unbuffered: on a full disk, `close` would fail again on what is left in a buffer.
         self._file = path.open("ab", buffering=0)
 
     def write(self, rows: Iterable[Row]) -> None:
-        """Appends rows, and hands them to the system.
+        """Appends rows, and passes them to the operating system.
 
         Raises:
-          OSError: If the disk has no room for them.
+          OSError: if the disk is full.
         """
         lines = "".join(json.dumps(row) + "\n" for row in rows).encode()
         if self._file.write(lines) != len(lines):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def sync(self) -> int:
-        """Makes sure that the disk has all rows; returns the length of the file, bytes."""
+        """Flushes all rows to disk, and returns the length of the file, bytes."""
         os.fsync(self._file.fileno())
         return self._file.tell()
 
@@ -256,14 +257,14 @@ class Log:
 
 
 def cut(path: Path, length: int) -> None:
-    """Cuts a log to the length that a checkpoint counts.
+    """Truncates a log to the length that a checkpoint recorded.
 
     Args:
-      path: Of the log.
-      length: In bytes, at the end of a line.
+      path: the log.
+      length: length in bytes, at the end of a line.
 
     Raises:
-      CheckpointError: If the log is shorter, or no line ends there.
+      CheckpointError: if the log is shorter, or no line ends there.
     """
     if not path.exists():
         return
@@ -279,12 +280,12 @@ def cut(path: Path, length: int) -> None:
 
 
 def bring(source: Path, run: Path, logs: Mapping[str, int]) -> None:
-    """Copies the logs of a run that goes on in another directory.
+    """Copies the logs of a run that is resumed in another directory.
 
     Args:
-      source: The directory of the run.
-      run: The other one; the logs of a run that has begun there are left as they are.
-      logs: Bytes of each log that belong to the run, by name; without them all are copied.
+      source: the old directory.
+      run: the new directory. If a run has already begun there, nothing is copied.
+      logs: bytes to copy of each log, by name. Without them, whole logs are copied.
     """
     if (run / CONFIG).exists():
         return
@@ -296,7 +297,7 @@ def bring(source: Path, run: Path, logs: Mapping[str, int]) -> None:
 
 
 def cut_rows(path: Path, update: int) -> None:
-    """Drops the rows of `update` and after, where a checkpoint of an older version counts none."""
+    """Drops the rows of `update` and later, for older checkpoints that record no log lengths."""
     if path.exists():
         rows = [row for row in read_rows(path, None, whole=False) if is_before(row, update)]
         with replacing(path) as temporary:
@@ -304,7 +305,7 @@ def cut_rows(path: Path, update: int) -> None:
 
 
 def is_before(row: Row, update: int) -> bool:
-    """Tells whether a row is of an update before this one."""
+    """Returns whether a row belongs to an update before this one."""
     found = row.get("update")
     return isinstance(found, int) and found < update
 
@@ -313,12 +314,12 @@ def read_rows(path: Path, length: int | None, *, whole: bool = True) -> list[Row
     """Reads the rows of a log.
 
     Args:
-      path: Of the log; none if it is missing.
-      length: Bytes that are read; None for all.
-      whole: Whether a line that is no row is an error. If not, it is left out.
+      path: the log. A missing log has no rows.
+      length: bytes to read; None for all.
+      whole: whether a damaged line is an error. If not, it is skipped.
 
     Raises:
-      CheckpointError: If the log is damaged.
+      CheckpointError: if the log is damaged.
     """
     if not path.exists():
         return []
@@ -334,7 +335,7 @@ def read_rows(path: Path, length: int | None, *, whole: bool = True) -> list[Row
 
 
 def _parsed(line: bytes) -> Row | None:
-    """Reads a row; None if the line is none."""
+    """Parses a row; None if the line is not a row."""
     try:
         row = json.loads(line)
     except (ValueError, RecursionError):

@@ -1,4 +1,4 @@
-"""What a run shows while it trains: a live table on a terminal, plain lines elsewhere."""
+"""Shows a run while it trains: a live table on a terminal, plain lines elsewhere."""
 
 import contextlib
 import time
@@ -15,9 +15,9 @@ from swarmjax import words
 
 Row = Mapping[str, Any]
 
-LINE_SECONDS = 2.0  # least time between two plain lines
-MOST_STAGES = 8  # that the table shows one by one
-GOOD = 0.9  # share of targets above which a stage is counted
+LINE_SECONDS = 2.0  # shortest time between two plain lines
+MOST_STAGES = 8  # with more stages, the table shows only three of them
+GOOD = 0.9  # a stage counts as good if it reaches a larger share of its targets
 _OF_LEVELS = ("levels kept", "success on them", "episodes on them")
 _SPEEDS = (
     ("arena steps/s", "arena_steps_per_s"),
@@ -28,7 +28,7 @@ _SPEEDS = (
 
 
 class Spread(NamedTuple):
-    """A figure over seeds: its mean, and the smallest and the largest."""
+    """A figure over seeds: its mean, minimum and maximum."""
 
     mean: float
     low: float
@@ -36,13 +36,13 @@ class Spread(NamedTuple):
 
 
 class LevelsState(NamedTuple):
-    """How the levels of a stage stand that are kept, mean over seeds.
+    """State of a stage's level buffer, mean over seeds.
 
     Attributes:
-      held: how many.
-      success: on them, 0 to 1; None where there are none.
-      again: share of the episodes that ended in the newest update and had begun on one of them, or
-        on a mutated one; None where none ended.
+      held: levels in the buffer.
+      success: success on them, 0 to 1; None if the buffer is empty.
+      again: share of episodes on kept or mutated levels, among the episodes that ended in the
+        newest update; None if none ended.
     """
 
     held: float
@@ -51,13 +51,14 @@ class LevelsState(NamedTuple):
 
 
 class StageState(NamedTuple):
-    """How a stage stands.
+    """State of a stage.
 
     Attributes:
-      name: of the stage.
+      name: name of the stage.
       arenas: share of the arenas that are on it, mean over seeds.
-      success: share of targets by its newest verdict, over the seeds that have one; None without.
-      levels: that are kept; None without a curriculum over levels.
+      success: share of targets in its newest measurement, over the seeds that have one; None if no
+        seed has one.
+      levels: state of its level buffer; None without a curriculum over levels.
     """
 
     name: str
@@ -67,22 +68,26 @@ class StageState(NamedTuple):
 
 
 def summarize(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
-    """Sums the rows of a call up, on the newest stage of each seed.
+    """Summarises the rows of a call, on the newest stage of each seed.
 
-    Episodes that end in an update are not like those that begin in it: the short ones end first.
-    How good the swarm is, the newest whole cohort says: all episodes that began within one step
-    limit.
+    The episodes that end in an update are a biased sample, because short ones end first. The newest
+    whole cohort measures how good the swarm is: all episodes that began within one step limit.
 
     Args:
-      rows: of all seeds, as `recorder.rows` makes them, those of a seed in their order.
-      names: of the stages, in order.
+      rows: rows of all seeds, as `recorder.rows` makes them. Rows of one seed are in order.
+      names: names of the stages, in order.
 
     Returns:
-      `stage`, the newest one, or the range of them over seeds; `update`; `episodes`; as `Spread`
-      over seeds `cohort_targets` and `cohort_complete`, shares of targets and of episodes in which
-      all arrived, over the newest cohort, None before there is one; `ended_targets`,
-      `contacts_per_robot` and `return`, over the episodes that ended, None where none did;
-      `value_loss` and `policy_loss`; and `stages`, the `StageState` of each.
+      A dictionary. Figures over seeds are a `Spread`.
+
+      - `stage`: the newest stage, or the range of newest stages over seeds.
+      - `update` and `episodes`: counts.
+      - `cohort_targets`: share of targets reached in the newest cohort; None before there is one.
+      - `cohort_complete`: share of its episodes in which all robots arrived; None as above.
+      - `ended_targets`, `contacts_per_robot`, `return`: over the episodes that ended; None if none
+        ended.
+      - `value_loss`, `policy_loss`: the newest losses.
+      - `stages`: the `StageState` of each stage.
     """
     by_seed: dict[int, list[Row]] = {}
     for row in rows:
@@ -101,7 +106,7 @@ def summarize(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
 
 
 def _of_seed(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
-    """Sums the rows of one seed up."""
+    """Summarises the rows of one seed."""
     newest = rows[-1]
     stage = names.index(newest["stage"])
     mine = [row for row in rows if row["stage"] == newest["stage"]]
@@ -122,20 +127,20 @@ def _of_seed(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
 
 
 def spread(values: Sequence[float | None]) -> Spread | None:
-    """Spread of those values that are there, or None if none is."""
+    """Returns the spread of the values that are not None; None if there are none."""
     there = [value for value in values if value is not None]
     return Spread(sum(there) / len(there), min(there), max(there)) if there else None
 
 
 def _stage(last: Sequence[Row], index: int, name: str) -> StageState:
-    """How a stage stands by the last row of each seed."""
+    """Returns the state of a stage, by the last row of each seed."""
     arenas = sum(row["mix"][index] / sum(row["mix"]) for row in last) / len(last)
     success = spread([row["success_by_stage"][index] for row in last])
     return StageState(name, arenas, success, _levels(last, index))
 
 
 def _levels(last: Sequence[Row], index: int) -> LevelsState | None:
-    """How the levels of a stage stand by the last row of each seed."""
+    """Returns the state of a stage's level buffer, by the last row of each seed."""
     if "levels_held" not in last[0]:
         return None
 
@@ -156,10 +161,10 @@ def _levels(last: Sequence[Row], index: int) -> LevelsState | None:
 
 @contextlib.contextmanager
 def working(what: str, console: Console | None = None) -> Iterator[None]:
-    """Shows on a terminal that something is under way and for how long; elsewhere nothing.
+    """Shows on a terminal what is in progress and for how long. Elsewhere, shows nothing.
 
     Args:
-      what: is under way, `compiling` say.
+      what: what is in progress, for example `compiling`.
       console: where to show it; None for standard error, which scripts do not read.
     """
     console = console or Console(stderr=True)
@@ -172,16 +177,16 @@ def working(what: str, console: Console | None = None) -> Iterator[None]:
 
 
 class _Console(Console):
-    """A console whose reader may go away: rich would end the process, with the run."""
+    """A console that survives a broken pipe. Rich would end the process, and the run with it."""
 
     def on_broken_pipe(self) -> None:
-        """Goes on without a reader."""
+        """Continues without a reader."""
 
 
 class Display:
-    """Shows the run on a console. Use it with `with`.
+    """Shows the run on a console, in a `with` block.
 
-    A terminal that is gone, or a pipe without a reader, does not stop the run.
+    A closed terminal or a pipe without a reader does not stop the run.
     """
 
     def __init__(self, updates: int, console: Console | None = None) -> None:
@@ -192,26 +197,26 @@ class Display:
         self._last_line = -LINE_SECONDS
 
     def say(self, sentence: str) -> None:
-        """Prints a sentence that stays."""
+        """Prints a sentence above the live table."""
         with contextlib.suppress(OSError):
             self._console.print(sentence, highlight=False, markup=False, soft_wrap=True)
 
     @contextlib.contextmanager
     def working(self, what: str) -> Iterator[None]:
-        """Shows that something is under way: on a terminal for how long, elsewhere in a line."""
+        """Shows what is in progress: with a timer on a terminal, as one line elsewhere."""
         if not self._console.is_terminal:
             self.say(f"{what} ...")
         with working(what, self._console):
             yield
 
     def hear(self, rows: Sequence[Row], speeds: Row) -> None:
-        """Takes the rows and speeds of a call; whoever listens to a run overrides it."""
+        """Receives the rows and speeds of a call. Subclasses that listen to a run override it."""
 
     def show(self, summary: Row, speeds: Row, seconds_left: float) -> None:
-        """Shows where the run stands."""
+        """Shows the state of the run."""
         if self._console.is_terminal:
             with contextlib.suppress(OSError):
-                self._live.start()  # not before there is a table: what is `working` stands there
+                self._live.start()  # not earlier: until then, `working` uses the terminal
                 table = _table(summary, speeds, self._updates, seconds_left)
                 self._live.update(table, refresh=True)
             return
@@ -221,17 +226,17 @@ class Display:
             self.say(_line(summary, speeds, self._updates, seconds_left))
 
     def __enter__(self) -> "Display":
-        """Returns itself; a terminal's table begins when there is one to show."""
+        """Returns itself. The live table starts with the first call of `show`."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leaves the last table standing."""
+        """Stops the live display and leaves the last table on screen."""
         with contextlib.suppress(OSError):
             self._live.stop()
 
 
 def _table(summary: Row, speeds: Row, updates: int, seconds_left: float) -> Group:
-    """Lays the live table out: how the swarm does beside how fast the run goes, then the stages."""
+    """Lays out the live table: results on the left, speeds on the right, stages below."""
     table = Table(title=f"swarmjax: stage {summary['stage']}", title_justify="left")
     for heading in ("swarm", "run"):
         table.add_column(heading)
@@ -259,7 +264,7 @@ def _table(summary: Row, speeds: Row, updates: int, seconds_left: float) -> Grou
 
 
 def _stage_table(stages: Sequence[StageState]) -> Table:
-    """Lists the stages, or of many the one with most arenas, the best and the worst."""
+    """Lists the stages. If there are many: the one with most arenas, the best and the worst."""
     table = Table(
         caption=_counted(stages), caption_justify="left", box=box.SIMPLE_HEAD, show_edge=False
     )
@@ -279,7 +284,7 @@ def _stage_table(stages: Sequence[StageState]) -> Table:
 
 
 def _levels_cells(levels: LevelsState | None) -> tuple[str, ...]:
-    """Writes how levels stand, for the columns `_OF_LEVELS`; nothing without a buffer."""
+    """Formats the state of a level buffer for the columns `_OF_LEVELS`; empty without a buffer."""
     if levels is None:
         return ()
     shares = ("-" if x is None else f"{100 * x:.0f} %" for x in (levels.success, levels.again))
@@ -287,19 +292,19 @@ def _levels_cells(levels: LevelsState | None) -> tuple[str, ...]:
 
 
 def _measured(stages: Sequence[StageState]) -> list[StageState]:
-    """Stages that have a verdict, the worst first."""
+    """Returns the stages that have been measured, worst first."""
     found = [(stage.success.mean, i) for i, stage in enumerate(stages) if stage.success is not None]
     return [stages[i] for _, i in sorted(found)]
 
 
 def _counted(stages: Sequence[StageState]) -> str:
-    """Says of how many stages the swarm reaches nearly all targets."""
+    """Counts the stages on which the swarm reaches nearly all targets."""
     good = sum(stage.success is not None and stage.success.mean > GOOD for stage in stages)
     return f"{good} of {words.count(len(stages), 'stage')} above {100 * GOOD:.0f} %"
 
 
 def _line(summary: Row, speeds: Row, updates: int, seconds_left: float) -> str:
-    """Says in one line what the table shows."""
+    """Formats the contents of the table in one line."""
     return (
         f"update {summary['update']}/{updates}  stage {summary['stage']}  "
         f"targets reached {measured(summary['cohort_targets'])} "
@@ -315,7 +320,7 @@ def _line(summary: Row, speeds: Row, updates: int, seconds_left: float) -> str:
 
 
 def _stages_in_line(stages: Sequence[StageState]) -> str:
-    """Says how the stages of a curriculum stand; of a single stage all else speaks already."""
+    """Formats the state of a curriculum's stages; empty for a single stage."""
     if len(stages) == 1:
         return ""
     worst = "".join(
@@ -325,7 +330,7 @@ def _stages_in_line(stages: Sequence[StageState]) -> str:
 
 
 def measured(share: Spread | None) -> str:
-    """Writes a share over a whole cohort, or that there is none yet."""
+    """Formats a share over a whole cohort, or says that it is not measured yet."""
     return "not measured yet" if share is None else _percent(share)
 
 
@@ -338,7 +343,7 @@ def _number(value: Spread | None) -> str:
 
 
 def _with_range(found: Spread | None, write: Callable[[float, int], str], unit: str) -> str:
-    """Writes a mean, with the range of several seeds a digit shorter."""
+    """Formats a mean and the range over seeds, the range with one digit less."""
     if found is None:
         return "-"
     text = f"{write(found.mean, 1)}{unit}"

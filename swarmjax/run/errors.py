@@ -1,17 +1,17 @@
-"""Errors that are the user's to mend, where a command can name them without loading JAX."""
+"""Errors that the user can fix. Commands can import them without loading JAX."""
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that is missing, damaged or of another run, in one sentence."""
+    """Says in one sentence that a checkpoint is missing, damaged or from another run."""
 
 
 class TrainingError(RuntimeError):
-    """A run that cannot go on, in one sentence."""
+    """Says in one sentence why a run cannot continue."""
 
 
 class DivergedError(RuntimeError):
-    """A run that learns nothing any more, in one sentence."""
+    """Says in one sentence that a run has stopped learning."""
 
 
 class LostPeerError(RuntimeError):
-    """A process of a run whose others are gone, in one sentence."""
+    """Says in one sentence that another process of the run is gone."""

@@ -1,4 +1,4 @@
-"""From the checked settings of a run to its exit code: caches, memory, and the closing lines."""
+"""Runs checked settings and returns an exit code: caches, memory, and the closing lines."""
 
 import math
 import os
@@ -21,12 +21,12 @@ from swarmjax.run.trainer import Tally, measure
 
 
 def execute(settings: TrainConfig, stop: Stop, *, auto: bool) -> int:
-    """Trains as the settings say.
+    """Trains a run.
 
     Args:
-      settings: of the run.
+      settings: the run's config.
       stop: notices signals.
-      auto: whether its number of arenas is still to be chosen.
+      auto: whether the number of arenas is still to be chosen.
 
     Returns:
       The exit code of the command.
@@ -50,14 +50,14 @@ def execute(settings: TrainConfig, stop: Stop, *, auto: bool) -> int:
 
 
 def fill(settings: TrainConfig) -> tuple[TrainConfig, str]:
-    """Chooses the number of arenas; returns the settings with it, and why it is that."""
+    """Chooses the number of arenas, and returns the settings with it and the reason."""
     available = None if jax.default_backend() == "cpu" else memory.limit()
     with memory.refusal(settings), working("finding out how many arenas fit"):
         return memory.fill(settings, measure, available)
 
 
 def _run(settings: TrainConfig, stop: Stop) -> int:
-    """Does what the config says; returns the exit code."""
+    """Trains, or with `run.dry` only describes the run, and returns the exit code."""
     try:
         if settings.run.dry:
             with Display(settings.updates) as display:
@@ -84,17 +84,17 @@ def _train(run: Path, settings: TrainConfig, stop: Stop) -> int:
 
 
 def _tell(text: str) -> None:
-    """Writes to standard output, whose reader may be gone."""
+    """Writes to standard output. The reader of a pipe may be gone."""
     try:
         sys.stdout.write(text)
         sys.stdout.flush()
     except OSError:
-        # Python flushes it again at exit, and would end with code 120.
+        # Python would flush it again at exit, fail, and exit with code 120.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _success(settings: TrainConfig, tally: Tally) -> str:
-    """Says how good the swarm is on the furthest stage that was measured."""
+    """Describes how good the swarm is on the furthest measured stage."""
     last = settings.stage[-1].name
     for stage in reversed(settings.stage):
         found = spread([of_seed.get(stage.name) for of_seed in tally.targets_reached.values()])
@@ -116,7 +116,7 @@ def _success(settings: TrainConfig, tally: Tally) -> str:
 
 
 def _closing(run: Path, settings: TrainConfig, tally: Tally) -> str:
-    """Says what to do next."""
+    """Describes what to do next."""
     if tally.update < settings.updates:
         saved = max(checkpoint.steps(run), default=0)
         how = "saved" if saved == tally.update else f"saved at update {saved:,}, the last sound one"

@@ -1,4 +1,4 @@
-"""The runs of a grid of settings: words such as `grid.algo.epochs=1,2`, multiplied out."""
+"""Expands a grid of settings, such as `grid.algo.epochs=1,2`, into runs."""
 
 import itertools
 import math
@@ -13,8 +13,8 @@ from swarmjax.run.settings import TrainConfig, load_run
 
 GRID = "grid."
 MOST_CELLS = 256
-_MOST_LETTERS = 5000  # of a word of the grid
-# What each cell is given here.
+_MOST_LETTERS = 5000  # in one word of the grid
+# Keys that this module sets for each cell.
 _OWN = ("resume", "run.dir", "run.coordinator", "run.processes", "run.process", "run.dry")
 
 
@@ -25,8 +25,8 @@ class GridCell:
     Attributes:
       label: the values, as words.
       run: its run directory.
-      words: of `swarmjax.train`, which train it or go on with it.
-      settings: what they come to.
+      words: words for `swarmjax.train`, which begin or continue its run.
+      settings: the config that these words give.
     """
 
     label: str
@@ -36,7 +36,7 @@ class GridCell:
 
     @property
     def is_done(self) -> bool:
-        """Whether its run has spent its budget."""
+        """Whether the cell's run has spent its budget."""
         path = self.run / SUMMARY
         found = reading.read_json(path) if path.exists() else None
         if not isinstance(found, dict):
@@ -45,17 +45,17 @@ class GridCell:
 
 
 def multiply(folder: Path, typed: Sequence[str]) -> list[GridCell]:
-    """Multiplies a grid out.
+    """Expands a grid into its cells.
 
     Args:
-      folder: of the run directories.
-      typed: words `grid.KEY=VALUE,VALUE`, and those `KEY=VALUE` that all cells share.
+      folder: the folder for the run directories.
+      typed: words `grid.KEY=VALUE,VALUE`, and words `KEY=VALUE` that all cells share.
 
     Returns:
-      Cells, the values of the last key varying fastest.
+      The cells. The values of the last key vary fastest.
 
     Raises:
-      ConfigError: if a word is unsound or one cell is, or there are none or too many.
+      ConfigError: if a word or a cell is invalid, or if there are no cells or too many.
     """
     grid: dict[str, list[str]] = {}
     shared = []
@@ -78,7 +78,7 @@ def multiply(folder: Path, typed: Sequence[str]) -> list[GridCell]:
 
 
 def _check_once(key: str, given: set[str]) -> None:
-    """Refuses a key that a word before has given."""
+    """Refuses a key that an earlier word has given."""
     if key.removeprefix(GRID) in given:
         raise ConfigError(f"{key.removeprefix(GRID)} is given twice: give each key once.")
 

@@ -1,8 +1,8 @@
-"""Several processes that train one run, on one host or on many.
+"""Lets several processes train one run, on one or more hosts.
 
-The first process shows the run and writes its directory; the others write into a folder that is
-thrown away. All of them call the program in step, so they decide together what depends on a clock
-or on a signal.
+The first process shows the run and writes its directory. The others write into a temporary folder.
+All processes must call the program in step. So they decide together about anything that depends on
+a clock or a signal.
 """
 
 import contextlib
@@ -24,8 +24,8 @@ from swarmjax.run.errors import LostPeerError
 from swarmjax.run.settings import TrainConfig, leaves
 
 AUTO = "auto"
-CHECKPOINTS = "checkpoints"  # folder of a run directory
-# A sentence within a minute, where a process never comes; within half of one, where one is lost.
+CHECKPOINTS = "checkpoints"  # folder in a run directory
+# A missing process is reported within a minute, and a lost one within half a minute.
 _JOIN_S, _HEARTBEAT_S = 45, 20
 # Keys that may differ between processes.
 _OWN = ("run.coordinator", "run.processes", "run.process", "run.id")
@@ -35,10 +35,10 @@ def join(settings: TrainConfig) -> None:
     """Joins the other processes of a run, if its settings name any.
 
     Args:
-      settings: of the run.
+      settings: the run's config.
 
     Raises:
-      ConfigError: if the others do not come, or have other settings or versions.
+      ConfigError: if the other processes do not join, or have other settings or versions.
     """
     run = settings.run
     if run.coordinator is None:
@@ -56,7 +56,7 @@ def join(settings: TrainConfig) -> None:
             heartbeat_timeout_seconds=_HEARTBEAT_S,
             shutdown_timeout_seconds=_HEARTBEAT_S,
         )
-    except Exception as error:  # of any type that JAX's transport raises
+    except Exception as error:  # JAX's transport raises errors of many types
         reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
         raise ConfigError(
             f"run.coordinator is {show(run.coordinator)}, but the processes of the run did not "
@@ -68,27 +68,27 @@ def join(settings: TrainConfig) -> None:
 
 
 def count() -> int:
-    """Counts the processes of this run."""
+    """Returns the number of processes of this run."""
     import jax
 
     return jax.process_count()
 
 
 def is_first() -> bool:
-    """Tells whether this process shows the run and writes it."""
+    """Returns whether this process shows and writes the run."""
     import jax
 
     return jax.process_index() == 0
 
 
 def share(value: int) -> np.ndarray:
-    """Tells all processes a number of each.
+    """Shares one number per process among all processes.
 
     Args:
-      value: of this process, of 32 bits.
+      value: number of this process, 32 bits.
 
     Returns:
-      [P], that of every process, in their order.
+      [P] the numbers of all processes, in order.
     """
     if count() == 1:
         return np.array([value])
@@ -98,7 +98,7 @@ def share(value: int) -> np.ndarray:
 
 
 def share_text(text: str) -> str:
-    """Gives all processes the text of the first."""
+    """Returns the text of the first process, on all processes."""
     if count() == 1:
         return text
     from jax.experimental import multihost_utils
@@ -111,7 +111,7 @@ def share_text(text: str) -> str:
 
 
 def gather(tree: Any) -> Any:
-    """Brings arrays that are spread over hosts together, on every process."""
+    """Gathers arrays that are spread over hosts, on every process."""
     if count() == 1:
         return tree
     import jax
@@ -129,10 +129,10 @@ def gather(tree: Any) -> Any:
 
 @contextlib.contextmanager
 def lost_peers() -> Iterator[None]:
-    """Turns what JAX raises when another process is gone into a sentence.
+    """Replaces JAX's error about a lost process by one sentence.
 
     Raises:
-      LostPeerError: if one is gone.
+      LostPeerError: if another process is gone.
     """
     import jax
 
@@ -147,12 +147,13 @@ def lost_peers() -> Iterator[None]:
 
 @contextlib.contextmanager
 def own_directory(run: Path) -> Iterator[Path]:
-    """Gives the first process the run directory, and the others one that is thrown away.
+    """Gives the first process the run directory, and the others a temporary directory.
 
-    The others are quiet besides, and find the checkpoints of the first there.
+    The temporary directory links to the checkpoints of the first process. The other processes also
+    print nothing.
 
     Args:
-      run: The run directory, of the first process.
+      run: the run directory of the first process.
     """
     shared = Path(share_text(str(run.resolve())))
     if is_first():
@@ -170,10 +171,10 @@ def own_directory(run: Path) -> Iterator[Path]:
 
 
 def leave(code: int) -> NoReturn:
-    """Ends a process whose peers are gone at once: at exit, JAX would wait for them.
+    """Ends this process at once. At a normal exit, JAX would wait for the lost processes.
 
     Args:
-      code: Of the exit.
+      code: the exit code.
     """
     sys.stdout.flush()
     sys.stderr.flush()
@@ -181,7 +182,7 @@ def leave(code: int) -> NoReturn:
 
 
 def _check_alike(settings: TrainConfig) -> None:
-    """Refuses processes that would not run the same program."""
+    """Refuses processes that would run different programs."""
     mine = json.dumps(_comparable(settings), sort_keys=True)
     first = share_text(mine)
     digests = share(zlib.crc32(mine.encode()) >> 1)
@@ -201,7 +202,7 @@ def _check_alike(settings: TrainConfig) -> None:
 
 
 def _comparable(settings: TrainConfig) -> dict[str, Any]:
-    """Flattens what all processes must have alike to dotted keys."""
+    """Returns the settings and versions that all processes must share, by dotted key."""
     found = {key: value for key, value in leaves(to_dict(settings)).items() if key not in _OWN}
     return found | {f"version of {name}": value for name, value in provenance.versions().items()}
 

@@ -1,4 +1,4 @@
-"""A run, from its config to its finished directory."""
+"""Carries out a run, from its config to its finished directory."""
 
 import json
 import math
@@ -32,37 +32,39 @@ from swarmjax.training import mesh, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
 
-_LOWERED = 0.1  # what the learning rates of a run that diverged are multiplied by
+_LOWERED = 0.1  # factor on the learning rates of a run that diverged
 _GIVE_UP = (
     "It had gone back once already: give lower algo.actor_learning_rate and "
     "algo.critic_learning_rate, or look at metrics.jsonl for what broke."
 )
-_PRICE = "learners/price/"  # of checkpoints written while algo.contact_limit was a key
+_PRICE = "learners/price/"  # in checkpoints from the time when algo.contact_limit was a key
 
 
 def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) -> Tally:
-    """Trains as a config says, and writes what a run directory holds.
+    """Trains a run and writes its directory.
+
+    With `resume` the run continues. If its budget is already spent, nothing is compiled, and only
+    the missing files of its directory are written.
 
     Args:
-      settings: the config; with `resume` it goes on. A run whose budget is spent is not compiled:
-        what its directory lacks is written.
-      run: the run directory, in which there is no other run.
+      settings: the config.
+      run: the run directory, which must hold no other run.
       stop: notices signals.
       display: shows the run.
 
     Returns:
-      What came of the run.
+      The totals of the run.
 
     Raises:
-      ConfigError: if it cannot begin as the config says, or needs more memory than there is, or
-        another process writes the directory.
-      CheckpointError: if what it goes on with is damaged.
-      TrainingError: if the run diverges again after it went back once, or its directory cannot be
-        written any more.
-      StoppedError: if somebody asked to stop before there was anything to save.
+      ConfigError: if the config cannot be run, training needs more memory than there is, or another
+        process is writing the directory.
+      CheckpointError: if the checkpoint or logs of a resumed run are damaged.
+      TrainingError: if the run diverges again after it went back once, or its directory can no
+        longer be written.
+      StoppedError: if a stop was requested before there was anything to save.
     """
     with directory.locked(run):
-        if hosts.is_first():  # the folder of the others links to checkpoints of the first
+        if hosts.is_first():  # the other processes' folders link to the first one's checkpoints
             check_free(run, settings)
         name = settings.run.id or hosts.share_text(directory.new_id())
         settings = replace(settings, run=replace(settings.run, id=name))
@@ -103,7 +105,7 @@ def _train(
     source: Source | None,
     kept: Kept | None,
 ) -> Tally:
-    """Trains from a checkpoint, or from the seed and what `source` had learned."""
+    """Trains from a checkpoint, or from the seed with the networks of `source`, if given."""
     stop.check()
     with working("building the arenas"):
         program, schedule, init, template = _load(_scaled(settings, kept))
@@ -136,7 +138,7 @@ def _scaled(settings: TrainConfig, kept: Kept | None) -> TrainConfig:
 def _first_sentences(
     program: Built, run: Path, source: Source | None, kept: Kept | None, skipped: list[str]
 ) -> Iterator[str]:
-    """Says what is trained, by what, and what it begins with."""
+    """Describes what is trained, what steps the robots, and what the run starts from."""
     settings = program.config
     yield f"{_opening(program)}; into {run}"
     if settings.extensions is not None:
@@ -147,11 +149,11 @@ def _first_sentences(
         yield f"{sentence}."
     if kept is not None and not kept.has_arenas:
         yield (
-            "the checkpoint holds no arenas (run.checkpoint_arenas=false): they are drawn again, "
-            "and the curriculum begins to measure its stages with them."
+            "the checkpoint holds no arenas (run.checkpoint_arenas=false): new ones are drawn, and "
+            "the curriculum measures its stages again from here."
         )
     if settings.resume is not None and kept is None:
-        yield f"{settings.resume} has no checkpoint yet: it begins from its seed."
+        yield f"{settings.resume} has no checkpoint yet: the run begins from its seed."
     if kept is not None and settings.resume is not None:
         yield from _dealt_again(settings)
     if source is not None:
@@ -159,23 +161,23 @@ def _first_sentences(
         as_there = describe(settings.robot, settings.task, settings.realism)
         yield (
             f"starting with what {source.run} had learned after {updates}; robot, task, realism "
-            f"and network as there, unless told otherwise: {as_there}"
+            f"and network are the same as there, unless given here: {as_there}"
         )
 
 
 def _dealt_again(settings: TrainConfig) -> Iterator[str]:
-    """Says that a run goes on with other random streams than it had."""
+    """Yields a sentence if a resumed run has another number of random streams than before."""
     before = from_stored(read_config(Path(settings.resume or ""))).stream_count
     now = settings.stream_count
     if now != before:
         yield (
-            f"random numbers come in {words.count(now, 'stream')} from here on, and not in "
-            f"{before}: what was learned is kept, and other levels are drawn than would have been."
+            f"random numbers come in {words.count(now, 'stream')} from here on, not {before}: what "
+            "was learned is kept, but the levels drawn from here on differ."
         )
 
 
 def _read_kept(settings: TrainConfig) -> Kept | None:
-    """Reads the newest sound checkpoint of the run that is resumed, if it has any."""
+    """Reads the newest sound checkpoint of the resumed run, if there is one."""
     if settings.resume is None or not checkpoint.steps(Path(settings.resume)):
         return None
     directory.check_regular(Path(settings.resume))
@@ -190,7 +192,7 @@ def _read_kept(settings: TrainConfig) -> Kept | None:
 
 
 def _complete(run: Path, settings: TrainConfig, kept: Kept, display: Display) -> Tally:
-    """Writes what the directory of a run lacks whose budget is spent; trains nothing."""
+    """Writes the missing files of a run whose budget is spent, and trains nothing."""
     current = _is_summed_up(run, kept.update)
     if not current:
         _open_run(run, settings, kept)
@@ -215,9 +217,9 @@ def _complete(run: Path, settings: TrainConfig, kept: Kept, display: Display) ->
 
 
 def _is_summed_up(run: Path, update: int) -> bool:
-    """Tells whether a summary says that the budget was spent with this update.
+    """Returns whether the summary says that the budget was spent at this update.
 
-    It is the last file that is written, so the others are then as new.
+    The summary is the last file that a run writes. If it is current, so are the others.
     """
     try:
         found = json.loads((run / directory.SUMMARY).read_text())
@@ -227,9 +229,9 @@ def _is_summed_up(run: Path, update: int) -> bool:
 
 
 def _load(settings: TrainConfig) -> tuple[Built, Schedule, Any, TrainState]:
-    """Builds the program, the curriculum's numbers, what starts a run, and its state's shapes."""
+    """Builds the program, the curriculum's numbers, the init function and the state's shapes."""
     program, schedule = programs.load(settings, by_robot=settings.run.episodes)
-    init = jax.jit(mesh.init(program))  # traced once, for the shapes and for the state
+    init = jax.jit(mesh.init(program))  # traced once, both for the shapes and for the state
     template = init.eval_shape(schedule)
     memory.check_buffer(settings, seeds.size(template.curriculum.levels), memory.limit())
     memory.check_state(settings, mesh.bytes_each(settings, template), memory.limit())
@@ -237,13 +239,13 @@ def _load(settings: TrainConfig) -> tuple[Built, Schedule, Any, TrainState]:
 
 
 def begin(settings: TrainConfig) -> tuple[Built, Schedule, TrainState]:
-    """Builds a run that begins: its program, its curriculum's numbers and its first state.
+    """Builds a new run: its program, its curriculum's numbers and its first state.
 
     Args:
       settings: the config.
 
     Raises:
-      ConfigError: if it cannot begin as the config says.
+      ConfigError: if the config cannot be run.
     """
     program, schedule, init, template = _load(settings)
     source = warm_start.read(settings)
@@ -259,9 +261,12 @@ def _first_state(
     source: Source | None,
     kept: Kept | None,
 ) -> tuple[TrainState, list[str]]:
-    """Starts from the seed, or from the checkpoint of the run that is resumed.
+    """Makes the first state, from the seed or from the checkpoint of the resumed run.
 
     A start from the seed takes the networks and normalisers of `source`, if there is one.
+
+    Returns:
+      The state, and a sentence for each item that was skipped.
     """
     settings = program.config
     if kept is None:
@@ -280,10 +285,10 @@ def _first_state(
 
 
 def find_run(settings: TrainConfig) -> Path:
-    """Finds a run directory that can be written and holds no other run; writes nothing.
+    """Finds a writable run directory without another run in it, and writes nothing.
 
     Raises:
-      ConfigError: if there is none, or a library that the run asks for is missing.
+      ConfigError: if there is none, or if a library that the config needs is missing.
     """
     weights_and_biases.check(settings)
     every = seeds.numbers(settings)
@@ -300,7 +305,7 @@ def find_run(settings: TrainConfig) -> Path:
 
 
 def check_free(run: Path, settings: TrainConfig) -> None:
-    """Refuses a directory that holds a run, unless it is the one that goes on."""
+    """Refuses a directory that holds a run, unless that run is resumed."""
     directory.check_regular(run)
     resumed = settings.resume is not None and Path(settings.resume).resolve() == run.resolve()
     if (run / directory.CONFIG).exists() and not resumed:
@@ -316,7 +321,7 @@ def check_free(run: Path, settings: TrainConfig) -> None:
 
 
 def _open_run(run: Path, settings: TrainConfig, kept: Kept | None) -> None:
-    """Writes `config.json`, and brings the logs of a run that goes on in another directory."""
+    """Writes `config.json`, and copies the logs if a run is resumed in another directory."""
     stored = to_dict(replace(settings, resume=None))
     if settings.resume is not None:
         source = Path(settings.resume)
@@ -330,19 +335,19 @@ def _open_run(run: Path, settings: TrainConfig, kept: Kept | None) -> None:
 
 
 def dry_run(settings: TrainConfig, stop: Stop, display: Display) -> int:
-    """Compiles, says what it took and what a run needs, and stops.
+    """Compiles a run, prints the time and memory that it needs, and trains nothing.
 
     Args:
       settings: the config.
       stop: notices signals.
-      display: shows what is done.
+      display: shows the progress.
 
     Returns:
       The exit code.
 
     Raises:
       ConfigError: as `carry_out`.
-      StoppedError: if somebody asked to stop.
+      StoppedError: if a stop was requested.
     """
     weights_and_biases.check(settings)
     with working("building the arenas"):
@@ -364,7 +369,7 @@ def dry_run(settings: TrainConfig, stop: Stop, display: Display) -> int:
 
 
 def _opening(program: Built) -> str:
-    """Says what is about to be trained, where, and what steps the robots."""
+    """Describes what is about to be trained, on which device, and what steps the robots."""
     settings, engine = program.config, program.world.physics.engine
     names = ", ".join(stage.name for stage in settings.stage)
     steps, every = settings.arenas * settings.algo.rollout_length, seeds.numbers(settings)
@@ -385,7 +390,7 @@ def _opening(program: Built) -> str:
 
 
 def _learning(settings: TrainConfig) -> str:
-    """Says how many gradient steps a run takes, and with which learning rates it begins."""
+    """Describes the number of gradient steps of a run, and its first learning rates."""
     steps = words.count(optimizer.gradient_steps(settings.algo, settings.updates), "gradient step")
     rates = optimizer.learning_rates(settings.algo, settings.updates)
     return (
@@ -394,7 +399,7 @@ def _learning(settings: TrainConfig) -> str:
 
 
 def _own_pieces(settings: TrainConfig) -> str:
-    """Names the pieces of an extension that are used."""
+    """Lists the pieces of the extension that a run uses."""
     chosen = pieces.choose(extension.load(settings.extensions), settings.task, settings.stage)
     used = {stage.level for stage in settings.stage}
     found = [
@@ -407,7 +412,7 @@ def _own_pieces(settings: TrainConfig) -> str:
 
 
 def _short_budget(settings: TrainConfig, schedule: Schedule) -> list[str]:
-    """Says where stages need more of the budget than they are to have, in no or one sentence."""
+    """Warns, in at most one sentence, if the budget is too short for the stages."""
     share = settings.curriculum.budget_share
     if share is None or settings.curriculum.prerequisites:
         return []
@@ -417,17 +422,16 @@ def _short_budget(settings: TrainConfig, schedule: Schedule) -> list[str]:
     when = f"begin as late as update {begins:,}" if begins < settings.updates else "never begin"
     least = words.count(int(schedule.cohort_updates), "update")
     return [
-        f"the budget is short: a stage takes at least {least} (one step limit), so that "
-        f"{settings.stage[-1].name}, the last, may {when}, where "
-        f"curriculum.budget_share={share} asks for {latest:,} at the latest: give more budget, "
-        "fewer arenas or fewer stages."
+        f"the budget is short: each stage takes at least {least} (one step limit), so the last "
+        f"stage, {settings.stage[-1].name}, may {when}, but curriculum.budget_share={share} asks "
+        f"for update {latest:,} at the latest: give more budget, fewer arenas or fewer stages."
     ]
 
 
 def _write_policies(
     run: Path, settings: TrainConfig, leaves: Leaves, update: int, *, only_missing: bool = False
 ) -> None:
-    """Writes the policy of every seed, or of those alone that have none."""
+    """Writes the policy of every seed, or only the missing ones."""
     for seed in seeds.numbers(settings):
         file = seed_path(run / POLICY, settings, seed)
         if not (only_missing and file.exists()):

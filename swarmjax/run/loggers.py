@@ -1,7 +1,8 @@
-"""Where a run's figures go besides its own files: TensorBoard, W&B and functions.
+"""Sends a run's figures to loggers: TensorBoard, W&B and Python functions.
 
-`metrics.jsonl` is the run's own record: it is written first, checkpoints count it, and a run that
-cannot write it ends. A logger holds nothing that the record does not, so that none ends a run.
+`metrics.jsonl` is the run's own record. It is written first, checkpoints record its length, and a
+run that cannot write it ends. A logger holds nothing beyond this record, so its failure does not
+end a run.
 """
 
 import contextlib
@@ -15,101 +16,102 @@ from typing import Any, Protocol, runtime_checkable
 
 from swarmjax.run.directory import Row
 
-MOST_PENDING = 100  # calls of the program that a logger may be behind
-PATIENCE_S = 60.0  # s, that a run waits for a logger which is so far behind, and at its end
+MOST_PENDING = 100  # how many calls of the program a logger may lag behind
+PATIENCE_S = 60.0  # s, how long a run waits for a logger that lags further, and at the run's end
 
 
 @runtime_checkable
 class Logger(Protocol):
-    """A place for a run's figures.
+    """A destination for a run's figures.
 
-    What is guaranteed, where the run calls it (`Guarded`):
+    The run calls it through `Guarded`, which guarantees:
 
-    - All calls come from one thread of the logger's own, one after the other; `close` is the last.
-    - Rows are those of `metrics.jsonl`, value by value. They come in the order of the updates, the
-      seeds of an update together, and each comes once.
-    - A run that goes on from a checkpoint, or goes back to one after it diverged, writes the rows
-      after the checkpoint again: `update` falls, and what came later counts. Without divergence
-      they are the same numbers as before, but for seconds.
-    - What raises is not called again, but for `close`. A sentence says so, and the run goes on.
-    - A run waits for a logger that is `MOST_PENDING` calls behind, and at its end, but never longer
-      than `PATIENCE_S`; then it goes on without.
+    - All calls come from one dedicated thread, one after the other. `close` is the last.
+    - The rows are those of `metrics.jsonl`, value by value. Each row comes once, in the order of
+      the updates, with the seeds of an update together.
+    - If a run resumes from a checkpoint, or goes back to one after it diverged, the rows after the
+      checkpoint come again. Then `update` drops, and the later rows are the valid ones. Without
+      divergence they repeat the earlier numbers, except for times in seconds.
+    - A logger that raises an error is not called again, except for `close`. The run prints a
+      message and continues.
+    - A run waits for a logger that lags `MOST_PENDING` calls behind, and at its end. After
+      `PATIENCE_S` it continues without the logger.
 
     Attributes:
-      name: what sentences call it.
+      name: name of the logger in messages.
     """
 
     name: str
 
     def write(self, rows: Sequence[Row], speeds: Row) -> None:
-        """Takes the rows of a call of the program, which others read too.
+        """Receives the rows of a call. Other loggers read the same rows, so do not change them.
 
         Args:
-          rows: an update and seed each, as `recorder.rows` makes them.
-          speeds: of the call, all seeds together: `arena_steps_per_s` and so on.
+          rows: one for each update and seed, as `recorder.rows` makes them.
+          speeds: speeds of the call over all seeds: `arena_steps_per_s` and so on.
         """
         ...
 
     def attach(self, name: str, path: Path, arena_steps: int) -> None:
-        """Takes a figure, or the place of a page.
+        """Receives a figure or the path of a page.
 
         Args:
-          name: of the figure or page.
-          path: of a file; a figure is a PNG.
-          arena_steps: of a seed, which the run had done.
+          name: name of the figure or page.
+          path: path of the file; a figure is a PNG.
+          arena_steps: arena steps per seed that the run had done.
         """
         ...
 
     def close(self) -> None:
-        """Ends; nothing comes after it."""
+        """Closes the logger. No call follows."""
         ...
 
 
 class Calls:
-    """Calls a function of Python's with each row."""
+    """Calls a Python function with each row."""
 
     name = "log"
 
     def __init__(self, call: Callable[[Row], object]) -> None:
-        """Keeps the function, whose answers count for nothing."""
+        """Stores the function. Its return values are ignored."""
         self._call = call
 
     def write(self, rows: Sequence[Row], speeds: Row) -> None:
-        """Hands on a copy of each row: the function may keep or change it."""
+        """Passes a copy of each row, since the function may keep or change it."""
         del speeds
         for row in rows:
             self._call(copy.deepcopy(row))
 
     def attach(self, name: str, path: Path, arena_steps: int) -> None:
-        """Takes nothing: a function of rows has no place for it."""
+        """Does nothing, since the function accepts only rows."""
 
     def close(self) -> None:
         """Does nothing."""
 
 
 class Guarded:
-    """Calls a logger in a thread, so that neither its pace nor its failure is the run's."""
+    """Calls a logger in a thread, so that it can neither slow down nor stop the run."""
 
     def __init__(self, logger: Logger) -> None:
-        """Calls nothing yet."""
+        """Prepares the thread, but calls nothing yet."""
         self._logger = logger
         self._jobs: queue.Queue[tuple[Callable[..., None], tuple] | None] = queue.Queue(
             MOST_PENDING
         )
-        # Python does not wait for a daemon at its end, which could be for ever.
+        # A daemon, because at exit Python would wait for other threads, perhaps forever.
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._lost = False
 
     def write(self, rows: Sequence[Row], speeds: Row) -> None:
-        """Has the rows of a call written."""
+        """Queues the rows of a call."""
         self._put((self._logger.write, (rows, speeds)))
 
     def attach(self, name: str, path: Path, arena_steps: int) -> None:
-        """Has a figure or the place of a page written."""
+        """Queues a figure or the path of a page."""
         self._put((self._logger.attach, (name, path, arena_steps)))
 
     def close(self) -> None:
-        """Waits until everything is written, at most `PATIENCE_S`."""
+        """Waits until everything is written, for at most `PATIENCE_S`."""
         if not self._thread.ident:  # nothing was written
             return
         self._put(None)
@@ -118,7 +120,7 @@ class Guarded:
             self._lose(f"it has not taken everything after {PATIENCE_S:g} s")
 
     def _put(self, job: tuple[Callable[..., None], tuple] | None) -> None:
-        """Hands a job over; None is the last."""
+        """Queues a job. None ends the thread."""
         if not self._thread.ident:
             self._thread.start()
         try:
@@ -136,20 +138,20 @@ class Guarded:
     def _try(self, what: Callable[..., None], *arguments: Any) -> None:
         try:
             what(*arguments)
-        except BaseException as error:  # of a library or a user's function
+        except BaseException as error:  # anything that a library or a user's function raises
             self._lose(_why(error))
 
     def _lose(self, why: str) -> None:
-        """Calls the logger no more, and says so once."""
+        """Stops calling the logger, and reports this once."""
         if self._lost:
             return
         self._lost = True
-        with contextlib.suppress(OSError, ValueError):  # a terminal that is gone
+        with contextlib.suppress(OSError, ValueError):  # the terminal may be gone
             sys.stderr.write(f"swarmjax: {self._logger.name} is not written from here on: {why}.\n")
 
 
 def _why(error: BaseException) -> str:
-    """Says in one line what went wrong."""
+    """Describes an error in one line."""
     text = (str(error).strip().splitlines() or [""])[0][:200].rstrip(".")
     if text and isinstance(error, OSError | ImportError):
         return text

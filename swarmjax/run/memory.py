@@ -1,10 +1,9 @@
-"""How many arenas a device's memory holds, found before a run is given any of it.
+"""Estimates how many arenas fit into a device's memory, before the run allocates any of it.
 
-A compiled program says what it takes: its arguments, what it works with, and what it returns but
-for what lies where donated arguments lay. That is a straight line in the number of arenas
-(docs/design-notes.md), so that two small programs, compiled and never run, tell what a large one
-takes.
-Warp's own temporary arrays are not in it: they lie outside of what JAX takes of a card.
+A compiled program reports the memory of its arguments, temporaries and results. Results that reuse
+donated arguments do not count. The total grows linearly with the number of arenas
+(docs/design-notes.md). So two small programs, compiled but never run, predict the memory of a large
+one. Warp's temporary arrays are not included, because they lie outside JAX's share of the GPU.
 """
 
 import contextlib
@@ -17,18 +16,18 @@ import jax
 from swarmjax.config import ConfigError
 from swarmjax.run.settings import TrainConfig
 
-ON_CPU = 128  # the default: more leave fewer updates of a budget, and gain little there
-PROBE = 4096  # arenas of the larger small program: every accelerator holds them
-MARGIN = 0.95  # of what fits by proportion: a program also has what does not grow with its arenas
-# What XLA, CUDA and Warp through it, call memory that they did not get.
+ON_CPU = 128  # the default. More arenas leave fewer updates and gain little speed on a CPU.
+PROBE = 4096  # most arenas of the two small programs. Every accelerator holds them.
+MARGIN = 0.95  # on the proportional estimate: part of a program's memory does not grow with arenas
+# How XLA, CUDA, and Warp through CUDA, report a failed allocation.
 _EXHAUSTED = ("RESOURCE_EXHAUSTED", "OUT_OF_MEMORY", "Failed to allocate")
 
 
 def limit() -> int | None:
-    """Finds the memory of the first device: what JAX may take of a card, all that a computer has.
+    """Finds the memory of the first device: JAX's share of a GPU, or the host's whole memory.
 
     Returns:
-      Bytes; None where nobody tells.
+      Bytes; None if the device or the system does not report it.
     """
     device = jax.local_devices()[0]
     if device.platform == "cpu":
@@ -38,23 +37,23 @@ def limit() -> int | None:
 
 
 def _host_memory() -> int | None:
-    """Memory of this computer, bytes; None where the operating system does not say."""
+    """Returns the memory of this computer, bytes; None if the system does not report it."""
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):  # Windows has none of it
+    except (AttributeError, ValueError, OSError):  # Windows has no sysconf
         return None
 
 
 def check_buffer(settings: TrainConfig, needed: int, available: int | None) -> None:
-    """Refuses a buffer of levels that is larger than the memory by itself.
+    """Refuses a buffer of levels that alone is larger than the memory.
 
     Args:
-      settings: of the run.
-      needed: by the buffers of all seeds, each of which a device holds whole, bytes.
-      available: bytes; None if it is not known, and then nothing is refused.
+      settings: the run's config.
+      needed: memory for the buffers of all seeds, bytes. A device holds each buffer whole.
+      available: memory of the device, bytes; None if unknown, and then nothing is refused.
 
     Raises:
-      ConfigError: with what is surely too much.
+      ConfigError: if the buffer cannot fit. The message names a size that is certainly too large.
     """
     if available is not None and needed > available:
         levels = settings.curriculum.levels.buffer or 0
@@ -67,15 +66,16 @@ def check_buffer(settings: TrainConfig, needed: int, available: int | None) -> N
 
 
 def check_state(settings: TrainConfig, needed: int, available: int | None) -> None:
-    """Refuses a run whose state alone, known before anything is compiled, is too large.
+    """Refuses a run whose state alone is too large, before anything is compiled.
 
     Args:
-      settings: of the run.
-      needed: by the state, bytes.
-      available: bytes; None if it is not known, and then nothing is refused.
+      settings: the run's config.
+      needed: memory for the state, bytes.
+      available: memory of the device, bytes; None if unknown, and then nothing is refused.
 
     Raises:
-      ConfigError: with what is surely too much; training takes many times its state.
+      ConfigError: if the state cannot fit. The message names a number of arenas that is certainly
+        too large, because training takes many times the memory of its state.
     """
     if available is not None and needed > available:
         advice = _advice(settings, "less than", settings.arenas * available / needed)
@@ -83,15 +83,15 @@ def check_state(settings: TrainConfig, needed: int, available: int | None) -> No
 
 
 def check(settings: TrainConfig, needed: int, available: int | None) -> None:
-    """Refuses a run that does not fit.
+    """Refuses a run that does not fit into memory.
 
     Args:
-      settings: of the run.
-      needed: by the compiled program, bytes.
-      available: bytes; None if it is not known, and then nothing is refused.
+      settings: the run's config.
+      needed: memory for the compiled program, bytes.
+      available: memory of the device, bytes; None if unknown, and then nothing is refused.
 
     Raises:
-      ConfigError: with about what fits.
+      ConfigError: if the program does not fit. The message names a number of arenas that should.
     """
     if available is not None and needed > available:
         most = MARGIN * settings.arenas * available / needed
@@ -101,10 +101,10 @@ def check(settings: TrainConfig, needed: int, available: int | None) -> None:
 
 @contextlib.contextmanager
 def refusal(settings: TrainConfig) -> Iterator[None]:
-    """Puts it into one sentence where a device's memory turns out to be full.
+    """Replaces JAX's out-of-memory error by one sentence.
 
     Raises:
-      ConfigError: in place of JAX's error; every other error passes.
+      ConfigError: in place of JAX's error. Every other error passes.
     """
     try:
         yield
@@ -120,21 +120,21 @@ def refusal(settings: TrainConfig) -> Iterator[None]:
 def fill(
     settings: TrainConfig, measure: Callable[[TrainConfig], int], available: int | None
 ) -> tuple[TrainConfig, str]:
-    """Chooses `arenas`: `algo.num_minibatches` times a power of two, as many as fit.
+    """Chooses the largest `arenas` that fits: `algo.num_minibatches` times a power of two.
 
     Args:
-      settings: of the run, with any number of arenas.
-      measure: says what memory training with a config needs, bytes.
-      available: of an accelerator, bytes, of which `run.memory_share` is filled; None on a CPU,
-        and where nobody tells: the number is then at most ON_CPU, whatever the memory.
+      settings: the run's config, with any number of arenas.
+      measure: returns the memory that training with a config needs, bytes.
+      available: memory of the accelerator, bytes. `run.memory_share` of it is filled. None on a CPU
+        or if unknown: the number is then at most ON_CPU.
 
     Returns:
-      The config with that number, and a sentence that says why it is that.
+      The config with that number, and a sentence that gives the reason.
     """
     sizes = _sizes(settings)
     if available is None:
         arenas = max((each for each in sizes if each <= ON_CPU), default=sizes[0])
-        why = f"arenas=auto: {arenas}, as wherever no GPU tells its memory."
+        why = f"arenas=auto: {arenas}, the default where no GPU reports its memory."
         return replace(settings, arenas=arenas), why
     small = [each for each in sizes if each <= PROBE][-2:] or sizes[:1]
     fixed, each_one = line(settings, small, measure)
@@ -152,18 +152,18 @@ def fill(
 def line(
     settings: TrainConfig, sizes: Sequence[int], measure: Callable[[TrainConfig], int]
 ) -> tuple[float, float]:
-    """Finds what programs take as a straight line in their arenas.
+    """Fits a straight line to the memory of programs by their number of arenas.
 
     Args:
-      settings: of the run.
-      sizes: of one or two small programs, in arenas, rising; of one, all grows with its arenas.
+      settings: the run's config.
+      sizes: arenas of one or two small programs, rising. With one, the line passes through 0.
       measure: as in `fill`.
 
     Returns:
-      Bytes of no arena, and of each one.
+      Fixed bytes, and bytes per arena.
     """
-    # One update each: a call's metrics are no part of the line, and the same programs serve
-    # whatever the budget.
+    # One update each. So metrics of a call do not count, and the compiled programs do not depend
+    # on the budget.
     control_steps = settings.algo.rollout_length
     needed = [measure(replace(settings, arenas=n, budget=n * control_steps)) for n in sizes]
     if len(sizes) == 1:
@@ -173,7 +173,7 @@ def line(
 
 
 def _sizes(settings: TrainConfig) -> list[int]:
-    """Numbers that `arenas` may be by all the rest of the config, rising."""
+    """Returns the numbers of arenas that the rest of the config allows, rising."""
     least = settings.algo.num_minibatches * settings.stream_count
     found = [replace(settings, arenas=least).arenas]
     with contextlib.suppress(ConfigError):
@@ -183,7 +183,7 @@ def _sizes(settings: TrainConfig) -> list[int]:
 
 
 def _reason(settings: TrainConfig, arenas: int) -> str:
-    """Why the rest of the config refuses a number of arenas."""
+    """Explains why the rest of the config refuses a number of arenas."""
     try:
         replace(settings, arenas=arenas)
     except ConfigError as error:
@@ -192,8 +192,8 @@ def _reason(settings: TrainConfig, arenas: int) -> str:
 
 
 def _advice(settings: TrainConfig, how: str, arenas: float) -> str:
-    """Says what to give instead: arenas, rounded down to what can be trained, if that helps."""
-    if settings.resume is not None:  # it keeps all that the memory depends on
+    """Suggests a number of arenas that can be trained, or another remedy if that does not help."""
+    if settings.resume is not None:  # a resumed run cannot change what its memory depends on
         return "go on with it on a device that has more"
     fewest = settings.algo.num_minibatches
     if settings.arenas == fewest:
@@ -204,7 +204,7 @@ def _advice(settings: TrainConfig, how: str, arenas: float) -> str:
 def _too_many(
     settings: TrainConfig, what: str, needed: int, available: int, advice: str
 ) -> ConfigError:
-    """The sentence that refuses a run."""
+    """Makes the error that refuses a run."""
     return ConfigError(
         f"{_arenas(settings)}, but {what} {_gib(needed)} of memory and there is "
         f"{_gib(available)}: {advice}."
@@ -212,7 +212,7 @@ def _too_many(
 
 
 def _arenas(settings: TrainConfig) -> str:
-    """Names what was asked for."""
+    """States the number of arenas that was given."""
     each = f" for each of {settings.seeds} seeds" if settings.seeds > 1 else ""
     return f"arenas is {settings.arenas}{each}"
 

@@ -1,4 +1,4 @@
-"""From a checkpoint to `policy.npz`: weights, normaliser, layout and what trained them."""
+"""Exports a checkpoint to `policy.npz`: weights, normaliser, layout and training config."""
 
 import re
 from pathlib import Path
@@ -25,10 +25,10 @@ _TASK = ("control_step", "target_radius", "arrival", "step_limit")
 
 
 def policy_arrays(leaves: Leaves) -> dict[str, np.ndarray]:
-    """Takes what a policy needs to act out of a checkpoint.
+    """Extracts the arrays that a policy needs to act.
 
     Args:
-      leaves: of the `TrainState` of one seed, as `checkpoint.to_leaves` names them.
+      leaves: arrays of one seed's `TrainState`, as `checkpoint.to_leaves` names them.
 
     Returns:
       Arrays [L, ...] under the names of the `policy.npz` format.
@@ -45,22 +45,22 @@ def policy_arrays(leaves: Leaves) -> dict[str, np.ndarray]:
 
 
 def _array_name(name: str) -> str:
-    """Names an array of the actor as the file does: hidden layers, heads, or somebody's network."""
+    """Returns the file's name for an array of the actor or of an extension's network."""
     inner = name.removeprefix("torso/")
     own = inner != name and not re.fullmatch(r"hidden_\d+/(kernel|bias)", inner)
     return f"network/{inner}" if own else f"actor/{inner}"
 
 
 def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
-    """Describes a policy: its layout with units, the config it was trained with, versions.
+    """Describes a policy: its layout with units, its training config, and versions.
 
     Args:
       trained: the run's config.
-      update: that the policy is from, 0 or more.
-      seed: of the policy.
+      update: update that the policy comes from, 0 or more.
+      seed: seed of the policy.
 
     Returns:
-      The `meta` of the `policy.npz` format, all of it but `format`, in SI units.
+      The `meta` of the `policy.npz` format without `format`, in SI units.
     """
     robot = trained.robot
     encoding = resolve_encoding(trained.task, trained.realism)
@@ -109,38 +109,38 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
 
 
 def _own_network(algo: AlgoConfig) -> dict[str, str]:
-    """Names the network of an extension, if the policy has one."""
+    """Returns the name of the extension's network, if the policy has one."""
     return {} if algo.network in (None, "mlp") else {"network": algo.network}
 
 
 def _memory(algo: AlgoConfig) -> dict[str, Any]:
-    """Says what the policy remembers, if it does."""
+    """Describes the policy's memory, if it has one."""
     if algo.memory == "none":
         return {}
     return {"memory": {"kind": algo.memory, "size": algo.memory_size}}
 
 
 def _history(trained: TrainConfig) -> dict[str, int]:
-    """Says how many observations the policy takes, if it takes more than the last one."""
+    """Returns the number of observations in the policy's input, if there is more than one."""
     return {} if trained.task.history == 1 else {"history": trained.task.history}
 
 
 def seed_path(path: Path, trained: TrainConfig, seed: int) -> Path:
-    """Names the policy of a seed.
+    """Returns the path of a seed's policy.
 
     Args:
-      path: of the policy of a run of one seed.
+      path: path of the policy in a run with one seed.
       trained: the run's config.
-      seed: one of the run's.
+      seed: a seed of the run.
 
     Returns:
-      `path`, or one beside it where there are several seeds.
+      `path`, or a path with the seed in its name if the run has several seeds.
     """
     return path if trained.seeds == 1 else path.with_stem(f"{path.stem}-seed{seed}")
 
 
 def _squashed(arrays: dict[str, np.ndarray], algo: AlgoConfig) -> dict[str, np.ndarray]:
-    """Writes an output of tanh as one more hidden layer, before a last one that changes nothing."""
+    """Writes a tanh output as one more hidden layer, followed by an identity output layer."""
     if algo.mean_activation == "linear":
         return arrays
     parts, count = ("kernel", "bias"), 0 if _own_network(algo) else len(algo.hidden_sizes)
@@ -156,13 +156,13 @@ def write_policy(path: Path, leaves: Leaves, trained: TrainConfig, update: int, 
 
     Args:
       path: the file.
-      leaves: of a run, [N, ...] each.
+      leaves: [N, ...] arrays of a run's checkpoint.
       trained: the run's config.
-      update: of the checkpoint.
-      seed: one of the run's.
+      update: update of the checkpoint.
+      seed: a seed of the run.
 
     Raises:
-      CheckpointError: if the config is not the one that made the checkpoint.
+      CheckpointError: if the checkpoint was made with another config.
     """
     lane = seeds.numbers(trained).index(seed)
     arrays = policy_arrays(checkpoint.of_seed(leaves, lane, trained.seeds))
@@ -173,6 +173,6 @@ def write_policy(path: Path, leaves: Leaves, trained: TrainConfig, update: int, 
     if found != (trained.learners, expected):
         raise CheckpointError(
             f"the checkpoint holds {found[0]} learners of layers {list(widths)}, but the config "
-            f"says {trained.learners} of {list(expected)}: it is of another run."
+            f"says {trained.learners} of {list(expected)}: it belongs to another run."
         )
     policy_file.write(path, _squashed(arrays, trained.algo), policy_meta(trained, update, seed))

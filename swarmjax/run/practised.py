@@ -1,4 +1,4 @@
-"""The levels that a run practises now, of its newest checkpoint, for its report."""
+"""Lists the levels that a run currently practises, from its newest checkpoint, for its report."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 FILE = "levels.json"
-BEST = 3  # levels of each stage that are written down
+BEST = 3  # levels to list for each stage
 _BUFFER = "curriculum/levels/"
 _TOLD = ("numbers", "score", "episodes", "successes", "generation")
 
@@ -15,12 +15,12 @@ def best(leaves: Mapping[str, np.ndarray]) -> dict[str, Any] | None:
     """Lists the levels of the buffer with the highest scores.
 
     Args:
-      leaves: of a checkpoint, [N, ...] each.
+      leaves: [N, ...] arrays of a checkpoint.
 
     Returns:
-      `update`, and `levels`: of each seed and stage at most `BEST`, the best first, each with the
-      `numbers` that it is drawn from, `score`, `episodes`, `successes` and `generation`; None
-      where there is no buffer.
+      `update` and `levels`; None without a buffer. `levels` lists at most `BEST` levels for each
+      seed and stage, best first. Each level has its `score`, `episodes`, `successes`, `generation`,
+      and the `numbers` that define it.
     """
     if f"{_BUFFER}numbers" not in leaves:
         return None

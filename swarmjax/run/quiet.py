@@ -1,4 +1,4 @@
-"""A training run without a terminal, for Python programs that call it."""
+"""Trains without a terminal, for Python programs."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
@@ -16,7 +16,7 @@ from swarmjax.run.signals import Stop
 
 
 class _Listener(Display):
-    """Prints nothing, and hands on the rows of each call."""
+    """Prints nothing, and passes on the rows of each call."""
 
     def __init__(
         self,
@@ -37,7 +37,7 @@ class _Listener(Display):
         yield
 
     def hear(self, rows: Sequence[Row], speeds: Row) -> None:
-        """Hands each row on, and asks the run to stop where the answer is True."""
+        """Passes each row on, and asks the run to stop if the callback returns True."""
         for logger in self._loggers:
             logger.write([dict(row) for row in rows], dict(speeds))
         for row in rows:
@@ -56,14 +56,15 @@ def train(
     loggers: Sequence[Logger] = (),
     auto: bool = False,
 ) -> tuple[Path, list[Path]]:
-    """Trains as a config says.
+    """Trains a run.
 
     Args:
       settings: the config.
-      on_update: is called with each row of `metrics.jsonl`; True stops the run.
-      listen: what to be in while it trains, such as `Stop` itself, which notices signals.
-      loggers: are told the rows too, and closed when the run is written.
-      auto: whether its number of arenas is still to be chosen.
+      on_update: called with each row of `metrics.jsonl`; it returns True to stop the run.
+      listen: makes the context manager for training, for example one that notices signals, as
+        `Stop` does.
+      loggers: they receive the rows too, and are closed when the run is written.
+      auto: whether the number of arenas is still to be chosen.
 
     Returns:
       The run directory, and the policy files of its seeds.
@@ -72,7 +73,7 @@ def train(
       ConfigError, CheckpointError, TrainingError: as `lifecycle.carry_out`.
     """
     if settings.run.dry:
-        raise ConfigError("run.dry is true, which is for the command line: leave it out.")
+        raise ConfigError("run.dry is true, but works only on the command line: leave it out.")
     with ExitStack() as told, compile_cache.use(settings.run.compile_cache):
         guarded = [told.enter_context(closing(Guarded(each))) for each in loggers]
         settings = execute.fill(settings)[0] if auto else settings

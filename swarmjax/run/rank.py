@@ -1,8 +1,8 @@
-"""The parent of a process that trains together with others.
+"""Supervises a process that trains together with others.
 
-A process whose peers are gone is ended by JAX from inside, by an abort and pages of stack. So one
-of several processes trains in a child, and its parent, which knows no JAX, says in a sentence what
-became of it.
+If the other processes are gone, JAX aborts a process from inside and prints pages of stack trace.
+So each process trains in a child. Its parent does not load JAX, and reports in one sentence how the
+child ended.
 """
 
 import ctypes
@@ -18,40 +18,40 @@ from typing import IO
 from swarmjax.exit_codes import REQUEUE, USER_ERROR
 from swarmjax.run.signals import CODES, Stop
 
-CHILD = "SWARMJAX_CHILD"  # holds the descriptor that a child tells its parent by
+CHILD = "SWARMJAX_CHILD"  # environment variable: file descriptor for messages to the parent
 _TICK_S = 0.05
 _DIE_WITH_PARENT, _KILL = 1, 9  # PR_SET_PDEATHSIG and SIGKILL of prctl(2)
-# What the C++ parts of JAX write: log lines, and the stack of an abort.
+# Output of JAX's C++ parts: log lines, and the stack trace of an abort.
 _NOISE = re.compile(
     r"[IWEF]\d{4} |\*\*\*|\s+@ |PC: @|\[Gloo\]|RPC: |=== Source|external/|Additional GRPC"
 )
 
 
 def is_child() -> bool:
-    """Tells whether this process has such a parent."""
+    """Returns whether this process has a supervising parent."""
     return CHILD in os.environ
 
 
 def begin() -> None:
-    """Ends a child when its parent ends, where the system can; for the child to call."""
+    """Makes this child end together with its parent, on Linux. The child calls it."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, _KILL)
 
 
 def tell_joined() -> None:
-    """Tells the parent, if there is one, that the processes of the run have met."""
+    """Tells the parent, if there is one, that the processes of the run have connected."""
     if is_child():
         os.write(int(os.environ[CHILD]), b"1")
 
 
 def supervise(stop: Stop) -> int:
-    """Runs this command once more as a child, and says how it ended if it cannot.
+    """Runs this command again as a child, and reports how the child died, if it did.
 
     Args:
-      stop: Notices signals, which are handed on.
+      stop: notices signals, which are passed on.
 
     Returns:
-      The exit code: the child's; 2 if it died before the processes met, 75 if after.
+      The child's exit code. If the child died: 2 before the processes had connected, 75 afterwards.
     """
     read, write = os.pipe()
     child = subprocess.Popen(
@@ -61,7 +61,7 @@ def supervise(stop: Stop) -> int:
         stderr=subprocess.PIPE,
         text=True,
         errors="replace",
-        start_new_session=True,  # a terminal's Ctrl-C reaches the parent alone
+        start_new_session=True,  # a terminal's Ctrl-C reaches only the parent
     )
     os.close(write)
     assert child.stderr is not None
@@ -77,7 +77,7 @@ def supervise(stop: Stop) -> int:
 
 
 def _wait(child: subprocess.Popen[str], stop: Stop) -> int:
-    """Waits for a child, and hands the first signal on."""
+    """Waits for a child, and passes the first signal on."""
     told = False
     while (code := child.poll()) is None:
         if stop.signalled and not told:
@@ -89,7 +89,7 @@ def _wait(child: subprocess.Popen[str], stop: Stop) -> int:
 
 
 def _copy(lines: IO[str]) -> None:
-    """Copies the lines that a child prints, without those of its C++ libraries."""
+    """Copies the child's output, without the lines of C++ libraries."""
     sys.stderr.writelines(_sentences(lines))
     sys.stderr.flush()
 
@@ -102,8 +102,8 @@ def _died(code: int, *, joined: bool) -> int:
     how = f"signal {-code}" if code < 0 else f"exit code {code}"
     if joined:
         sys.stderr.write(
-            f"swarmjax.train: error: this process of the run died ({how}), as it does when another "
-            "one is gone. What was saved before is kept: go on with resume=auto.\n"
+            f"swarmjax.train: error: this process of the run died ({how}), probably because "
+            "another one is gone. What was saved before is kept: go on with resume=auto.\n"
         )
         return REQUEUE
     sys.stderr.write(

@@ -1,4 +1,4 @@
-"""What a run writes while it trains: metrics, decisions, episodes (all JSONL), and to loggers."""
+"""Writes a run's metrics, decisions and episodes to JSONL files and loggers while it trains."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,22 +23,21 @@ def rows(
     seeds: Sequence[int],
     control_steps: int,
 ) -> list[Row]:
-    """Turns the metrics of a call into a row an update and seed.
+    """Turns the metrics of a call into one row for each update and seed.
 
     Args:
-      metrics: [N, rows, ...] as `seeds.train_chunk` returns them; of each seed the first n entries
-        hold an update each.
+      metrics: [N, rows, ...] as `seeds.train_chunk` returns them. The first n entries of each seed
+        hold one update each.
       n: updates of the call.
-      stages: names.
-      seeds: [N], the run's.
-      control_steps: arena control steps of one update and seed, over all arenas.
+      stages: names of the stages.
+      seeds: [N] seeds of the run.
+      control_steps: control steps of one update and seed, over all arenas.
 
     Returns:
-      Rows of plain numbers, those of an update together and in the order of the seeds: counts as
-      they are, shares and means over the episodes that ended in the update on its stage (None
-      where none did).
+      Rows of plain numbers, ordered by update, then by seed. Counts are unchanged. Shares and means
+      are over the episodes that ended in the update on its stage; None if none ended.
     """
-    # [n, N] flattened: an update's seeds stand together.
+    # [n, N] flattened, so that the seeds of an update are adjacent.
     columns = {
         name: np.swapaxes(np.asarray(column)[:, :n], 0, 1).reshape(-1, *column.shape[2:]).tolist()
         for name, column in metrics.items()
@@ -51,7 +50,7 @@ def rows(
 
 
 def _row(raw: Row, stages: Sequence[str], control_steps: int) -> Row:
-    """Adds shares, means and names to the numbers of one update."""
+    """Adds shares, means and names to the metrics of one update."""
     episodes, targets = raw["episodes"], raw["targets"]
     contacts = sum(raw[f"contacts_{kind}"] for kind in gaps.KINDS)
     named = {
@@ -69,7 +68,7 @@ def _row(raw: Row, stages: Sequence[str], control_steps: int) -> Row:
 
 
 def _finite(value: Any) -> Any:
-    """Puts None, which JSON has, in the place of numbers that are not finite."""
+    """Replaces numbers that are not finite by None, since JSON has no such numbers."""
     if isinstance(value, list):
         return [_finite(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
@@ -80,7 +79,7 @@ def _share(part: float, whole: float) -> float | None:
 
 
 class Recorder:
-    """Appends to the logs of a run directory. Use it with `with`."""
+    """Appends to the logs of a run directory, in a `with` block."""
 
     def __init__(
         self,
@@ -94,12 +93,18 @@ class Recorder:
         logs: Mapping[str, int] | None = None,
         loggers: Sequence[Logger] = (),
     ) -> None:
-        """Opens the logs, dropping what a stopped run wrote after the checkpoint `update`.
+        """Opens the logs, and drops the rows that a stopped run wrote after its checkpoint.
 
-        `logs` has the bytes of each log that the checkpoint counts; without them, as in a
-        checkpoint of an older version, rows are dropped by their update. `arena_steps` is where
-        that checkpoint stands, on TensorBoard's axis. `episodes` opens a log for them. `loggers`
-        are told the rows besides, and closed at the end.
+        Args:
+          run: the run directory.
+          seeds: of the run.
+          tensorboard: whether to write TensorBoard events.
+          update: updates done at the checkpoint.
+          arena_steps: arena steps done at the checkpoint, for TensorBoard's axis.
+          episodes: whether to log episodes.
+          logs: bytes of each log at the checkpoint. Checkpoints of older versions do not have them;
+            then rows are dropped by their update.
+          loggers: further loggers, which receive the rows and are closed at the end.
         """
         run.mkdir(parents=True, exist_ok=True)
         for name in directory.LOGS:
@@ -111,24 +116,24 @@ class Recorder:
         self._logs = {name: Log(run / name) for name in names}
         # A log that this process does not write still belongs to the run.
         self._closed = {k: length for k, length in (logs or {}).items() if k not in names}
-        purge = arena_steps + 1 if update else None  # TensorBoard hides what it has from here on
+        purge = arena_steps + 1 if update else None  # TensorBoard hides older events from here on
         boards = [Boards(run, seeds, purge)] if tensorboard else []
         self._loggers = [Guarded(each) for each in (*boards, *loggers)]
 
     def write(self, found: Sequence[Row], decisions: Iterable[Row], speeds: Row) -> None:
-        """Writes the rows of a call, and tells the loggers of its speeds as well."""
+        """Writes the rows and decisions of a call. Loggers also receive its speeds."""
         self._logs[METRICS].write(found)
         self._logs[DECISIONS].write(decisions)
         for logger in self._loggers:
             logger.write(found, speeds)
 
     def write_episodes(self, found: Iterable[Row]) -> None:
-        """Writes the episodes of a call, where there is a log for them."""
+        """Writes the episodes of a call, if they are logged."""
         if EPISODES in self._logs:
             self._logs[EPISODES].write(found)
 
     def sync(self) -> dict[str, int]:
-        """Makes sure that the disk has all rows; returns the bytes of each log, by name."""
+        """Flushes all rows to disk, and returns the bytes of each log by name."""
         return self._closed | {name: log.sync() for name, log in self._logs.items()}
 
     def __enter__(self) -> "Recorder":
@@ -146,15 +151,15 @@ class Recorder:
 def history(
     run: Path, update: int, logs: Mapping[str, int] | None = None
 ) -> tuple[list[Row], list[Row]]:
-    """Reads what a run had written down before a checkpoint: its metrics and its decisions.
+    """Reads the metrics and decisions that a run logged before a checkpoint.
 
     Args:
-      run: The run directory.
-      update: Of the checkpoint.
-      logs: Bytes of each log that it counts; without them rows are taken by their update.
+      run: the run directory.
+      update: updates done at the checkpoint.
+      logs: bytes of each log at the checkpoint. Without them, rows are selected by their update.
 
     Raises:
-      CheckpointError: If a log is damaged.
+      CheckpointError: if a log is damaged.
     """
     if logs:
         metrics, decisions = (directory.read_rows(run / k, logs.get(k, 0)) for k in _READ)
@@ -164,5 +169,5 @@ def history(
 
 
 def _earlier(rows: Sequence[Row], update: int) -> list[Row]:
-    """Takes the rows before `update`."""
+    """Returns the rows before `update`."""
     return [row for row in rows if directory.is_before(row, update)]

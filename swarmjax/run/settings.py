@@ -1,4 +1,4 @@
-"""The settings of a training run, and what its directory tells of them."""
+"""The settings of a training run, and how to read them from its directory."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,12 +26,12 @@ from swarmjax.task.config import check_realism
 from swarmjax.task.stage_config import make_room
 from swarmjax.training.config import ProgramConfig
 
-# Arenas of all seeds whose episodes are written down one by one: more end thousands a second.
+# Most arenas of all seeds with run.episodes=true. With more, thousands of episodes end per second.
 MOST_LOGGED = 8192
-AUTO = "auto"  # what `arenas` may be instead of a number
+AUTO = "auto"  # `arenas` accepts it in place of a number
 
 
-# What may be given when a run goes on; everything else fixes what it has computed so far.
+# The keys that a resumed run accepts. All others determine what it has computed so far.
 _RESUME_KEYS = tuple("run.*" if key == "run" else key for key in MAY_CHANGE)
 
 
@@ -40,7 +40,7 @@ class RunConfig(Section):
     """Where a run is written, and how often."""
 
     id: str | None = field(
-        default=None, metadata=about("of the run, drawn when it begins", derived=True)
+        default=None, metadata=about("random id, drawn when the run begins", derived=True)
     )
     dir: str | None = field(
         default=None, metadata=about("run directory; null: runs/<date>-<time>-<stage>-seed<seed>")
@@ -53,16 +53,16 @@ class RunConfig(Section):
     )
     checkpoint_share: float = field(
         default=0.1,
-        metadata=about("of the budget, after which one is written too; 0: by time alone", 0.0, 1.0),
+        metadata=about("share of the budget between checkpoints; 0: by time only", 0.0, 1.0),
     )
     keep_checkpoints: int = field(
         default=2,
-        metadata=about("newest checkpoints that are kept, besides the best", 1, MAX_COUNT),
+        metadata=about("how many of the newest checkpoints to keep, plus the best", 1, MAX_COUNT),
     )
     checkpoint_arenas: bool = field(
         default=True,
         metadata=about(
-            "keep arenas in checkpoints; false: small files, and a run that goes on draws others"
+            "save arenas in checkpoints; false: small files, and a resumed run draws new arenas"
         ),
     )
     stop_after: int | None = field(
@@ -72,39 +72,40 @@ class RunConfig(Section):
     tensorboard: bool = field(default=True, metadata=about("write TensorBoard events"))
     wandb: str | None = field(
         default=None,
-        metadata=about("project of Weights & Biases that is logged to; needs the extra wandb"),
+        metadata=about("Weights & Biases project to log to; needs the extra wandb"),
     )
     wandb_mode: Literal["offline", "online"] = field(
         default="offline",
-        metadata=about("offline: into the run directory, for `wandb sync`; online: to W&B"),
+        metadata=about("offline: write to the run directory for `wandb sync`; online: send to W&B"),
     )
     episodes: bool = field(
-        default=False, metadata=about("write episodes.jsonl: each episode, robot by robot")
+        default=False, metadata=about("write each episode, robot by robot, to episodes.jsonl")
     )
     coordinator: Literal["auto"] | str | None = field(
         default=None,
         metadata=about(
-            "HOST:PORT of the first of several processes; auto: as Slurm, Open MPI or Kubernetes "
-            "say; null: this process is alone"
+            "HOST:PORT of the first of several processes; auto: taken from Slurm, Open MPI or "
+            "Kubernetes; null: a single process"
         ),
     )
     processes: int | None = field(
-        default=None, metadata=about("of the run [coordinator=HOST:PORT]", 1, 2**16)
+        default=None, metadata=about("number of processes [coordinator=HOST:PORT]", 1, 2**16)
     )
     process: int | None = field(
-        default=None, metadata=about("number of this one, from 0 [coordinator=HOST:PORT]", 0, 2**16)
+        default=None,
+        metadata=about("index of this process, from 0 [coordinator=HOST:PORT]", 0, 2**16),
     )
     deterministic: bool = field(
-        default=False, metadata=about("compute the same bits each time on a GPU; slower")
+        default=False, metadata=about("make results on a GPU bit-for-bit repeatable; slower")
     )
-    dry: bool = field(default=False, metadata=about("check and describe the run, train nothing"))
+    dry: bool = field(default=False, metadata=about("check and describe the run; train nothing"))
     compile_cache: Literal["auto"] | str | None = field(
         default="auto",
-        metadata=about("directory that keeps compiled programs; auto: the user's; null: none"),
+        metadata=about("directory for compiled programs; auto: the user's cache; null: none"),
     )
     memory_share: float = field(
         default=0.8,
-        metadata=about("of the GPU's memory, what arenas=auto fills", above=0.0, high=1.0),
+        metadata=about("share of the GPU's memory that arenas=auto fills", above=0.0, high=1.0),
     )
 
     def _check(self) -> None:
@@ -114,7 +115,7 @@ class RunConfig(Section):
                 where = "null" if self.coordinator is None else "auto"
                 raise ConfigError(
                     f"processes is {show(self.processes)} and process {show(self.process)}, but "
-                    f"coordinator is {where}: give them with coordinator=HOST:PORT alone."
+                    f"coordinator is {where}: give them only with coordinator=HOST:PORT."
                 )
             return
         host, _, port = str(self.coordinator).rpartition(":")
@@ -126,13 +127,13 @@ class RunConfig(Section):
             raise ConfigError(
                 f"coordinator is {show(self.coordinator)}, but processes is "
                 f"{show(self.processes)} and process {show(self.process)}: give the number of "
-                "processes, and that of this one from 0."
+                "processes, and the index of this one, counted from 0."
             )
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig(ProgramConfig):
-    """Everything that fixes a training run: its program, and where it is written."""
+    """All settings of a training run: its program, and where it is written."""
 
     command: ClassVar[str] = "train"
     renamed: ClassVar[Mapping[str, str]] = {"start": "init_from", "start_std": "init_from_std"}
@@ -140,19 +141,19 @@ class TrainConfig(ProgramConfig):
     run: RunConfig = field(default_factory=RunConfig)
     resume: str | None = field(
         default=None,
-        metadata=about("run directory to go on with; auto: that of run.dir if it holds a run"),
+        metadata=about("run directory to go on with; auto: run.dir, if it holds a run"),
     )
     init_from: str | None = field(
         default=None,
-        metadata=about("run directory whose networks and normaliser a new run begins with"),
+        metadata=about("run directory to take the first networks and normaliser from"),
     )
     init_from_std: Literal["keep", "reset"] = field(
         default="keep",
-        metadata=about("exploration that init_from begins with: as learned, or algo.initial_std"),
+        metadata=about("exploration after init_from; keep: as learned; reset: algo.initial_std"),
     )
     stage_name: str = field(
         default="",
-        metadata=about("the one stage, or what the curriculum is called", derived=True),
+        metadata=about("name of the stage or of the curriculum", derived=True),
     )
 
     def _check(self) -> None:
@@ -233,8 +234,8 @@ class TrainConfig(ProgramConfig):
         most = MAX_COUNT // (self.sim.robots * steps)
         if self.arenas > most:
             raise ConfigError(
-                f"arenas is {self.arenas}, but robot steps are counted in 32 bits, and "
-                f"{self.sim.robots} robots for {steps} control steps leave room for {most}: "
+                f"arenas is {self.arenas}, but robot steps are counted in 32 bits, which is enough "
+                f"for {most} arenas with {self.sim.robots} robots and {steps} control steps: "
                 f"give at most {most}."
             )
 
@@ -251,8 +252,8 @@ class TrainConfig(ProgramConfig):
             return
         if levels.buffer is not None and levels.buffer < len(self.stage):
             raise ConfigError(
-                f"curriculum.levels.buffer is {levels.buffer}, but there are {len(self.stage)} "
-                f"stages with an equal part each: give at least {len(self.stage)}."
+                f"curriculum.levels.buffer is {levels.buffer}, but {len(self.stage)} stages share "
+                f"it equally: give at least {len(self.stage)}."
             )
         if levels.mutates:
             for stage in self.stage:
@@ -267,8 +268,8 @@ class TrainConfig(ProgramConfig):
         self._check_hearing()
         if self.algo.exploration == "scheduled" and self.budget > MAX_COUNT:
             raise ConfigError(
-                f"budget is {self.budget}, but algo.exploration is scheduled by control steps that "
-                f"are counted in 32 bits: give at most {MAX_COUNT}."
+                f"budget is {self.budget}, but algo.exploration=scheduled counts control steps in "
+                f"32 bits: give at most {MAX_COUNT}."
             )
         if self.curriculum.normalizer == "relearn" and not self.algo.normalize_observations:
             raise ConfigError(
@@ -277,7 +278,7 @@ class TrainConfig(ProgramConfig):
             )
 
     def _check_hearing(self) -> None:
-        """Refuses what a network that hears does not go with."""
+        """Refuses options that a network with neighbour messages does not support."""
         count = self.task.neighbours.count
         if count and self.algo.update_backend == "fused":
             raise ConfigError(
@@ -287,7 +288,7 @@ class TrainConfig(ProgramConfig):
         if count and self.algo.network not in (None, "mlp"):
             raise ConfigError(
                 f"algo.network is {self.algo.network}, but task.neighbours.count is {count}, which "
-                "goes with hidden layers alone: give algo.network=mlp or task.neighbours.count=0."
+                "works only with hidden layers: give algo.network=mlp or task.neighbours.count=0."
             )
 
     def _check_budget(self) -> None:
@@ -301,21 +302,21 @@ class TrainConfig(ProgramConfig):
         if self.updates > most:
             raise ConfigError(
                 f"budget is {self.budget}, which is {self.updates} updates of {update} control "
-                f"steps, and the gradient steps of no more than {most} are counted in 32 bits: "
-                f"give at most {most * update}."
+                f"steps, but gradient steps are counted in 32 bits, which is enough for {most} "
+                f"updates: give at most {most * update}."
             )
 
 
 def from_stored(stored: Mapping[str, Any], where: str = "") -> TrainConfig:
-    """Make the configuration that a run directory or a policy holds, written by any version.
+    """Makes the configuration that a run directory or a policy holds, written by any version.
 
     Args:
-        stored: as `to_dict` gave it. Names that have changed since are read by their old ones;
-            what is gone is left out.
-        where: what comes before its keys in a sentence.
+      stored: the result of `to_dict`. Old names of keys are translated, and removed keys are left
+        out.
+      where: the prefix of its keys in messages.
 
     Raises:
-        ConfigError: it is unsound.
+      ConfigError: if it is invalid.
     """
     return build(TrainConfig, modernise(TrainConfig, stored), where)
 
@@ -330,7 +331,7 @@ def read_config(run: Path) -> dict:
       The config as plain data, unchecked.
 
     Raises:
-      ConfigError: if there is none, or it is no JSON object.
+      ConfigError: if there is none, or it is not a JSON object.
     """
     path = run / CONFIG
     section.check_text("the run directory", str(run))
@@ -338,7 +339,7 @@ def read_config(run: Path) -> dict:
         raise ConfigError(f"{run} is no run directory: it has no {CONFIG}.")
     found = reading.read_json(path)
     if not isinstance(found, dict):
-        raise ConfigError(f"{path} is no run's config: it holds no JSON object.")
+        raise ConfigError(f"{path} is not a run's config: it holds no JSON object.")
     return found
 
 
@@ -348,16 +349,16 @@ def load_train(
     auto: bool = False,
     stages: Sequence[dict[str, Any]] | None = None,
 ) -> TrainConfig:
-    """Make the configuration of `swarmjax.train` from its `key=value` words.
+    """Makes the configuration of `swarmjax.train` from its `key=value` words.
 
     Args:
-        overrides: the words.
-        auto: whether `arenas=auto` may be among them. It leaves the fewest arenas there can be,
-            algo.num_minibatches; `memory.fill` chooses how many there will be.
-        stages: plain data of the stages, in place of a file's.
+      overrides: the words.
+      auto: whether to accept `arenas=auto`. It sets the smallest possible number of arenas,
+        `algo.num_minibatches`. `memory.fill` chooses the final number later.
+      stages: plain data of the stages, in place of a file.
 
     Raises:
-        ConfigError: a word, a choice, a file or a value is unsound.
+      ConfigError: if a word, a choice, a file or a value is invalid.
     """
 
     def complete(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:
@@ -376,7 +377,7 @@ def load_train(
     return settle(files.load(TrainConfig, [*_inherited(overrides), *overrides], complete))
 
 
-# Of the learner, what a run with init_from has to share with the run that it begins with.
+# The algo keys that a run with init_from must share with the run that it starts from.
 _SHARED = (
     "policy",
     "network",
@@ -390,22 +391,22 @@ _SHARED = (
 
 
 def _inherited(typed: Sequence[str]) -> list[str]:
-    """Return the words that a run with `init_from` takes from the run it begins with.
+    """Returns the words that a run with `init_from` takes from the run that it starts from.
 
-    These are robot, task, realism and the shape of the networks. What is typed comes after them.
+    They set robot, task, realism and the shape of the networks. Typed words override them.
     """
     source = files.values(files.split_words(TrainConfig, typed)).get("init_from")
     if not isinstance(source, str):
         return []
     try:
         held = from_stored(read_config(Path(source)))
-    except ConfigError:  # which `warm_start.read` refuses, when the run is to begin
+    except ConfigError:  # `warm_start.read` reports it later, when the run begins
         return []
     others = [key for key in to_dict(held.algo) if key not in _SHARED]
     if held.algo.memory == "none" or any(
         word.startswith(("algo.memory=", "algo=")) for word in typed
     ):
-        others.append("memory_size")  # an option of the memory that is typed
+        others.append("memory_size")  # it belongs to the kind of memory that was typed
     return [
         *inherit.group_words(TrainConfig, "robot", held.robot, typed),
         *inherit.group_words(TrainConfig, "task", held.task, typed),
@@ -415,13 +416,13 @@ def _inherited(typed: Sequence[str]) -> list[str]:
 
 
 def settle(settings: TrainConfig) -> TrainConfig:
-    """Name in full the pieces of extensions that a run uses, with their digests.
+    """Adds the full names and digests of the extension pieces that a run uses.
 
     Args:
-        settings: the config; digests that it holds already are those of a stored run.
+      settings: the config. Digests that it already holds come from a stored run.
 
     Raises:
-        ConfigError: a piece is missing, or is not the one that the stored run used.
+      ConfigError: if a piece is missing, or differs from the one that the stored run used.
     """
     found = extension.load(settings.extensions)
     extension.check_needs(settings.pieces, found, "the stored run")
@@ -445,16 +446,16 @@ def settle(settings: TrainConfig) -> TrainConfig:
 
 
 def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainConfig:
-    """Make the configuration with which a stored run goes on.
+    """Makes the configuration with which a stored run goes on.
 
     `run.stop_after` is not kept: it interrupted the stored run, and would stop this one at once.
 
     Args:
-        stored: configuration of the run, as `to_dict` gave it.
-        overrides: `key=value` words, of what may change alone.
+      stored: configuration of the run, as `to_dict` gave it.
+      overrides: `key=value` words, only for keys that may change.
 
     Raises:
-        ConfigError: another key is given, the stored configuration is unsound, or see the module.
+      ConfigError: if another key is given, or a stored or new value is invalid.
     """
     words = files.split_words(TrainConfig, overrides)
     for key, word in words.items():
@@ -472,7 +473,7 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
 
 
 def _spread_again(streams: int | None, devices: Any, seeds_by: str) -> dict[str, Any]:
-    """Spreads a run that goes on over devices, with the random streams that it has if they fit."""
+    """Spreads a resumed run over its devices, and keeps its random streams if they fit."""
     by_seeds = seeds_by == "devices"
     fits = isinstance(devices, int) and streams and (by_seeds or streams % devices == 0)
     return {"devices": devices, "streams": streams if fits else None}
@@ -481,17 +482,17 @@ def _spread_again(streams: int | None, devices: Any, seeds_by: str) -> dict[str,
 def load_run(
     overrides: Sequence[str], stages: Sequence[dict[str, Any]] | None = None
 ) -> tuple[TrainConfig, bool]:
-    """Make the configuration of a run, a new one or with `resume=` one that goes on.
+    """Makes the configuration of a new run or, with `resume=`, of one that goes on.
 
     Args:
-        overrides: `key=value` words; with `resume` of what may be changed alone.
-        stages: plain data of the stages of a new run, in place of a file's.
+      overrides: `key=value` words; with `resume`, only for keys that may change.
+      stages: plain data of the stages of a new run, in place of a file.
 
     Returns:
-        The configuration, and whether its number of arenas is still to be chosen.
+      The configuration, and whether the number of arenas is still to be chosen.
 
     Raises:
-        ConfigError: a word, a choice, a file or a value is unsound.
+      ConfigError: if a word, a choice, a file or a value is invalid.
     """
     given = {key: value for key, _, value in (word.partition("=") for word in overrides)}
     resumed = given.get("resume", "null").strip("'\"")
@@ -509,7 +510,7 @@ def load_run(
 def _go_on_or_begin(
     overrides: Sequence[str], given: Mapping[str, str], stages: Sequence[dict[str, Any]] | None
 ) -> tuple[TrainConfig, bool]:
-    """Make the configuration of `resume=auto`: of the run in `run.dir`, or of a new one there."""
+    """Makes the configuration for `resume=auto`: of the run in `run.dir`, or of a new run there."""
     if given.get("run.dir", "null") in ("", "null"):
         raise ConfigError("resume is auto, but there is no run.dir: give run.dir=DIR with it.")
     begun = [word for word in overrides if word.partition("=")[0] != "resume"]
@@ -531,7 +532,7 @@ def _go_on_or_begin(
 
 
 def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
-    """Refuse to go on with a run by other settings than its own, key by key."""
+    """Refuses to resume a run with settings that differ from its own, and names the keys."""
     mine, its = (
         leaves({k: v for k, v in each.items() if k not in MAY_CHANGE}) for each in (typed, stored)
     )
@@ -539,17 +540,17 @@ def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, A
     if changed:
         shown = ", ".join(f"{k} is {show(mine[k])} and not {show(its.get(k))}" for k in changed[:3])
         raise ConfigError(
-            f"resume is auto, but {run} holds a run of other settings: {shown}. Of a run that goes "
-            f"on, {', '.join(_RESUME_KEYS)} may change: give its own settings, or another run.dir."
+            f"resume is auto, but {run} holds a run with other settings: {shown}. A resumed run "
+            f"may change only {', '.join(_RESUME_KEYS)}: give its own settings, or another run.dir."
         )
 
 
 def leaves(found: Mapping[str, Any], where: str = "") -> dict[str, Any]:
-    """Flatten nested settings to dotted keys.
+    """Flattens nested settings to dotted keys.
 
     Args:
-        found: plain data, as `to_dict` gives it.
-        where: what comes before its keys.
+      found: plain data, as `to_dict` gives it.
+      where: the prefix of its keys.
     """
     flat: dict[str, Any] = {}
     for key, value in found.items():

@@ -1,8 +1,8 @@
-"""Signals: a run saves when it is asked to stop, and stops at once when it is asked twice.
+"""Handles signals: a run saves and stops at the first one, and stops at once at the second.
 
-SIGINT comes from a person and ends the run with 130. SIGTERM, SIGUSR1, SIGUSR2 and SIGHUP come from
-a scheduler or a lost terminal and end it with 75, so that a job script may requeue it. This module
-imports nothing that is slow, so that a command can listen before it loads JAX.
+SIGINT comes from a person and ends the run with code 130. SIGTERM, SIGUSR1, SIGUSR2 and SIGHUP come
+from a scheduler or a lost terminal. They end the run with code 75, so that a job script can requeue
+it. This module imports nothing slow, so a command can listen before it loads JAX.
 """
 
 import contextlib
@@ -26,25 +26,28 @@ CODES = {
 
 
 class StoppedError(Exception):
-    """A run that was asked to stop before it had anything to save."""
+    """Says that a run was asked to stop before it had anything to save."""
 
 
 class Stop:
-    """Notices signals while in a `with`, so that the run can save before it stops.
+    """Notices signals in a `with` block, so that the run can save before it stops.
 
     Attributes:
-      code: The exit code that the first signal asks for; None if there was none.
-      signalled: Whether somebody asked to stop, by a signal or by setting it.
+      code: the exit code for the first signal; None if there was none.
+      signalled: whether a stop was requested, by a signal or by setting this attribute.
     """
 
     def __init__(
         self, until: float = math.inf, *, patient: bool = False, last: bool = False
     ) -> None:
-        """Nobody has asked yet; it stops by itself at `until`, of `time.monotonic`.
+        """Begins without a request to stop.
 
-        One that is `patient` does not stop at once at a second signal: a scheduler sends each to a
-        process and to its parent, which hands it on. After one that is `last` the process ends, and
-        a signal no longer changes its exit code: what there was to save is saved.
+        Args:
+          until: time to stop without a signal, on the clock `time.monotonic`.
+          patient: whether to ignore a second signal. A scheduler sends each signal to a process and
+            to its parent, which passes it on, so the process receives it twice.
+          last: whether the process ends after the `with` block. Then everything is saved, and later
+            signals must not change the exit code.
         """
         self.signalled = False
         self._patient, self._last = patient, last
@@ -53,11 +56,11 @@ class Stop:
 
     @property
     def asked(self) -> bool:
-        """Whether to stop, because of a signal or of the time."""
+        """Whether to stop, because of a signal or the time limit."""
         return self.signalled or time.monotonic() >= self._until
 
     def check(self) -> None:
-        """Raises `StoppedError` if a signal came; for where there is nothing to save yet."""
+        """Raises `StoppedError` if a signal came. For use before there is anything to save."""
         if self.signalled:
             raise StoppedError
 
@@ -74,11 +77,11 @@ class Stop:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Gives the signals back; ignores them if the process ends."""
+        """Restores the old signal handlers, or ignores signals if the process ends."""
         signal.set_wakeup_fd(self._wakeup)
         for number, handler in self._before.items():
             signal.signal(number, signal.SIG_IGN if self._last else handler)
-        os.close(self._write)  # which ends the thread, when it has said what it has to
+        os.close(self._write)  # ends the thread after its last message
         self._thread.join()
 
     def _ask(self, number: int, _: FrameType | None) -> None:
@@ -88,10 +91,10 @@ class Stop:
 
 
 def _watch(read: int, patient: bool) -> None:
-    """Says what the first signal does, and ends the process at the second.
+    """Reports the first signal, and ends the process at the second.
 
-    Python calls a handler only between its own instructions, and a compiled program may run for
-    minutes within one. The bytes of `signal.set_wakeup_fd` come at once.
+    Python calls a handler only between its own instructions. A compiled program can run for minutes
+    within one instruction. The bytes of `signal.set_wakeup_fd` arrive at once.
     """
     first: signal.Signals | None = None
     with os.fdopen(read, "rb", buffering=0) as pipe:
@@ -104,16 +107,16 @@ def _watch(read: int, patient: bool) -> None:
             if first is not None:
                 _end(CODES[first])
             first = found
-            _say("stopping after this call, to save; once more stops at once")
+            _say("stopping after this call, to save; a second signal stops at once")
 
 
 def _end(code: int) -> None:
-    """Ends the process without waiting for anything; files it was writing are not replaced."""
+    """Ends the process without waiting. Files that it was writing keep their old content."""
     _say("stopped at once; what was saved before is kept")
     os._exit(code)
 
 
 def _say(sentence: str) -> None:
-    with contextlib.suppress(OSError, ValueError):  # a terminal that is gone
+    with contextlib.suppress(OSError, ValueError):  # the terminal may be gone
         sys.stderr.write(f"{sentence}\n")
         sys.stderr.flush()

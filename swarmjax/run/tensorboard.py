@@ -1,4 +1,4 @@
-"""TensorBoard's events, by tensorboardX: a folder for each seed of a run."""
+"""Writes TensorBoard events with tensorboardX, into one folder for each seed of a run."""
 
 import contextlib
 import struct
@@ -10,22 +10,22 @@ from typing import Any
 from swarmjax.run.directory import Row
 
 FOLDER = "tensorboard"
-BOARDS = 16  # seeds that TensorBoard is written for: a board holds three files open
+BOARDS = 16  # most seeds with a folder, because each one keeps three files open
 
 
 class Boards:
-    """Folders of TensorBoard, by seed; a `Logger`.
+    """TensorBoard folders by seed; a `Logger`.
 
-    TensorBoardX takes seconds to import where there is PyTorch, which it brings along, so that it
-    is left to the first rows, when the logger's thread has them to spare.
+    If PyTorch is installed, tensorboardX imports it, which takes seconds. So the import waits for
+    the first rows and happens in the logger's thread.
     """
 
     name = "TensorBoard"
 
     def __init__(self, run: Path, seeds: Sequence[int], purge: int | None = None) -> None:
-        """Opens nothing yet; what lies at arena step `purge` and after is to be hidden.
+        """Prepares a folder for each of the first `BOARDS` seeds, but opens nothing yet.
 
-        Of several seeds the first `BOARDS` have a folder each.
+        TensorBoard hides older events from arena step `purge` on.
         """
         folder = run / FOLDER
         several = len(seeds) > 1
@@ -34,10 +34,10 @@ class Boards:
         self._open: dict[int, Board] = {}
 
     def write(self, rows: Sequence[Row], speeds: Row) -> None:
-        """Writes rows, and the speeds to the first board.
+        """Writes rows, and the speeds to the first folder.
 
-        Of N boards each is given every N-th update, so that they cost no more time than one:
-        a row takes it a millisecond, as much as an update of a few arenas.
+        Writing a row takes a millisecond, as long as an update of a few arenas. So with N folders,
+        each receives only every N-th update, and all together take no more time than one.
         """
         boards = self._boards()
         for row in rows:
@@ -46,7 +46,7 @@ class Boards:
         next(iter(boards.values())).add(speeds, rows[-1]["arena_steps"])
 
     def attach(self, name: str, path: Path, arena_steps: int) -> None:
-        """Writes a PNG as a picture, and of other files where they are, to the first board."""
+        """Writes a PNG as an image, or the path of any other file, to the first folder."""
         board = next(iter(self._boards().values()))
         if path.suffix == ".png":
             board.add_picture(name, path.read_bytes(), arena_steps)
@@ -54,9 +54,9 @@ class Boards:
             board.add_text(name, f"`{path.resolve()}`", arena_steps)
 
     def close(self) -> None:
-        """Writes what is left."""
+        """Writes the remaining events."""
         for board in self._open.values():
-            with contextlib.suppress(OSError):  # which was said when it was lost
+            with contextlib.suppress(OSError):  # already reported when the logger was lost
                 board.close()
 
     def _boards(self) -> "dict[int, Board]":
@@ -66,14 +66,14 @@ class Boards:
 
 
 class Board:
-    """One folder of TensorBoard.
+    """One TensorBoard folder.
 
-    TensorBoardX's own `SummaryWriter` has a thread that dies on a full disk and leaves its queue
-    full, so that whoever writes next waits for ever. Its writer of events has none.
+    The `SummaryWriter` of tensorboardX has a thread that dies on a full disk. Its queue stays full,
+    and the next write waits forever. Its `EventsWriter` has no thread.
     """
 
     def __init__(self, folder: Path, purge: int | None) -> None:
-        """Makes the folder and its file; TensorBoard hides what it has from step `purge` on."""
+        """Makes the folder and its file. TensorBoard hides older events from step `purge` on."""
         from tensorboardX.event_file_writer import EventsWriter
 
         folder.mkdir(parents=True, exist_ok=True)
@@ -92,7 +92,7 @@ class Board:
         self._writer.write_event(event)
 
     def add_picture(self, name: str, png: bytes, arena_steps: int) -> None:
-        """Writes a PNG, whose size stands in its first chunk (PNG specification, 11.2.1)."""
+        """Writes a PNG. Its first chunk holds its size (PNG specification, 11.2.1)."""
         event = _event(arena_steps)
         image = event.summary.value.add(tag=name).image
         image.width, image.height = struct.unpack(">II", png[16:24])
@@ -100,7 +100,7 @@ class Board:
         self._writer.write_event(event)
 
     def add_text(self, name: str, text: str, arena_steps: int) -> None:
-        """Writes Markdown for TensorBoard's page of texts."""
+        """Writes Markdown for TensorBoard's text page."""
         from tensorboardX.proto import types_pb2
 
         event = _event(arena_steps)
@@ -112,13 +112,13 @@ class Board:
         self._writer.write_event(event)
 
     def close(self) -> None:
-        """Writes what is left."""
+        """Writes the remaining events."""
         self._writer.close()
 
 
 def _event(arena_steps: int) -> Any:
-    """Makes an event of TensorBoard's that holds nothing yet."""
+    """Makes an empty TensorBoard event."""
     from tensorboardX.proto import event_pb2
 
-    made: Any = event_pb2  # whose messages are made when it is imported
+    made: Any = event_pb2  # its classes are created at import, so pyright does not see them
     return made.Event(wall_time=time.time(), step=arena_steps)

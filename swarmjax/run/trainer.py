@@ -1,4 +1,4 @@
-"""The host side of a run: calls the compiled chunk, records, shows, saves, and stops when asked."""
+"""The host's training loop: calls the compiled chunk, records, displays, saves and stops."""
 
 import contextlib
 import importlib
@@ -36,22 +36,22 @@ from swarmjax.training.program import Program
 
 Built = Program[TrainConfig]  # the program of a run
 
-CALL_SECONDS = 1.0  # what a call should take when run.chunk is auto: the display's pace
-ALL_SECONDS = 10.0  # what a call may take when run.chunk is all: so long a signal waits
-FIRST_UPDATES = 32  # of the first call then, by which the others are measured
-PATIENCE = 10  # updates in a row that taught nothing, after which a run has diverged
-GROWTH = 4  # a call is at most this many times as long as the one before
+CALL_SECONDS = 1.0  # target length of a call with run.chunk=auto: the display's refresh interval
+ALL_SECONDS = 10.0  # longest call with run.chunk=all: a signal waits up to this long
+FIRST_UPDATES = 32  # in the first call with run.chunk=all; its pace sets the length of the others
+PATIENCE = 10  # a run has diverged after this many updates in a row without learning
+GROWTH = 4  # a call is at most this many times as long as the previous one
 
 
 @dataclass(frozen=True)
 class Compiled:
-    """The compiled chunk and what compiling it took.
+    """The compiled chunk, the time to compile it, and the memory that it needs.
 
     Attributes:
-      call: (schedule, state [N], n) -> (state [N], metrics [N, rows]); the state is donated.
-      seconds: that tracing and compiling took.
-      state_bytes: of device memory for what changes in the run.
-      work_bytes: that the program needs besides.
+      call: (schedule, state [N], n) -> (state [N], metrics [N, rows]). The state is donated.
+      seconds: time spent tracing and compiling.
+      state_bytes: device memory for the training state.
+      work_bytes: device memory that the program needs beyond the state.
     """
 
     call: Callable[[Schedule, TrainState, np.int32], tuple[TrainState, dict]]
@@ -67,19 +67,19 @@ class Compiled:
 
 @dataclass
 class Tally:
-    """What the host adds up over the whole run, in integers that do not wrap.
+    """Totals over the whole run, kept on the host in integers that do not wrap.
 
     Attributes:
-      update: updates of every seed that are done.
+      update: updates that every seed has done.
       first: updates that were done when this process began.
-      compile_s: spent compiling.
+      compile_s: seconds spent compiling.
       transitions: robot steps that each seed was trained on.
       targets_reached: newest measured share of each stage's targets, by seed.
-      earlier_s: spent training before this process began.
-      seconds: spent training by this process, compilation apart.
+      earlier_s: seconds of training before this process began.
+      seconds: seconds of training in this process, without compilation.
       decisions: promotions and demotions.
-      barren: newest updates in a row, by seed, that taught nothing: every gradient step was skipped
-        or every arena broke at every step.
+      barren: how many of the newest updates in a row taught nothing, by seed. Such an update
+        skipped every gradient step, or every arena broke at every step.
     """
 
     update: int
@@ -107,10 +107,10 @@ def compile_chunk(
     """Compiles `seeds.train_chunk` ahead of time.
 
     Args:
-      program: the compiled side.
+      program: the run's program.
       schedule: the curriculum's numbers.
-      state: [N] a state, or what `jax.eval_shape` gives of one.
-      meanwhile: is called in a thread when Python has traced the program and XLA compiles it.
+      state: [N] a state, or its shapes from `jax.eval_shape`.
+      meanwhile: called in a thread after Python has traced the program, while XLA compiles it.
 
     Returns:
       The program to call.
@@ -125,8 +125,8 @@ def compile_chunk(
     fixed = program.config.run.deterministic
     call = lowered.compile(loop.compiler_options(deterministic=fixed))
     found = call.memory_analysis()
-    assert found is not None  # both CPU and GPU tell
-    # What is returned lies where the donated state lay, but for the metrics.
+    assert found is not None  # both CPU and GPU report it
+    # The returned state reuses the memory of the donated one. Only the metrics need more.
     returned = found.output_size_in_bytes - found.alias_size_in_bytes
     work = groups * (found.temp_size_in_bytes + returned)
     if groups > 1:
@@ -136,15 +136,15 @@ def compile_chunk(
 
 
 def _import_ahead() -> None:
-    """Imports what a run needs when it saves, while XLA leaves Python idle: half a second."""
-    with contextlib.suppress(ImportError):  # whoever needs it says so
+    """Imports Orbax (half a second) while XLA compiles and Python is idle."""
+    with contextlib.suppress(ImportError):  # the code that needs it reports the error
         importlib.import_module("orbax.checkpoint")
 
 
 def _call_at_once(
     call: Callable[..., Any], groups: int, schedule: Schedule, state: TrainState, n: np.int32
 ) -> tuple[TrainState, dict]:
-    """Calls the program of a group of seeds in a thread for each: XLA uses one core for it."""
+    """Runs each group of seeds in a thread of its own, because XLA uses one core per group."""
 
     def one(part: TrainState) -> tuple[TrainState, dict]:
         return jax.block_until_ready(call(schedule, part, n))
@@ -157,24 +157,25 @@ def _call_at_once(
 def prepare(
     program: Built, schedule: Schedule, state: TrainState, available: int | None
 ) -> tuple[Compiled, TrainState]:
-    """Compiles, and takes all the memory that training needs, so that nothing can lack it later.
+    """Compiles the program and claims all memory for training, so that it cannot run out later.
 
     Args:
-      program: the compiled side.
+      program: the run's program.
       schedule: the curriculum's numbers.
-      state: [N] where to start; donated.
-      available: memory of the device, bytes; None if it is not known.
+      state: [N] the first state; donated.
+      available: memory of the device, bytes; None if unknown.
 
     Returns:
-      The program to call, its `seconds` with those that Warp's kernels took, and the same state.
+      The program to call and the same state. The program's `seconds` include the time to build
+      Warp's kernels.
 
     Raises:
-      ConfigError: if it needs more than there is.
+      ConfigError: if training needs more memory than there is.
     """
     compiled = compile_chunk(program, schedule, state, _import_ahead)
     memory.check(program.config, compiled.total_bytes, available)
     seconds = compiled.seconds + _build_kernels(program, state)
-    # A call of no updates changes nothing, but takes what the program works with.
+    # A call with zero updates changes nothing, but allocates the program's working memory.
     state, _ = jax.block_until_ready(compiled.call(schedule, state, np.int32(0)))
     return replace(compiled, seconds=seconds), state
 
@@ -196,26 +197,26 @@ def train(
     stop: Stop,
     kept: Kept | None = None,
 ) -> tuple[TrainState, Tally]:
-    """Trains until the budget is spent, `run.stop_after` is reached or somebody asks to stop.
+    """Trains until the budget is spent, `run.stop_after` is reached or a stop is requested.
 
-    A checkpoint is written before the first update, by time, by share of the budget, and at the
-    end; a thread writes it while training goes on.
+    Writes checkpoints before the first update, by time, by share of the budget, and at the end. A
+    thread writes them while training continues.
 
     Args:
       run: the run directory.
-      program: the compiled side.
+      program: the run's program.
       schedule: the curriculum's numbers.
       compiled: the program to call, as `prepare` made it.
-      state: [N] where to start; donated.
+      state: [N] the first state; donated.
       display: shows the run.
       stop: notices signals.
-      kept: the checkpoint that the state is of; None for a run that begins.
+      kept: the checkpoint that the state comes from; None for a new run.
 
     Returns:
-      The last state, which is saved, and what came of the run.
+      The last state, which is saved, and the totals of the run.
 
     Raises:
-      DivergedError: if a seed learned nothing in `PATIENCE` updates in a row; the checkpoint before
+      DivergedError: if a seed learned nothing in `PATIENCE` updates in a row. The checkpoint before
         them is kept.
       TrainingError: if the directory cannot be written.
     """
@@ -233,7 +234,7 @@ def train(
             of={"budget": settings.budget, "streams": settings.stream_count, "arenas": keeps},
         )
         what = partial(_saved_part, arenas=keeps)
-        save(what(state), done, record.sync())  # nothing is done if it is there
+        save(what(state), done, record.sync())  # does nothing if this update is already saved
         for n in _calls(program, tally, stop):
             began = time.perf_counter()
             state, metrics = compiled.call(schedule, state, np.int32(n))
@@ -249,33 +250,33 @@ def train(
 
 
 def _saved_part(state: TrainState, *, arenas: bool) -> Any:
-    """Leaves the arenas out of what is saved, where the config says so."""
+    """Drops the arenas from the state to save, if the config says so."""
     return state if arenas else replace(state, arenas=None)
 
 
 class Saves:
-    """Says when a checkpoint is due, by time and by share of the budget, and when to wait for one.
+    """Decides when to write a checkpoint, by time and by share of the budget, and when to wait.
 
-    A run that is killed while it writes a checkpoint goes back to the one before. So that a kill
-    repeats one interval at most, a checkpoint is begun early: by the time that the last one took
-    to write and the next call takes, at most by half of the interval. If it takes longer than
-    that, the run waits for it.
+    A run that is killed while it writes a checkpoint goes back to the previous one. A kill should
+    cost at most one interval of training. So each checkpoint begins early: by the time that the
+    last one took to write plus the length of the next call, but at most by half the interval. If
+    writing takes longer than that, the run waits for it.
     """
 
     def __init__(self, settings: TrainConfig, done: int) -> None:
-        """Begins to count where `done` updates are done."""
+        """Starts to count after `done` updates."""
         self._seconds = 60.0 * settings.run.checkpoint_minutes
         self._updates = settings.run.checkpoint_share * settings.updates
-        self._last = self._before = (time.monotonic(), done)  # checkpoints, the newest and before
+        self._last = self._before = (time.monotonic(), done)  # the newest and previous checkpoint
         self._update = done
         self._call = 0
 
     def due(self, tally: Tally, write_seconds: float) -> bool:
-        """Tells whether to save now; if so, the next checkpoint is counted from here.
+        """Returns whether to save now. If so, the next interval starts here.
 
         Args:
-          tally: after a call of the program.
-          write_seconds: that the last checkpoint took to write.
+          tally: the totals after a call of the program.
+          write_seconds: time to write the last checkpoint.
         """
         self._call, self._update = tally.update - self._update, tally.update
         late = self._call + write_seconds / _pace(tally)  # updates until it is written
@@ -285,13 +286,16 @@ class Saves:
         return due
 
     def must_wait(self, tally: Tally) -> bool:
-        """Tells whether the next call ends later than an interval after the checkpoint before."""
+        """Returns whether the next call ends more than an interval after the save before last."""
         return self._is_over(self._before, tally, self._call, most=1.0)
 
     def _is_over(
         self, since: tuple[float, int], tally: Tally, ahead: float, *, most: float
     ) -> bool:
-        """Tells whether an interval is over in `ahead` updates, or in `most` of it."""
+        """Returns whether an interval since `since` ends within the next `ahead` updates.
+
+        `ahead` counts for at most the fraction `most` of the interval.
+        """
         seconds, updates = time.monotonic() - since[0], tally.update - since[1]
         by_time = seconds + min(ahead * _pace(tally), most * self._seconds) > self._seconds
         by_share = updates + min(ahead, most * self._updates) > self._updates
@@ -299,16 +303,18 @@ class Saves:
 
 
 def _pace(tally: Tally) -> float:
-    """Returns the seconds that an update takes."""
+    """Returns the mean seconds per update in this process."""
     return tally.seconds / (tally.update - tally.first)
 
 
 def score(settings: TrainConfig, tally: Tally) -> float | None:
     """Rates what a run has learned, so that its best checkpoint can be kept.
 
+    A seed scores the index of its furthest measured stage, from 0, plus the share of targets
+    reached there.
+
     Returns:
-      The mean over the seeds of the furthest stage measured, counted from 0, plus the share of
-      its targets that were reached; None before every seed was measured.
+      The mean score over the seeds; None until every seed has been measured.
     """
     names = [stage.name for stage in settings.stage]
     found = [
@@ -322,20 +328,20 @@ def score(settings: TrainConfig, tally: Tally) -> float | None:
 def begin_tally(
     settings: TrainConfig, done: int, compile_s: float, run: Path, kept: Kept | None = None
 ) -> Tally:
-    """Begins to add up, from what a resumed run had come to.
+    """Starts the totals of a run. A resumed run continues the totals in its logs.
 
     Args:
-      settings: of the run.
-      done: updates of every seed that are done.
-      compile_s: that compiling took.
-      run: directory that holds the logs of a run that goes on.
-      kept: the checkpoint that the run goes on from, if one.
+      settings: the run's config.
+      done: updates that every seed has done.
+      compile_s: seconds spent compiling.
+      run: the directory with the logs of a resumed run.
+      kept: the checkpoint that the run resumes from, if any.
 
     Returns:
       The tally before the first update of this process.
 
     Raises:
-      CheckpointError: if a log of the run that goes on is damaged.
+      CheckpointError: if a log of the resumed run is damaged.
     """
     numbers = seeds.numbers(settings)
     tally = Tally(
@@ -371,7 +377,7 @@ def _add(settings: TrainConfig, tally: Tally, rows: list[Row], decisions: list[R
 
 
 def _recorder(run: Path, program: Built, done: int, kept: Kept | None) -> Recorder:
-    """Opens what the run writes, where `done` updates are done."""
+    """Opens the logs of a run that has done `done` updates."""
     settings = program.config
     return Recorder(
         run,
@@ -386,7 +392,7 @@ def _recorder(run: Path, program: Built, done: int, kept: Kept | None) -> Record
 
 
 def _build_kernels(program: Built, state: TrainState) -> float:
-    """Builds Warp's kernels before the clock of training starts; returns the seconds it took."""
+    """Builds Warp's kernels before training time is counted, and returns the seconds it took."""
     began = time.perf_counter()
     loaded = program.world.physics
     if loaded.engine.builds_kernels:
@@ -395,7 +401,7 @@ def _build_kernels(program: Built, state: TrainState) -> float:
 
 
 def _calls(program: Built, tally: Tally, stop: Stop) -> Iterator[int]:
-    """Yields how many updates the next call does, until there is nothing left to do."""
+    """Yields the number of updates for each call, until the run is done or should stop."""
     settings = program.config
     goal = settings.updates
     if settings.run.stop_after is not None:
@@ -416,7 +422,7 @@ def _calls(program: Built, tally: Tally, stop: Stop) -> Iterator[int]:
 
 
 def stop_together(stop: Stop) -> bool:
-    """Tells whether a process of the run was asked to stop; all then end with the same code."""
+    """Returns whether any process of the run was asked to stop. All then exit with one code."""
     if hosts.count() == 1:
         return stop.asked
     asked = hosts.share((stop.code or 1) if stop.asked else 0).max()
@@ -434,7 +440,7 @@ def _report(
     record: Recorder,
     display: Display,
 ) -> None:
-    """Adds a call to the tally, writes it and its episodes down, and shows it."""
+    """Adds a call to the tally, logs it and its episodes, and shows it."""
     settings, log = program.config, metrics.pop(episodes.KEY, None)
     names = [stage.name for stage in settings.stage]
     control_steps = settings.arenas * settings.algo.rollout_length
@@ -448,7 +454,7 @@ def _report(
     record.write(rows, decisions, speeds)
     _watch_steps(settings, tally, rows)
     for entry in decisions:
-        if "to" in entry:  # the rest is many, and stands in the log
+        if "to" in entry:  # the other decisions are many and only go to the log
             display.say(_sentence(settings, entry))
     pace = tally.seconds / (tally.update - tally.first)
     display.hear(rows, speeds)
@@ -464,7 +470,7 @@ def _log_episodes(
     record: Recorder,
     display: Display,
 ) -> None:
-    """Writes the episodes of a call down."""
+    """Writes the episodes of a call to their log."""
     names, numbers = [stage.name for stage in settings.stage], seeds.numbers(settings)
     steps = settings.arenas * settings.algo.rollout_length
     rows, lost = episodes.rows(log, updates, names, numbers, steps)
@@ -472,12 +478,12 @@ def _log_episodes(
     if lost:
         display.say(
             f"{EPISODES} lacks {words.count(lost, 'episode')} up to update "
-            f"{updates[-1]:,}: more ended than there was room for."
+            f"{updates[-1]:,}: more episodes ended than its buffer holds."
         )
 
 
 def _decisions(settings: TrainConfig, rows: list[Row]) -> list[Row]:
-    """Says what the curricula of all seeds decided, in the order of the updates."""
+    """Returns the curriculum's decisions for all seeds, in the order of the updates."""
     names, several = [stage.name for stage in settings.stage], settings.seeds
     found = [
         entry
@@ -488,7 +494,7 @@ def _decisions(settings: TrainConfig, rows: list[Row]) -> list[Row]:
 
 
 def _watch_steps(settings: TrainConfig, tally: Tally, rows: list[Row]) -> None:
-    """Counts the updates in a row that taught nothing; too many end the run."""
+    """Counts the updates in a row that taught nothing, and ends the run after too many."""
     for row in rows:
         seed, skipped = row["seed"], row["policy_loss"] is None or _broke(settings, row)
         tally.barren[seed] = tally.barren[seed] + 1 if skipped else 0
@@ -506,12 +512,12 @@ def _diverged(settings: TrainConfig, tally: Tally, row: Row) -> str:
 
 
 def _broke(settings: TrainConfig, row: Row) -> bool:
-    """Tells whether no step of any arena of an update was finite."""
+    """Returns whether every arena broke at every step of an update."""
     return row["broken_arenas"] >= settings.arenas * settings.algo.rollout_length
 
 
 def _speeds(program: Built, rows: list[Row], seconds: float) -> dict[str, float]:
-    """Speeds of a call: arena, robot and physics steps, and transitions, of all seeds a second."""
+    """Returns a call's arena, robot and physics steps and transitions per second, all seeds."""
     settings = program.config
     arena_steps = len(rows) * settings.arenas * settings.algo.rollout_length
     substeps = physics_substeps(settings.robot, settings.sim.substeps)
@@ -526,7 +532,7 @@ def _speeds(program: Built, rows: list[Row], seconds: float) -> dict[str, float]
 
 
 def _sentence(settings: TrainConfig, entry: Row) -> str:
-    """Says in one line what the curriculum decided."""
+    """Describes a decision of the curriculum in one line."""
     seed = f"seed {entry['seed']}, " if settings.seeds > 1 else ""
     share = entry["targets_reached"]
     success = "not measured yet" if share is None else f"{100 * share:.1f} % of targets reached"

@@ -1,9 +1,11 @@
-"""`init_from=DIR`: a new run begins with what another one learned, its networks and its normaliser.
+"""Implements `init_from=DIR`: a new run starts with another run's networks and normaliser.
 
-Everything else begins afresh: optimiser, learning rate, curriculum, arenas, keys and counters. Of
-the curriculum the number of robots that have trained is kept, so that a promotion copies no
-learner over another one that has learned already.
-Several seeds begin lane by lane with those of as many, or all with the one that there is.
+Optimiser, learning rate, curriculum, arenas, keys and counters start fresh, with one exception. The
+number of robots that have trained is kept, so that a promotion does not copy one learner over
+another that has already learned.
+
+If the other run has as many seeds, each seed starts from its counterpart. If it has one seed, all
+seeds start from that one.
 """
 
 from dataclasses import dataclass, replace
@@ -20,20 +22,20 @@ from swarmjax.run.settings import TrainConfig, from_stored, read_config
 from swarmjax.task.config import resolve_encoding
 from swarmjax.training.loop import TrainState
 
-_CARRIED = ("params", "normalizer")  # of a learner
-_EXPLORED = "explored"  # likewise, of one whose exploration is scheduled
-_MET = "curriculum/met"  # robots that have trained: a promotion copies nobody over them
+_CARRIED = ("params", "normalizer")  # parts of a learner
+_EXPLORED = "explored"  # another part, if its exploration is scheduled
+_MET = "curriculum/met"  # how many robots have trained; a promotion does not overwrite these
 
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """What is carried over.
+    """The learned state that a new run starts from.
 
     Attributes:
-      run: directory of the run that it comes from.
-      update: of the checkpoint that it comes from.
-      leaves: of the learners' networks and normalisers, as `checkpoint.to_leaves` names them, a
-        lane for each seed of the new run.
+      run: directory of the source run.
+      update: update of its checkpoint.
+      leaves: arrays of the learners' networks and normalisers, as `checkpoint.to_leaves` names
+        them, with one entry on the leading axis for each seed of the new run.
       skipped: a sentence for each newer checkpoint that is damaged.
     """
 
@@ -44,16 +46,16 @@ class Source:
 
 
 def read(settings: TrainConfig) -> Source | None:
-    """Reads the newest sound checkpoint of the run that a config starts from.
+    """Reads the newest sound checkpoint of the run in `init_from`.
 
     Args:
       settings: the config of the new run.
 
     Returns:
-      What is carried over, or None if nothing is.
+      The learned state; None without `init_from`.
 
     Raises:
-      ConfigError: if there is none, or its networks are not those of the config.
+      ConfigError: if there is no such checkpoint, or its networks differ from those of the config.
     """
     if settings.init_from is None:
         return None
@@ -77,16 +79,16 @@ def carry(source: Source, state: TrainState, settings: TrainConfig) -> TrainStat
     """Puts what was learned into the first state of a new run.
 
     Args:
-      source: as `read` gave it.
-      state: as `seeds.init` gave it.
-      settings: the config of the new run; `init_from_std` says whose exploration it begins with.
+      source: the learned state, as `read` gave it.
+      state: the first state, as `seeds.init` gave it.
+      settings: the config of the new run. `init_from_std` selects the exploration to start with.
 
     Returns:
-      The state, with the networks and normalisers of the source, and a curriculum that knows how
-      many robots have trained them.
+      The state with the networks and normalisers of the source. Its curriculum records how many
+      robots have trained them.
 
     Raises:
-      ConfigError: if the checkpoint is not of the config beside it.
+      ConfigError: if the checkpoint does not match the config in its directory.
     """
     fresh = {name: getattr(state.learners, name) for name in _CARRIED}
     if settings.init_from_std == "keep" and f"learners/{_EXPLORED}" in source.leaves:
@@ -121,7 +123,7 @@ def _refused(init_from: str, error: Exception) -> ConfigError:
 
 
 def _check_alike(init_from: str, stored: TrainConfig, settings: TrainConfig) -> None:
-    """Refuses networks of another shape or number, and those that would misread what they see."""
+    """Refuses networks of another shape or number, or with another encoding of observations."""
     if stored.seeds not in (1, settings.seeds):
         raise ConfigError(
             f"init_from is {show(init_from)}, a run of {stored.seeds} seeds, but seeds is "

@@ -1,4 +1,4 @@
-"""Weights & Biases: a run of theirs for each seed of a run, on their server or in files alone."""
+"""Logs to Weights & Biases: one W&B run for each seed, on their server or only in files."""
 
 import importlib
 import importlib.util
@@ -18,12 +18,12 @@ def check(settings: TrainConfig) -> None:
     """Refuses a run that asks for W&B where it cannot be used.
 
     Raises:
-      ConfigError: if the library is missing, or is to send and has no key.
+      ConfigError: if the library is missing, or if it has no key in online mode.
     """
     if settings.run.wandb is None:
         return
     found = importlib.util.find_spec("wandb")
-    # W&B's own folder of files would be taken for a package without code.
+    # Python would find W&B's data folder `wandb` as a package without code.
     if found is None or found.origin is None:
         raise ConfigError(
             f"run.wandb is {show(settings.run.wandb)}, but W&B is not installed: install the "
@@ -36,7 +36,7 @@ def check(settings: TrainConfig) -> None:
 def _sign_in() -> None:
     try:
         signed = _wandb().login(verify=False, prompt=False)
-    except Exception:  # of a type of W&B's own
+    except Exception:  # W&B raises errors of its own types
         signed = False
     if not signed:
         raise ConfigError(
@@ -46,47 +46,47 @@ def _sign_in() -> None:
 
 
 class WandbRuns:
-    """Runs of W&B, by seed; a `Logger`.
+    """W&B runs by seed; a `Logger`.
 
-    Of several seeds the first `BOARDS` have one each, in one group. A run that goes on adds to them
-    on the server; in files alone each process writes others, of the same group. Of the machine
-    W&B is told nothing: neither its name nor its load, source or output.
+    Each of the first `BOARDS` seeds has a W&B run. All are in one group. Online, a resumed run
+    continues them on the server. Offline, each process writes new W&B runs in the same group. W&B
+    receives nothing about the machine: not its name, load, source code or console output.
     """
 
     name = "W&B"
 
     def __init__(self, settings: TrainConfig, run: Path) -> None:
-        """Opens nothing yet: W&B takes seconds."""
+        """Opens nothing yet, because W&B takes seconds to start."""
         self._settings, self._run = settings, run
         self._seeds = settings.numbers[:BOARDS]
         self._open: dict[int, Any] = {}
 
     def write(self, rows: Sequence[Row], speeds: Row) -> None:
-        """Writes the numbers of each row, and the speeds of a call with the first seed's last."""
+        """Writes the numbers of each row. The first seed's last row also gets the speeds."""
         mine = [row for row in rows if row["seed"] in self._seeds]
         last = [row for row in mine if row["seed"] == self._seeds[0]][-1]
         for row in mine:
             self._of(row["seed"]).log(_numbers(row | speeds if row is last else row))
 
     def attach(self, name: str, path: Path, arena_steps: int) -> None:
-        """Writes a PNG as a picture and a page as a page, with the first seed."""
+        """Writes a PNG as an image, or a page as HTML, to the first seed's run."""
         wandb = _wandb()
         made = wandb.Image(str(path)) if path.suffix == ".png" else wandb.Html(path.read_text())
         self._of(self._seeds[0]).log({name: made, "arena_steps": arena_steps})
 
     def close(self) -> None:
-        """Waits until everything is written, and sent."""
+        """Waits until everything is written and sent."""
         for each in self._open.values():
             each.finish()
 
     def _of(self, seed: int) -> Any:
-        """Returns the run of a seed, which is started if it is not there."""
+        """Returns the W&B run of a seed, and starts it if necessary."""
         if seed not in self._open:
             self._open[seed] = self._start(seed)
         return self._open[seed]
 
     def _start(self, seed: int) -> Any:
-        """Starts or goes on with the run of a seed."""
+        """Starts or continues the W&B run of a seed."""
         wandb = _wandb()
         asked, online = self._settings.run, self._settings.run.wandb_mode == "online"
         run = wandb.init(
@@ -115,10 +115,10 @@ class WandbRuns:
 
 
 def _wandb() -> Any:
-    """Imports the library, which is an extra and takes seconds."""
+    """Imports the library, which is an optional extra and takes seconds to import."""
     return importlib.import_module("wandb")
 
 
 def _numbers(row: Row) -> Row:
-    """Takes what is a number, as TensorBoard does."""
+    """Returns the entries that are numbers, as for TensorBoard."""
     return {name: value for name, value in row.items() if isinstance(value, int | float)}

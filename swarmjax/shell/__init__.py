@@ -1,5 +1,5 @@
-"""`swarmjax COMMAND key=value ...`: the console script, and what shells complete for it.
+"""The console script `swarmjax COMMAND key=value ...`, and its shell completion.
 
-`swarmjax train` is `python -m swarmjax.train`. A new command is a line in `commands.py`; its module
-is imported only when it runs, so that `--help` needs no JAX.
+`swarmjax train` is the same as `python -m swarmjax.train`. To add a command, add a line to
+`commands.py`. A command's module is imported only when it runs, so that `--help` needs no JAX.
 """

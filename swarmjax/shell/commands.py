@@ -1,4 +1,4 @@
-"""The commands of the console script."""
+"""Lists the commands of the console script."""
 
 import importlib
 from typing import NamedTuple
@@ -7,18 +7,18 @@ from swarmjax.config.section import Section
 
 
 class Command(NamedTuple):
-    """A command of the package, which `python -m swarmjax.NAME` runs as well.
+    """A command of the package. `python -m swarmjax.NAME` runs it too.
 
     Attributes:
-        settings: module and name of the dataclass of its keys, which importing must need no JAX.
-        meaning: what it does, in one sentence without a quote, which scripts of shells put it in.
+      settings: module and name of the dataclass of its keys. Importing it must not need JAX.
+      meaning: its purpose, in one sentence without quotes, because shell scripts quote it.
     """
 
     settings: str
     meaning: str
 
 
-# One line a command.
+# One line per command.
 COMMANDS: dict[str, Command] = {
     "train": Command("swarmjax.run.settings:TrainConfig", "Train a swarm."),
     "evaluate": Command("swarmjax.evaluate.config:EvaluateConfig", "Judge policies in MuJoCo C."),
@@ -37,10 +37,10 @@ COMMANDS: dict[str, Command] = {
 
 
 def settings(name: str) -> type[Section]:
-    """Import the dataclass of a command's keys.
+    """Imports the dataclass of a command's keys.
 
     Args:
-        name: one of `COMMANDS`.
+      name: one of `COMMANDS`.
     """
     module, _, cls = COMMANDS[name].settings.partition(":")
     return getattr(importlib.import_module(module), cls)

@@ -1,7 +1,7 @@
-"""What bash, zsh and fish complete behind `swarmjax`: commands, their keys, and choices of a key.
+"""Writes completion scripts for bash, zsh and fish: commands, their keys, and values of keys.
 
-A script holds all of it in a table, so that completing a word starts no Python; it is written again
-where the keys have changed. A line of the table is a command, a key and the choices of its value:
+A script holds all of this in a table, so that completing a word does not start Python. It must be
+written again after the keys change. A line of the table has a command, a key and its values:
 
     train stage s1 s2 @file
     train run.dry true false
@@ -18,20 +18,20 @@ from swarmjax.shell.commands import COMMANDS, settings
 
 SHELLS = ("bash", "zsh", "fish")
 _FILE = "@file"
-_FOLDERS = {"suite": "suites"}  # folders of configs/ that hold the choices of a key of another name
+_FOLDERS = {"suite": "suites"}  # keys whose folder in configs/ has another name
 
 
 def script(shell: str) -> str:
-    """Write the script that a shell reads.
+    """Writes the completion script for a shell.
 
     Args:
-        shell: one of `SHELLS`.
+      shell: one of `SHELLS`.
 
     Returns:
-        Its text, with a newline at the end.
+      Its text, with a newline at the end.
 
     Raises:
-        ConfigError: it is another shell.
+      ConfigError: if it is another shell.
     """
     if shell not in SHELLS:
         raise ConfigError(f"--completion is {show(shell)}: give one of {', '.join(SHELLS)}.")
@@ -45,10 +45,10 @@ def script(shell: str) -> str:
 
 
 def table(name: str) -> list[str]:
-    """List the keys of a command, each on a line with its choices.
+    """Lists the keys of a command, one per line, with their values.
 
     Args:
-        name: one of `COMMANDS`.
+      name: one of `COMMANDS`.
     """
     cls = settings(name)
     groups = {key for key in section.names(cls) if files.choices(_FOLDERS.get(key, key))}
@@ -59,13 +59,13 @@ def table(name: str) -> list[str]:
 
 
 def choices(hint: object) -> list[str]:
-    """List what a key may be.
+    """Lists the values of a key.
 
     Args:
-        hint: its type.
+      hint: its type.
 
     Returns:
-        Its words; `@file` among them where text is taken, and none where only numbers are.
+      Its values, with `@file` if the key takes text. A key that takes only numbers has none.
     """
     found: list[str] = []
     for option in section.options(hint):

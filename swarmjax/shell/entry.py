@@ -1,4 +1,4 @@
-"""What the console script `swarmjax` runs."""
+"""The entry point of the console script `swarmjax`."""
 
 import difflib
 import runpy
@@ -12,14 +12,14 @@ from swarmjax.exit_codes import USER_ERROR
 from swarmjax.shell import completion
 from swarmjax.shell.commands import COMMANDS, settings
 
-_TOLD = ("jax", "mujoco", "mujoco-mjx", "python")  # what `--version` names besides swarmjax
+_TOLD = ("jax", "mujoco", "mujoco-mjx", "python")  # `--version` lists these after swarmjax
 
 
 def main() -> int:
-    """Run what the command line asks for.
+    """Runs the command line.
 
     Returns:
-        The exit code, 2 for an error of the user's; a command ends the process with its own.
+      The exit code: 2 for the user's errors. A command ends the process with its own code.
     """
     name, *rest = sys.argv[1:] or ["--help"]
     try:
@@ -41,12 +41,12 @@ def _run(name: str, rest: Sequence[str]) -> int:
     else:
         near = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"did you mean {near[0]}?" if near else f"give one of {', '.join(COMMANDS)}."
-        raise ConfigError(f"{show(name)} is no command: {hint}")
+        raise ConfigError(f"{show(name)} is not a command: {hint}")
     return 0
 
 
 def _command(name: str, rest: Sequence[str]) -> int:
-    """Run a command as `python -m` does, but for its help, which needs no more than its keys."""
+    """Runs a command as `python -m` does, except that help imports only the command's keys."""
     sys.argv = [sys.argv[0], *rest]
     if command.HELP & set(rest):
         return command.run(name, lambda _: 0, settings(name))
@@ -55,7 +55,7 @@ def _command(name: str, rest: Sequence[str]) -> int:
 
 
 def help_text() -> str:
-    """List the commands, without a newline at the end."""
+    """Lists the commands, without a newline at the end."""
     lines = ["usage: swarmjax COMMAND key=value ...", "", "Commands:"]
     lines += [f"  {name:<10}  {each.meaning}" for name, each in COMMANDS.items()]
     lines += [
@@ -68,7 +68,7 @@ def help_text() -> str:
 
 
 def _versions() -> str:
-    """Name the versions installed, on one line."""
+    """Lists the installed versions on one line."""
     found = provenance.versions()
     told = [f"{name} {found[name]}" for name in _TOLD if name in found]
     return ", ".join([f"swarmjax {swarmjax.__version__}", *told])

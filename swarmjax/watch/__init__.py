@@ -1,6 +1,7 @@
-"""A page on the loopback that follows a run: its curves, and what its newest policy does.
+"""Serves a page on the loopback that follows a run: its curves, and a replay of its newest policy.
 
-Imports figures of `report`, episodes of `replay`, `pages`, and what a run's directory tells by
-`run`. `standing.py` says whether a run trains, `newest.py` replays its newest policy, `view.py`
-keeps what is shown as new as it should be, `server.py` answers. Start with `view.Views`.
+Imports `pages`, the figures of `report`, the episodes of `replay`, and the run directory's readers
+of `run`. `standing.py` finds out whether a run trains, and `newest.py` replays its newest policy.
+`view.py` keeps the shown data up to date, and `server.py` answers requests. Start with
+`view.Views`.
 """

@@ -1,7 +1,7 @@
-"""`python -m swarmjax.watch run=DIR [port=N]`: a page on this machine that follows a run.
+"""`python -m swarmjax.watch run=DIR [port=N]`: serves a page on this machine that follows a run.
 
-Prints the page's address, and serves it until Ctrl-C. The run may train, have ended or have been
-killed; the page says which. No account, and nothing that leaves the machine.
+Prints the page's address, and serves it until Ctrl-C. The page shows whether the run trains, has
+ended or was killed. It needs no account, and sends nothing off the machine.
 """
 
 import os
@@ -16,7 +16,7 @@ from swarmjax.watch.config import WatchConfig
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; Ctrl-C ends it."""
     settings = files.load(WatchConfig, arguments)
-    os.environ["JAX_PLATFORMS"] = "cpu"  # it reads checkpoints, and leaves the GPU to the run
+    os.environ["JAX_PLATFORMS"] = "cpu"  # reading checkpoints needs no GPU; leave it to the run
     from swarmjax.watch.server import Server
     from swarmjax.watch.view import Views
 

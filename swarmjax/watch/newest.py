@@ -1,7 +1,7 @@
-"""What the newest policy of a run does: a replay of one level, in MuJoCo's C engine.
+"""Replays one level with the newest policy of a run, in MuJoCo's C engine.
 
-The weights are those of the newest sound checkpoint. Nothing of the run is executed: a policy that
-needs pieces of somebody's is shown only with the file that whoever watches names.
+The weights come from the newest sound checkpoint. No code from the run directory is executed. A
+policy that needs an extension is shown only if the user names the extension's file.
 """
 
 import tempfile
@@ -30,9 +30,9 @@ class Newest(NamedTuple):
     """A replay of a run's newest policy.
 
     Attributes:
-        update: updates that the policy was trained for.
-        sentence: what is seen.
-        page: of HTML.
+      update: updates that the policy was trained for.
+      sentence: a description of the replay.
+      page: the HTML page.
     """
 
     update: int
@@ -41,18 +41,18 @@ class Newest(NamedTuple):
 
 
 def record(settings: WatchConfig, history: History | None) -> Newest:
-    """Replays a level by the newest policy.
+    """Replays a level with the newest policy.
 
     Args:
-        settings: of the page.
-        history: what the run has written down; None before the first update.
+      settings: settings of the page.
+      history: the run's logged results; None before the first update.
 
     Raises:
-        ConfigError: if the policy cannot be replayed as the settings say.
-        CheckpointError: if no checkpoint is sound.
-        PolicyError: if the policy is unsound.
+      ConfigError: if the policy cannot be replayed with these settings.
+      CheckpointError: if no checkpoint is sound.
+      PolicyError: if the policy is invalid.
     """
-    from swarmjax.run import checkpoint  # which takes JAX, for seconds
+    from swarmjax.run import checkpoint  # imports JAX, which takes seconds
     from swarmjax.run.policy_export import write_policy
 
     run = Path(settings.run)
@@ -79,10 +79,10 @@ def record(settings: WatchConfig, history: History | None) -> Newest:
 
 
 def _settled(settings: WatchConfig, trained: TrainConfig) -> TrainConfig:
-    """Puts the file that is named in the place of the one that the run names."""
+    """Replaces the run's extension file by the one in the page's settings."""
     if trained.extensions is not None and settings.extensions is None:
         raise ConfigError(
-            "the run has pieces of somebody's, which are code: to see its policy, give "
+            "the run was trained with an extension, which is code: to see its policy, give "
             "extensions=FILE, a file that you trust."
         )
     return settle(replace(trained, extensions=settings.extensions))
@@ -94,7 +94,7 @@ def _seed(settings: WatchConfig, trained: TrainConfig) -> int:
         return every[0]
     if settings.seed not in every:
         raise ConfigError(
-            f"seed is {settings.seed}, but {settings.run} was trained with {every[0]} to "
+            f"seed is {settings.seed}, but {settings.run} was trained with seeds {every[0]} to "
             f"{every[-1]}: give one of them."
         )
     return settings.seed

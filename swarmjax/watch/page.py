@@ -1,23 +1,23 @@
-"""The page that follows a run: what stands still on it, and its script."""
+"""Builds the page that follows a run: its static parts and its script."""
 
 from pathlib import Path
 
 from swarmjax.pages import builder
 from swarmjax.watch.view import NAMES
 
-# Of its own server: what its script asks for, and the frame of a replay.
+# The page may load from its own server only: requests of its script, and the frame of a replay.
 _SOURCES = {"img-src": "'self' data:", "connect-src": "'self'", "frame-src": "'self'"}
 
 
 def page(run: Path) -> str:
-    """Lays the page out.
+    """Builds the page.
 
     Args:
-        run: that it follows.
+      run: the run to follow.
 
     Returns:
-        HTML in which the run's name is escaped. All else of the run comes as data, which the script
-        puts there as text.
+      HTML with the run's name escaped. Everything else about the run arrives as data, which the
+      script inserts as text.
     """
     return builder.render(
         "watch/watch.html",

@@ -1,8 +1,8 @@
-"""Answers a browser on this machine: the page, what it shows, its figures and its replay.
+"""Serves the page, its data, its figures and its replay to a browser on this machine.
 
-Nothing is read from disk for an answer, so no path leads to a file. Only this machine can connect.
-A page elsewhere whose name is made to lead here (DNS rebinding) sends its own name as Host and is
-refused; it cannot read answers otherwise, since none allows another origin.
+No request reads from disk, so no path leads to a file. Only this machine can connect. A foreign
+page that redirects its own name to this address (DNS rebinding) sends that name as Host and is
+refused. Without rebinding it cannot read answers either, since none of them allows another origin.
 """
 
 import json
@@ -21,42 +21,42 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-_TIMEOUT_S = 10.0  # for which a connection may say nothing
+_TIMEOUT_S = 10.0  # a connection that is silent for longer is closed
 
 
 class Server(ThreadingHTTPServer):
-    """Listens on the loopback alone."""
+    """Listens only on the loopback."""
 
     daemon_threads = True
 
     def __init__(self, port: int, views: Views) -> None:
-        """Takes the port; 0 is any that is free.
+        """Opens the port; 0 means any free port.
 
         Raises:
-            ConfigError: if it cannot be had.
+          ConfigError: if the port is not available.
         """
         self.views, self.page = views, page.page(views.run)
         try:
             super().__init__((ADDRESS, port), Answers)
         except OSError as error:
             raise ConfigError(
-                f"port is {port}, which cannot be had ({error.strerror}): give another, or 0 for "
-                "any that is free."
+                f"port is {port}, which is not available ({error.strerror}): give another, or 0 "
+                "for any free port."
             ) from None
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Says nothing of a browser that has gone before it had its answer."""
+        """Ignores a browser that has closed the connection before it received its answer."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)  # pyright: ignore[reportArgumentType]
 
     @property
     def url(self) -> str:
-        """Of the page."""
+        """Address of the page."""
         return f"http://{ADDRESS}:{self.server_port}/"
 
     @property
     def hosts(self) -> tuple[str, str]:
-        """What a browser on this machine sends as Host."""
+        """Values that a browser on this machine sends as Host."""
         return f"{ADDRESS}:{self.server_port}", f"localhost:{self.server_port}"
 
 
@@ -68,7 +68,7 @@ class Answers(BaseHTTPRequestHandler):
     timeout = _TIMEOUT_S
 
     def do_GET(self) -> None:  # as the library calls it
-        """Answers with what there is under a path."""
+        """Answers with the content at a path."""
         if self._is_foreign():
             return
         found = self._find(self.path.partition("?")[0])
@@ -79,7 +79,7 @@ class Answers(BaseHTTPRequestHandler):
         self._send(HTTPStatus.OK, kind, content, {"Content-Security-Policy": frames})
 
     def _find(self, path: str) -> tuple[str, bytes, str] | None:
-        """Finds the type, the content and who may frame it; None if there is none."""
+        """Returns type, content and framing policy for a path; None if there is no such page."""
         views = self.server.views
         html, unframed = "text/html; charset=utf-8", "frame-ancestors 'none'"
         if path == "/":
@@ -94,16 +94,16 @@ class Answers(BaseHTTPRequestHandler):
         return None
 
     def _refuse(self) -> None:
-        """Refuses what would change something."""
+        """Refuses every method except GET."""
         if not self._is_foreign():
-            text = b"This page is to be read: GET alone.\n"
+            text = b"This page is read-only: use GET.\n"
             self._send(HTTPStatus.METHOD_NOT_ALLOWED, "text/plain", text, {"Allow": "GET"})
 
     do_HEAD = do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = _refuse  # noqa: N815
     do_CONNECT = _refuse  # noqa: N815
 
     def _is_foreign(self) -> bool:
-        """Refuses a request that was meant for another host; tells whether it did."""
+        """Refuses a request that was meant for another host; returns whether it did."""
         if self.headers.get_all("Host") in [[host] for host in self.server.hosts]:
             return False
         self._send(
@@ -123,4 +123,4 @@ class Answers(BaseHTTPRequestHandler):
             self.wfile.write(content)
 
     def log_message(self, format: str, *args: object) -> None:  # as the library has it
-        """Says nothing of requests."""
+        """Logs nothing about requests."""

@@ -1,4 +1,4 @@
-"""Says whether a run trains, has ended, was stopped or was killed, from its directory alone."""
+"""Finds out from its directory whether a run trains, has ended, was stopped or was killed."""
 
 import json
 import os
@@ -13,19 +13,21 @@ from swarmjax.run import directory
 from swarmjax.run.hosts import CHECKPOINTS
 from swarmjax.run.settings import TrainConfig
 
-# s; a run elsewhere, whose process cannot be seen, that has written nothing for so long is silent.
+# s. The process of a run on another machine cannot be seen. If the run has written nothing for
+# this long, it counts as silent.
 SILENT_S = 120.0
 _TAIL = 2**22  # bytes that hold the newest rows of all seeds
 
 
 class Standing(NamedTuple):
-    """How a run stands.
+    """State of a run.
 
     Attributes:
-        state: `trains` or `elsewhere` while it goes on; `ended`, with its budget spent; `stopped`,
-            with all saved; `killed`, or broken, with the rest of its budget open; `silent`: gone,
-            or on another machine and not heard of.
-        sentence: says so to a person.
+      state: one of these. `trains`: on this machine. `elsewhere`: trains on another machine.
+        `ended`: its budget is spent. `stopped`: it saved everything before it stopped. `killed`:
+        killed or crashed. `silent`: its directory is gone, or it is on another machine and has
+        written nothing for a while.
+      sentence: the same for a person to read.
     """
 
     state: Literal["trains", "elsewhere", "ended", "stopped", "killed", "silent"]
@@ -33,11 +35,11 @@ class Standing(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """How far a run is.
+    """Progress of a run.
 
     Attributes:
-        done: updates that all seeds have written down.
-        seconds: that training took them; None if it was not written down.
+      done: updates that all seeds have logged.
+      seconds: training time for these updates; None if it was not logged.
     """
 
     done: int = 0
@@ -45,11 +47,11 @@ class Progress(NamedTuple):
 
 
 def progress(run: Path, seeds: int) -> Progress:
-    """Reads how far a run is from the end of its metrics; a line without an end counts for nothing.
+    """Reads the progress of a run from the end of its metrics, and ignores an unfinished line.
 
     Args:
-        run: its directory.
-        seeds: how many write an update down.
+      run: its directory.
+      seeds: number of seeds, which each log an update.
     """
     try:
         with (run / directory.METRICS).open("rb") as file:
@@ -64,11 +66,11 @@ def progress(run: Path, seeds: int) -> Progress:
 
 
 def stand(run: Path, trained: TrainConfig) -> Standing:
-    """Says how a run stands now.
+    """Returns the current state of a run.
 
     Args:
-        run: its directory.
-        trained: its config.
+      run: its directory.
+      trained: its config.
     """
     if not (run / directory.CONFIG).exists():
         return Standing("silent", f"{run} is gone.")
@@ -91,16 +93,18 @@ def stand(run: Path, trained: TrainConfig) -> Standing:
 
 
 def _elsewhere(so_far: str, age: float | None) -> Standing:
-    """Says how a run stands whose process another machine has."""
+    """Returns the state of a run whose process is on another machine."""
     if age is not None and age < SILENT_S:
         return Standing("elsewhere", f"It trains: {so_far}; {_written(age)}.")
     return Standing(
-        "silent", f"It was killed or still trains: {so_far}, which cannot be seen; {_written(age)}."
+        "silent",
+        f"It was killed or still trains, which cannot be seen from here: {so_far}; "
+        f"{_written(age)}.",
     )
 
 
 def _age(run: Path) -> float | None:
-    """Returns the seconds since the run wrote down an update; None if it has none."""
+    """Returns the seconds since the run last logged an update; None if it has logged none."""
     try:
         found = (run / directory.METRICS).stat()
     except OSError:
@@ -115,7 +119,7 @@ def _written(age: float | None) -> str:
 
 
 def _left(trained: TrainConfig, found: Progress) -> str:
-    """Says how long a run will take, by the mean of its updates so far."""
+    """Describes the time that a run has left, from its mean time per update."""
     if not found.done or found.seconds is None or found.done >= trained.updates:
         return ""
     seconds = found.seconds / found.done * (trained.updates - found.done)
@@ -123,7 +127,7 @@ def _left(trained: TrainConfig, found: Progress) -> str:
 
 
 def _summed_up(run: Path) -> int | None:
-    """Returns the updates of the summary, the last file that a run writes; None without one."""
+    """Returns the updates in the summary, the last file that a run writes; None without one."""
     try:
         found = rows.read_object(run / directory.SUMMARY).get("updates")
     except (ConfigError, OSError):

@@ -1,4 +1,4 @@
-"""Keeps what a page shows as new as it should be, in threads, while somebody looks at it."""
+"""Keeps the figures and the replay of a page up to date, in threads, while the page is open."""
 
 import sys
 import threading
@@ -19,9 +19,9 @@ from swarmjax.watch.config import WatchConfig
 from swarmjax.watch.newest import Newest
 from swarmjax.watch.standing import stand
 
-LOOKED_AT_S = 15.0  # since the page last asked, for which it counts as looked at
-PAUSE_S = 0.5  # between two looks at the directory
-# Drawing takes at most this share of a core, so that a run which shares it is hardly slower.
+LOOKED_AT_S = 15.0  # the page counts as open for this long after its last request
+PAUSE_S = 0.5  # between two checks of the directory
+# Drawing takes at most this share of a core, so that it hardly slows down the run.
 SHARE = 0.2
 
 NAMES = {
@@ -36,10 +36,10 @@ class DrawnFigures(NamedTuple):
     """Figures of a run.
 
     Attributes:
-        version: rises with each drawing.
-        history: that they show; None before the first update.
-        figures: PNG files by the names in `NAMES`.
-        trouble: why there are no newer ones; empty if there are.
+      version: increases with each drawing.
+      history: the results that they show; None before the first update.
+      figures: PNG files by the names in `NAMES`.
+      trouble: why the newest drawing failed; empty if it did not.
     """
 
     version: int = 0
@@ -52,9 +52,9 @@ class Replayed(NamedTuple):
     """A replay.
 
     Attributes:
-        version: rises with each.
-        newest: what is shown; None before there is one.
-        trouble: why there is no newer one; empty if there is.
+      version: increases with each replay.
+      newest: the replay to show; None before there is one.
+      trouble: why the newest replay failed; empty if it did not.
     """
 
     version: int = 0
@@ -63,13 +63,13 @@ class Replayed(NamedTuple):
 
 
 class Views:
-    """What is shown of a run; threads renew it."""
+    """The figures and the replay of a run, which threads keep up to date."""
 
     def __init__(self, settings: WatchConfig) -> None:
         """Reads the run's config.
 
         Raises:
-            ConfigError: if there is none that is sound.
+          ConfigError: if there is no valid config.
         """
         self.settings, self.run = settings, Path(settings.run)
         self.trained = rows.read_config(self.run)
@@ -79,12 +79,12 @@ class Views:
         self._tried: int | None = None
 
     def follow(self) -> None:
-        """Begins to renew what is shown, whenever somebody looks."""
+        """Starts the threads that update figures and replay while the page is open."""
         for renew in (self.draw, self.replay):
             threading.Thread(target=self._keep, args=(renew,), daemon=True).start()
 
     def state(self) -> dict[str, Any]:
-        """Says what the page shows now, as plain data; whoever asks looks at it."""
+        """Returns the page's current content as plain data, and marks the page as open."""
         self._asked = time.monotonic()
         drawn, replayed = self.drawn, self.replayed
         standing = stand(self.run, self.trained)
@@ -102,7 +102,7 @@ class Views:
         }
 
     def draw(self) -> float:
-        """Draws the figures again if the run has written more; returns how long to rest then, s."""
+        """Redraws the figures if the run has logged more, and returns the seconds to rest."""
         found = _version(self.run / METRICS)
         if found is None or found == self._seen:
             return 0.0
@@ -111,14 +111,14 @@ class Views:
             self.trained = rows.read_config(self.run)
             history = rows.read(self.run)
             self.drawn = DrawnFigures(self.drawn.version + 1, history, figures(history))
-        except (ConfigError, OSError) as error:  # such as of a run that is removed meanwhile
+        except (ConfigError, OSError) as error:  # for example, the run was removed meanwhile
             self.drawn = self.drawn._replace(trouble=str(error))
         self._seen = found
         return (time.perf_counter() - began) * (1.0 - SHARE) / SHARE
 
     def replay(self) -> float:
-        """Replays a policy that was not tried yet; returns how long to rest then, s."""
-        if self.drawn.history is None and not self.drawn.trouble:  # which says on what stage it is
+        """Replays the newest policy if it is new, and returns the seconds to rest."""
+        if self.drawn.history is None and not self.drawn.trouble:  # the history gives the stage
             return 0.0
         from swarmjax.run import checkpoint  # JAX takes seconds to import
 
@@ -134,20 +134,20 @@ class Views:
         return self.settings.seconds
 
     def _keep(self, renew: Callable[[], float]) -> None:
-        """Renews while somebody looks, for ever."""
+        """Keeps updating forever, while the page is open."""
         while True:
             rest = 0.0
             if time.monotonic() - self._asked < LOOKED_AT_S:
                 try:
                     rest = renew()
-                except Exception as error:  # unforeseen; the page goes on
+                except Exception as error:  # unforeseen; the page must go on
                     sys.stderr.write(f"swarmjax.watch: {type(error).__name__}: {error}\n")
                     rest = LOOKED_AT_S
             time.sleep(PAUSE_S + rest)
 
 
 def _version(path: Path) -> tuple[int, float] | None:
-    """Tells one state of a file from another; None if it is missing or empty."""
+    """Returns a file's size and time, to detect changes; None if it is missing or empty."""
     try:
         found = path.stat()
     except OSError:
@@ -159,7 +159,7 @@ def figures(history: History) -> dict[str, bytes]:
     """Draws the figures of a run.
 
     Returns:
-        PNG files by the names in `NAMES`; those alone that say something.
+      PNG files by the names in `NAMES`, without figures that would show nothing.
     """
     from swarmjax.pages import figures as drawing  # Matplotlib takes a second
     from swarmjax.report import figures as report_figures

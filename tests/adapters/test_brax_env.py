@@ -73,7 +73,7 @@ def test_wrong_actions_are_refused(
 
 
 def test_another_number_of_environments_is_refused(env: SwarmBraxEnv) -> None:
-    with pytest.raises(ValueError, match=r"^num_envs is 4: give 6, the robots there are\.$"):
+    with pytest.raises(ValueError, match=r"^num_envs is 4: give 6, the number of robots\.$"):
         env.reset(jax.random.split(jax.random.key(0), 4))
 
 

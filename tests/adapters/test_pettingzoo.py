@@ -76,10 +76,13 @@ def test_seeds_reproduce(env: SwarmParallelEnv) -> None:
 @pytest.mark.parametrize(
     ("actions", "sentence"),
     [
-        ({"robot_0": np.zeros(2, np.float32)}, "actions lack, or have too many, ['robot_1']."),
+        (
+            {"robot_0": np.zeros(2, np.float32)},
+            "actions are missing or not expected for ['robot_1'].",
+        ),
         (
             dict.fromkeys([*AGENTS, "robot_2"], np.zeros(2, np.float32)),
-            "actions lack, or have too many, ['robot_2'].",
+            "actions are missing or not expected for ['robot_2'].",
         ),
         (
             dict.fromkeys(AGENTS, np.zeros(3, np.float32)),

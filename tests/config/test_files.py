@@ -134,7 +134,7 @@ def test_a_grid_is_one_file(own_configs):
         ("name: mine\nrobot: 4\nside: 1\n", "stage.robot is not a key: did you mean stage.robots?"),
         ("name: [\n", "mine.yaml"),
         ("- a\n", "mine.yaml"),
-        ("grid: 3\n", "stage.grid is 3: give keys of its own, as stage.grid.robots"),
+        ("grid: 3\n", "stage.grid is 3: give its keys, such as stage.grid.robots"),
         ("grid: {robots: [2]}\n", "stage.grid.side is missing"),
         ("grid: {robots: [2], side: [1]}\nrobots: 3\n", "stage.robots cannot be given for mine"),
     ],

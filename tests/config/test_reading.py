@@ -20,9 +20,9 @@ BOMB = "\n".join(
     ("text", "part"),
     [
         (BOMB, "has more than 200000 values"),
-        ("a: &a [*a]", "*a stands within itself"),
-        ("a: " + "[" * 100_000, "more than 32 lists or mappings lie in one another"),
-        ("[" * 100_000 + "]" * 100_000, "more than 32 lists or mappings lie in one another"),
+        ("a: &a [*a]", "*a contains itself"),
+        ("a: " + "[" * 100_000, "lists or mappings are nested more than 32 deep"),
+        ("[" * 100_000 + "]" * 100_000, "lists or mappings are nested more than 32 deep"),
         ("a: " + "9" * 4900, "4300 digits"),
         ("a: " + "9" * 5001, "more than 5000 letters"),
         ("a: 1\na: 2\n", "key 'a' is there twice"),
@@ -54,10 +54,10 @@ def test_aliases_that_stand_for_little_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        ("[" * 100_000, "more than 32 lists or mappings lie in one another"),
-        ('{"a":' * 40 + "1" + "}" * 40, "more than 32 lists or mappings lie in one another"),
+        ("[" * 100_000, "lists or mappings are nested more than 32 deep"),
+        ('{"a":' * 40 + "1" + "}" * 40, "lists or mappings are nested more than 32 deep"),
         ("9" * 5000, "a number has too many digits"),
-        ("{", "no JSON"),
+        ("{", "it is not JSON"),
     ],
 )
 def test_json_that_stands_for_too_much_is_refused(tmp_path: Path, text: str, part: str) -> None:
@@ -82,7 +82,7 @@ def test_what_is_no_plain_file_is_refused(path: Path) -> None:
 def test_text_that_is_no_unicode_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_bytes(b"a: \xff\n")
-    assert refusal(reading.read_text, path) == f"{path} cannot be read: it is no text in UTF-8."
+    assert refusal(reading.read_text, path) == f"{path} cannot be read: it is not UTF-8 text."
 
 
 def test_a_large_file_is_refused_unread(tmp_path: Path) -> None:

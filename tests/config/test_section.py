@@ -149,7 +149,7 @@ def test_stages_of_a_curriculum_are_named_in_sentences():
     )
     assert refusal(build, TrainConfig, {"stage": [bad]}) == "stage.robots is 0: give 1 to 100."
     assert refusal(build, TrainConfig, {"stage": [good, 3]}) == (
-        "stage 1 is 3: give keys of its own, as stage 1: name."
+        "stage 1 is 3: give its keys, such as stage 1: name."
     )
 
 

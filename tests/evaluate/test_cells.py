@@ -304,7 +304,7 @@ def test_swarms_are_as_dense_as_the_last_stage() -> None:
         (_text("name: a b, stage: s1, seed: 1000000"), "name is 'a b': give letters, digits"),
         (_text(*["name: a, stage: s1, seed: 1000000"] * 2), "cells names a more than once"),
         (_text("name: a, stage: {robots: 2, side: 0.3}, seed: 1000000"), "stage.side is 0.3: "),
-        ("- 1\n", "is no list of keys and values"),
+        ("- 1\n", "is not a list of keys and values"),
     ],
 )
 def test_a_suite_that_is_unsound_is_refused(tmp_path: Path, text: str, reason: str) -> None:

@@ -124,8 +124,8 @@ def test_the_clamp_of_each_wheel_takes_the_turn_of_a_fast_command() -> None:
          "algo.mean_activation is tanh, but activation is relu, and a policy's file has one for "
          "all layers: give activation=tanh or mean_activation=linear."),
         (["algo=paper", "budget=3e9"],
-         "budget is 3000000000, but algo.exploration is scheduled by control steps that are "
-         "counted in 32 bits: give at most 2147483647."),
+         "budget is 3000000000, but algo.exploration=scheduled counts control steps in 32 bits: "
+         "give at most 2147483647."),
         (["algo=paper", "curriculum.normalizer=relearn"],
          "curriculum.normalizer is relearn, but algo.normalize_observations is false: give keep "
          "or algo.normalize_observations=true."),

@@ -155,7 +155,7 @@ def test_a_renamed_checkpoint_is_passed_over(tmp_path: Path) -> None:
     _, update, skipped = checkpoint.restore(tmp_path)
     assert update == 1
     assert "checkpoint 7" in skipped[0]
-    assert "it is of update 2" in skipped[0]
+    assert "it belongs to update 2" in skipped[0]
 
 
 def test_swapped_checkpoints_are_both_passed_over(tmp_path: Path) -> None:
@@ -176,7 +176,7 @@ def test_a_checkpoint_of_another_run_is_passed_over(tmp_path: Path) -> None:
     shutil.copytree(_steps(other) / "2", _steps(mine) / "2")
     _, update, skipped = checkpoint.restore(mine)
     assert update == 1
-    assert "it is of run b, and this is run a" in skipped[0]
+    assert "it belongs to run b, but this is run a" in skipped[0]
 
 
 def test_a_checkpoint_of_another_config_is_refused(tmp_path: Path) -> None:
@@ -210,7 +210,7 @@ def test_a_checkpoint_of_an_older_version_loads_with_a_sentence(tmp_path: Path) 
     kept = checkpoint.find(tmp_path)
     assert kept.update == 1
     assert kept.logs == {}
-    assert kept.notes == [f"checkpoint 1 of {tmp_path} does not say which run it is of"]
+    assert kept.notes == [f"checkpoint 1 of {tmp_path} does not record its run"]
 
 
 def test_the_best_is_kept_besides_the_newest(tmp_path: Path) -> None:

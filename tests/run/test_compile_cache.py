@@ -109,7 +109,7 @@ def test_a_damaged_entry_is_said_and_replaced(
     foreign = "jit_small_program-of-mine-cache"
     (tmp_path / foreign).write_text("")
     (sentence,) = _use(tmp_path)
-    assert sentence.startswith(f"what {tmp_path} kept of jit_small_program cannot be read and is ")
+    assert sentence.startswith(f"jit_small_program in {tmp_path} cannot be read and is compiled ")
     assert _entries(tmp_path).keys() == {name, foreign}
     events.clear()
     assert _use(tmp_path) == []
@@ -119,7 +119,7 @@ def test_a_damaged_entry_is_said_and_replaced(
 def test_a_directory_that_cannot_be_written_is_said(unset: None, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     (sentence,) = _use(tmp_path / "file" / "xla")
-    assert sentence.startswith("nothing that is compiled will be kept: ")
+    assert sentence.startswith("compiled programs will not be kept: ")
     assert str(tmp_path / "file") in sentence
 
 

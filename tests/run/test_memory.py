@@ -125,7 +125,7 @@ def test_auto_on_a_cpu_is_the_default(minibatches: int, arenas: int) -> None:
     settings = replace(SETTINGS, arenas=minibatches, algo=AlgoConfig(num_minibatches=minibatches))
     chosen, why = memory.fill(settings, lambda _: pytest.fail("nothing to measure"), None)
     assert chosen == replace(settings, arenas=arenas)
-    assert why == f"arenas=auto: {arenas}, as wherever no GPU tells its memory."
+    assert why == f"arenas=auto: {arenas}, the default where no GPU reports its memory."
 
 
 @pytest.mark.parametrize(

@@ -170,7 +170,7 @@ def test_import_needs_neither_jax_nor_hydra():
          "layout is fence: give 1 or more."),
         # Types and bounds.
         (["task.arrival=stay"], "task.arrival is 'stay': give latch or hold."),
-        (["task=3"], "task is 3: give keys of its own, as task.control_step."),
+        (["task=3"], "task is 3: give its keys, such as task.control_step."),
         (["algo.hidden_sizes=64"], "algo.hidden_sizes is 64: give a list, as in [64,64]."),
         (["algo.hidden_sizes=[]"], "algo.hidden_sizes is []: give at least one layer, as in "
         "[64,64]."),
@@ -254,7 +254,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["task.neighbours.count=2", "algo.update_backend=fused"], "algo.update_backend is fused, "
          "but task.neighbours.count is 2: give auto or autodiff, or task.neighbours.count=0."),
         (["task.neighbours.count=2", "algo.network=mine"], "algo.network is mine, but "
-         "task.neighbours.count is 2, which goes with hidden layers alone: give algo.network=mlp "
+         "task.neighbours.count is 2, which works only with hidden layers: give algo.network=mlp "
          "or task.neighbours.count=0."),
         (["realism.packet_loss=1.5"], "realism.packet_loss is 1.5: give 0 to 1."),
         (["robot.track=0.08"], "robot.track is 0.08, but hull_radius is 0.037 and the wheels lie "
@@ -273,8 +273,8 @@ def test_import_needs_neither_jax_nor_hydra():
         # 1e15 // 4096 = 244140625000; 1 epoch of 8 minibatches: (2**31 - 1) // 8 = 268435455, and
         # 268435455 * 4096 = 1099511623680.
         (["budget=1e15"], "budget is 1000000000000000, which is 244140625000 updates of 4096 "
-         "control steps, and the gradient steps of no more than 268435455 are counted in 32 bits: "
-         "give at most 1099511623680."),
+         "control steps, but gradient steps are counted in 32 bits, which is enough for 268435455 "
+         "updates: give at most 1099511623680."),
     ],
 )  # fmt: skip
 def test_train_refuses(words, sentence):

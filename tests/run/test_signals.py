@@ -51,7 +51,7 @@ def test_a_signal_asks_to_stop_and_says_so(number: int, code: int) -> None:
     process.send_signal(number)
     _, said = process.communicate(timeout=30)
     assert process.returncode == code
-    assert said == "stopping after this call, to save; once more stops at once\n"
+    assert said == "stopping after this call, to save; a second signal stops at once\n"
 
 
 def test_a_second_signal_ends_the_process_even_within_a_call() -> None:

@@ -400,7 +400,7 @@ def test_a_run_that_was_killed_before_it_saved_begins_from_its_seed(
     (tmp_path / "metrics.jsonl").write_text('{"update": 0, "arena')
     assert train.main([f"resume={tmp_path}"]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert f"{tmp_path} has no checkpoint yet: it begins from its seed." in said
+    assert f"{tmp_path} has no checkpoint yet: the run begins from its seed." in said
     assert _digest(tmp_path) == _digest(whole)
     assert [row["update"] for row in _rows(tmp_path)] == list(range(9))
 

@@ -55,10 +55,10 @@ def test_version_names_swarmjax_jax_and_mujoco(
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["trian"], "'trian' is no command: did you mean train?"),
+        (["trian"], "'trian' is not a command: did you mean train?"),
         (
             ["frob"],
-            f"'frob' is no command: give one of {', '.join(COMMANDS)}.",
+            f"'frob' is not a command: give one of {', '.join(COMMANDS)}.",
         ),
         (["--completion"], "--completion is '': give one of bash, zsh, fish."),
     ],

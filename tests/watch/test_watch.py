@@ -280,14 +280,14 @@ def test_code_that_a_run_names_is_not_run(tmp_path: Path) -> None:
     run = write(tmp_path / "run", [row(0)], trained=replace(CONFIG, extensions=str(own)))
     views = Views(WatchConfig(run=str(run)))
     views.draw()
-    with pytest.raises(ConfigError, match=r"^the run has pieces of somebody's, which are code"):
+    with pytest.raises(ConfigError, match=r"^the run was trained with an extension, which is code"):
         newest.record(views.settings, views.drawn.history)
     assert not mark.exists()
 
 
 def test_a_seed_that_the_run_has_not_is_refused(tmp_path: Path) -> None:
     run = write(tmp_path / "run", [row(0)])
-    with pytest.raises(ConfigError, match=r"^seed is 4, but .* was trained with 0 to 0"):
+    with pytest.raises(ConfigError, match=r"^seed is 4, but .* was trained with seeds 0 to 0"):
         newest.record(WatchConfig(run=str(run), seed=4), None)
 
 
@@ -312,7 +312,7 @@ def test_a_port_that_is_taken_is_one_sentence(
     server: Server, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert _command(monkeypatch, f"run={str(run)!r}", f"port={server.server_port}") == 2
-    assert f"port is {server.server_port}, which cannot be had" in capsys.readouterr().err
+    assert f"port is {server.server_port}, which is not available" in capsys.readouterr().err
 
 
 def test_control_c_ends_it(run: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:

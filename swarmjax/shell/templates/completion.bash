@@ -9,7 +9,7 @@ _swarmjax_offer() {
     [[ $2 == "$1"* ]] && COMPREPLY+=("$2")
 }
 
-# Offers the next part of each key of command $1 that begins with $2, to the next dot.
+# Offers the next part, up to the next dot, of each key of command $1 that begins with $2.
 _swarmjax_keys() {
     local command key rest part
     while read -r command key rest; do
@@ -17,13 +17,13 @@ _swarmjax_keys() {
         rest=${key#"$2"}
         part=$2${rest%%.*}
         [[ $rest == *.* ]] && part+=. || part+==
-        # Keys of one section follow one another, but for the section that is a key as well.
+        # Offer each part once. A section can also be a key, so equal parts need not be adjacent.
         [[ " ${COMPREPLY[*]} " == *" $part "* ]] || COMPREPLY+=("$part")
     done <<<"$_swarmjax_table"
     compopt -o nospace 2>/dev/null
 }
 
-# Offers what key $2 of command $1 may be, as far as $3 begins with it.
+# Offers the values of key $2 of command $1 that begin with $3.
 _swarmjax_values() {
     local command key values value file
     while read -r command key values; do
@@ -56,7 +56,7 @@ _swarmjax() {
         _swarmjax_offer "$word" --help
     elif [[ $word == *=* ]]; then
         _swarmjax_values "${COMP_WORDS[1]}" "${word%%=*}" "${word#*=}"
-        # Where = parts words, which it does by default, only what follows it is replaced.
+        # By default, bash splits words at = and replaces only the text after it.
         [[ $COMP_WORDBREAKS == *=* ]] && return
         for index in "${!COMPREPLY[@]}"; do
             COMPREPLY[index]=${word%%=*}=${COMPREPLY[index]}

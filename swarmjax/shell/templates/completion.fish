@@ -4,7 +4,7 @@ set -g __swarmjax_commands '@COMMANDS@'
 
 set -g __swarmjax_table '@TABLE@'
 
-# Prints the next part of each key of command $argv[1] that begins with $argv[2], to the next dot.
+# Prints the next part, up to the next dot, of each key of command $argv[1] that begins with $argv[2].
 function __swarmjax_keys
     set -l size (string length -- "$argv[2]")
     for line in (string split \n -- $__swarmjax_table)
@@ -20,7 +20,7 @@ function __swarmjax_keys
     end
 end
 
-# Prints what key $argv[2] of command $argv[1] may be, where $argv[3] was typed of its value.
+# Prints the values of key $argv[2] of command $argv[1] that begin with $argv[3].
 function __swarmjax_values
     for line in (string split \n -- $__swarmjax_table)
         set -l words (string split ' ' -- $line)

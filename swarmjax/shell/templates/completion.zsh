@@ -5,7 +5,7 @@ _swarmjax_commands='@COMMANDS@'
 
 _swarmjax_table='@TABLE@'
 
-# Offers the next part of each key of command $1, to the next dot.
+# Offers the next part, up to the next dot, of each key of command $1.
 _swarmjax_keys() {
     local line rest
     local -a words parts keys
@@ -24,7 +24,7 @@ _swarmjax_keys() {
     compadd -S '' -a parts
 }
 
-# Offers what key $2 of command $1 may be.
+# Offers the values of key $2 of command $1.
 _swarmjax_values() {
     local line
     local -a words values
@@ -59,7 +59,7 @@ _swarmjax() {
     fi
 }
 
-# In a folder of fpath the file is the function itself; elsewhere it is read, and declares it.
+# In a folder of fpath, zsh runs this file as the function itself. When sourced, it registers it.
 if [[ $funcstack[1] == _swarmjax ]]; then
     _swarmjax "$@"
 else
