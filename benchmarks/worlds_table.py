@@ -1,0 +1,160 @@
+"""Tables of what `benchmarks.worlds_study` has printed.
+
+`python -m benchmarks.worlds_table FILE...` prints two Markdown tables. The first has an arm in each
+row, with interquartile means over seeds and families and 95 % intervals of a stratified bootstrap
+(swarmjax.evaluate.statistics):
+
+- `all arrive`: share of levels in which all robots arrive, at the end of training.
+- `to 0.9`: arena steps until a seed's mean over the families first reaches 0.9.
+- `worst 5 %`: mean of the worst twentieth of the seeds' families.
+- `contacts`: per robot.
+- `P(better)`: probability that a seed does better on a family than a seed of `random`.
+
+The second has a family in each row, with the mean over seeds of `all arrive` for every arm.
+"""
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from swarmjax import command
+from swarmjax.config import ConfigError
+from swarmjax.evaluate import statistics
+from swarmjax.evaluate.curves import steps_to
+from swarmjax.evaluate.statistics import Interval
+from swarmjax.run.settings import TrainConfig
+
+BASELINE = "random"
+THRESHOLD = 0.9
+_KEYS = ("arm", "seeds", "arena_steps", "judged", "levels", "level_seed", "steps")
+_SHARED = ("arena_steps", "levels", "level_seed", "steps")
+
+Line = dict[str, Any]
+
+
+def read(path: Path) -> list[Line]:
+    """Reads the lines of a file.
+
+    Raises:
+      ConfigError: If it cannot be read, or has a line that `benchmarks.worlds_study` did not print.
+    """
+    try:
+        lines = [json.loads(text) for text in path.read_text().splitlines() if text]
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise ConfigError(f"{path} cannot be read: {error}.") from None
+    for number, line in enumerate(lines, 1):
+        if not isinstance(line, dict) or line.get("benchmark") != "worlds_study":
+            raise ConfigError(f"{path}, line {number} is not a line of benchmarks.worlds_study.")
+        for key in _KEYS:
+            if key not in line:
+                raise ConfigError(f"{path}, line {number} has no {key}: it is damaged.")
+    return lines
+
+
+def merge(lines: Sequence[Line]) -> dict[str, Line]:
+    """Puts together the seeds of each arm, which several runs may have trained.
+
+    Args:
+      lines: As `benchmarks.worlds_study` prints them.
+
+    Returns:
+      A line for each arm, the baseline first.
+
+    Raises:
+      ConfigError: If a seed of an arm is there twice, or lines were judged differently.
+    """
+    found: dict[str, Line] = {}
+    for line in sorted(lines, key=lambda line: line["arm"] != BASELINE):
+        for key in _SHARED:
+            if line[key] != lines[0][key]:
+                raise ConfigError(
+                    f"arm {line['arm']} has {key} {line[key]}, but {lines[0]['arm']} has "
+                    f"{lines[0][key]}: compare lines of one study."
+                )
+        mine = found.get(line["arm"])
+        found[line["arm"]] = line if mine is None else _joined(mine, line)
+    return found
+
+
+def _joined(one: Line, other: Line) -> Line:
+    """Joins two lines of an arm."""
+    twice = set(one["seeds"]) & set(other["seeds"])
+    if twice:
+        raise ConfigError(f"arm {one['arm']} has seed {min(twice)} twice: leave one line out.")
+    judged = {
+        family: {name: [*values, *other["judged"][family][name]] for name, values in found.items()}
+        for family, found in one["judged"].items()
+    }
+    return one | {"seeds": [*one["seeds"], *other["seeds"]], "judged": judged}
+
+
+def curves(line: Line, measure: str) -> np.ndarray:
+    """Returns what an arm measured, [N seeds, F families, P points]."""
+    return np.stack([np.array(found[measure]) for found in line["judged"].values()], axis=1)
+
+
+def arms_table(arms: dict[str, Line]) -> str:
+    """Makes the Markdown table of the arms."""
+    rows = ["| arm | all arrive | to 0.9 | worst 5 % | contacts | P(better) |"]
+    rows.append("|---|--:|--:|--:|--:|--:|")
+    baseline = arms.get(BASELINE)
+    rows += [f"| {name} | {' | '.join(_cells(line, baseline))} |" for name, line in arms.items()]
+    return "\n".join(rows)
+
+
+def _cells(line: Line, baseline: Line | None) -> list[str]:
+    """Makes the cells of an arm."""
+    arrive = curves(line, "all_reached")
+    end, contacts = arrive[..., -1], curves(line, "contacts_per_robot")[..., -1]
+    to = steps_to(line["arena_steps"], arrive.mean(axis=1), THRESHOLD)
+    better = "-"
+    if baseline is not None and line is not baseline:
+        theirs = curves(baseline, "all_reached")[..., -1]
+        better = _words(statistics.probability_of_improvement(end, theirs))
+    return [
+        _words(statistics.bootstrap(end, statistics.iqm)),
+        _steps(float(statistics.iqm(to))),
+        _words(statistics.bootstrap(end, _worst)),
+        _words(statistics.bootstrap(contacts, statistics.iqm)),
+        better,
+    ]
+
+
+def _worst(values: np.ndarray, axis: tuple[int, ...]) -> np.ndarray:
+    return np.asarray(statistics.cvar(values, axis=axis))
+
+
+def _words(found: Interval[float]) -> str:
+    return f"{found.estimate:.2f} [{found.low:.2f}, {found.high:.2f}]"
+
+
+def _steps(steps: float) -> str:
+    return "never" if np.isinf(steps) else f"{steps:.2g}"
+
+
+def families_table(arms: dict[str, Line]) -> str:
+    """Makes the Markdown table of the families."""
+    rows = [f"| family | {' | '.join(arms)} |", f"|---|{'--:|' * len(arms)}"]
+    first = next(iter(arms.values()))
+    for i, family in enumerate(first["judged"]):
+        means = [curves(line, "all_reached")[:, i, -1].mean() for line in arms.values()]
+        cells = " | ".join(f"{mean:.2f}" for mean in means)
+        rows.append(f"| `{family.removeprefix('world_')}` | {cells} |")
+    return "\n".join(rows)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    if not arguments:
+        raise ConfigError("there is no file: give those that benchmarks.worlds_study printed.")
+    arms = merge([line for name in arguments for line in read(Path(name))])
+    sys.stdout.write(f"{arms_table(arms)}\n\n{families_table(arms)}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("worlds_table", main, TrainConfig))

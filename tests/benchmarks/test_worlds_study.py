@@ -1,0 +1,129 @@
+"""The study of curricula on worlds: its arms, its points, and its tables by hand."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sentences import refusal
+
+from benchmarks import key_value, worlds_study, worlds_table
+from benchmarks.worlds_study import Study
+
+
+@pytest.mark.parametrize("arm", worlds_study.ARMS)
+def test_arms_train_on_all_families_with_one_recipe(arm: str) -> None:
+    config = worlds_study.load_arm(Study(), arm, [])
+    assert len(config.stage) == 10
+    assert (config.algo.memory, config.algo.critic) == ("gru", "state")
+    assert config.task.neighbours.count == 4
+    assert (config.seeds, config.budget) == (10, 100_000_000)
+
+
+@pytest.mark.parametrize(
+    ("without", "memory", "count", "critic"),
+    [
+        ("memory", "none", 4, "state"),
+        ("messages", "gru", 0, "state"),
+        ("state", "gru", 4, "observation"),
+    ],
+)
+def test_a_part_can_be_left_out(without: Any, memory: str, count: int, critic: str) -> None:
+    config = worlds_study.load_arm(Study(without=without), "adaptive", [])
+    assert config.algo.memory == memory
+    assert config.task.neighbours.count == count
+    assert config.algo.critic == critic
+
+
+def test_words_win_over_the_recipe() -> None:
+    assert worlds_study.load_arm(Study(), "mixed", ["seeds=3"]).seeds == 3
+
+
+def test_only_the_arm_without_curriculum_has_the_sizes_that_are_judged() -> None:
+    hardest = worlds_study.load_arm(Study(), "hardest", []).stage[0]
+    assert (hardest.level, hardest.width, hardest.depth) == ("trap", 0.3, 0.3)
+    assert isinstance(worlds_study.load_arm(Study(), "random", []).stage[0].depth, tuple)
+
+
+def test_the_last_point_is_the_end() -> None:
+    words = ["budget=5e6", "arenas=8192"]  # 9 updates of 524,288 steps
+    config = worlds_study.load_arm(Study(), "random", words)
+    assert worlds_study.points(Study(points=3), config).tolist() == [3, 6, 9]
+    assert refusal(worlds_study.points, Study(points=10), config) == (
+        "points is 10, but the budget pays for 9 updates: give at most 9."
+    )
+
+
+def test_an_unknown_arm_is_refused() -> None:
+    assert "arms is 'best': give hardest, random" in refusal(key_value.load, Study, ["arms=best"])
+
+
+def _line(arm: str, seeds: list[int], trap: list[list[float]], fence: list[list[float]]) -> Any:
+    return {
+        "benchmark": "worlds_study",
+        "arm": arm,
+        "seeds": seeds,
+        "levels": 4,
+        "level_seed": 5,
+        "steps": 9,
+        "arena_steps": [100, 200],
+        "judged": {
+            "world_trap": {"all_reached": trap, "contacts_per_robot": [[0.5, 0.25]] * len(seeds)},
+            "world_fence": {"all_reached": fence, "contacts_per_robot": [[0.5, 0.25]] * len(seeds)},
+        },
+    }
+
+
+RANDOM = _line("random", [0, 1, 2], [[0.0, 0.0]] * 3, [[0.5, 0.8]] * 3)
+BETTER = _line("adaptive", [0, 1, 2], [[0.5, 1.0]] * 3, [[0.7, 1.0]] * 3)
+
+
+def test_arms_are_compared() -> None:
+    found = worlds_table.arms_table(worlds_table.merge([BETTER, RANDOM])).splitlines()
+    assert found[2] == (
+        "| random | 0.40 [0.40, 0.40] | never | 0.00 [0.00, 0.00] | 0.25 [0.25, 0.25] | - |"
+    )
+    # The mean over the families goes from 0.6 to 1.0, and is 0.9 at three quarters of the way.
+    assert found[3] == (
+        "| adaptive | 1.00 [1.00, 1.00] | 1.8e+02 | 1.00 [1.00, 1.00] | 0.25 [0.25, 0.25] "
+        "| 1.00 [1.00, 1.00] |"
+    )
+
+
+def test_families_are_compared() -> None:
+    found = worlds_table.families_table(worlds_table.merge([BETTER, RANDOM])).splitlines()
+    assert found == [
+        "| family | random | adaptive |",
+        "|---|--:|--:|",
+        "| `trap` | 0.00 | 1.00 |",
+        "| `fence` | 0.80 | 1.00 |",
+    ]
+
+
+def test_seeds_of_several_runs_are_put_together() -> None:
+    more = _line("random", [3], [[1.0, 1.0]], [[1.0, 1.0]])
+    found = worlds_table.merge([RANDOM, more])["random"]
+    assert found["seeds"] == [0, 1, 2, 3]
+    expected = np.array([[0.0, 0.8]] * 3 + [[1.0, 1.0]])
+    assert (worlds_table.curves(found, "all_reached")[..., -1] == expected).all()
+
+
+def test_a_seed_counts_once() -> None:
+    assert refusal(worlds_table.merge, [RANDOM, RANDOM]) == (
+        "arm random has seed 0 twice: leave one line out."
+    )
+
+
+def test_arms_are_judged_alike() -> None:
+    assert refusal(worlds_table.merge, [RANDOM, BETTER | {"steps": 10}]) == (
+        "arm adaptive has steps 10, but random has 9: compare lines of one study."
+    )
+
+
+def test_lines_of_other_benchmarks_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "lines.jsonl"
+    path.write_text(json.dumps({"benchmark": "curriculum"}))
+    assert "line 1 is not a line of benchmarks.worlds_study" in refusal(worlds_table.read, path)
+    path.write_text(json.dumps({k: v for k, v in RANDOM.items() if k != "steps"}))
+    assert "line 1 has no steps: it is damaged" in refusal(worlds_table.read, path)
