@@ -58,7 +58,18 @@ _BY_FAILURE = [
     "curriculum.shares=robots",
     "curriculum.score=failure",
 ]
-ARMS = {
+Arm = Literal[
+    "hardest",
+    "random",
+    "sequential",
+    "mixed",
+    "adaptive",
+    "prerequisites",
+    "learnability",
+    "value_loss",
+    "mutation",
+]
+ARMS: dict[Arm, list[str]] = {
     "hardest": _EVENLY,
     "random": _EVENLY,
     "sequential": ["curriculum.mode=sequential"],
@@ -92,20 +103,7 @@ Judge = Callable[[LearnerState], dict[str, dict[str, np.ndarray]]]
 class Study(Section):
     """What is compared, and how it is judged."""
 
-    arms: tuple[
-        Literal[
-            "hardest",
-            "random",
-            "sequential",
-            "mixed",
-            "adaptive",
-            "prerequisites",
-            "learnability",
-            "value_loss",
-            "mutation",
-        ],
-        ...,
-    ] = field(
+    arms: tuple[Arm, ...] = field(
         default=tuple(ARMS),
         metadata=about("hardest: no curriculum, the suite's sizes alone; random: all families"),
     )
@@ -118,7 +116,7 @@ class Study(Section):
     steps: int = field(default=3000, metadata=about("control steps of an episode", 1, 10**6))
 
 
-def load_arm(study: Study, arm: str, words: Sequence[str]) -> TrainConfig:
+def load_arm(study: Study, arm: Arm, words: Sequence[str]) -> TrainConfig:
     """Makes the config of one arm.
 
     Args:
@@ -203,7 +201,7 @@ def results(study: Study, words: Sequence[str]) -> Iterator[dict[str, Any]]:
         yield _line(study, arm, trained, at) | vars(curves)
 
 
-def _line(study: Study, arm: str, trained: TrainConfig, at: np.ndarray) -> dict[str, Any]:
+def _line(study: Study, arm: Arm, trained: TrainConfig, at: np.ndarray) -> dict[str, Any]:
     """Says what an arm was."""
     return {
         "benchmark": "worlds_study",

@@ -9,11 +9,11 @@ import pytest
 from sentences import refusal
 
 from benchmarks import key_value, worlds_study, worlds_table
-from benchmarks.worlds_study import Study
+from benchmarks.worlds_study import Arm, Study
 
 
 @pytest.mark.parametrize("arm", worlds_study.ARMS)
-def test_arms_train_on_all_families_with_one_recipe(arm: str) -> None:
+def test_arms_train_on_all_families_with_one_recipe(arm: Arm) -> None:
     config = worlds_study.load_arm(Study(), arm, [])
     assert len(config.stage) == 10
     assert (config.algo.memory, config.algo.critic) == ("gru", "state")
