@@ -1,4 +1,4 @@
-"""Refuses what a form cannot express, before anything is written."""
+"""Checks that a form can express a policy, before anything is written."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,16 +11,16 @@ from swarmjax.sim import response
 
 
 def expressible(meta: Mapping[str, Any], form: str, sensors: str) -> None:
-    """Refuses a policy that a form cannot hold, or whose inputs its controller cannot measure.
+    """Checks that a form can hold a policy and that its controller can measure all inputs.
 
     Args:
-        meta: of the policy.
+        meta: metadata of the policy.
         form: `onnx`, `c` or `webots`.
-        sensors: what answers a controller: `webots` or `real`.
+        sensors: sensors that the controller reads: `webots` or `real`.
 
     Raises:
-        PolicyError: the policy's network is code, or it observes what e-pucks do not measure.
-        ConfigError: its infrared reaches further than the sensors.
+        PolicyError: if the policy's network is code, or e-pucks cannot measure its inputs.
+        ConfigError: if the policy's infrared reaches further than the sensors.
     """
     if "network" in meta:
         raise PolicyError(
@@ -45,7 +45,7 @@ def expressible(meta: Mapping[str, Any], form: str, sensors: str) -> None:
 
 
 def _check_range(meta: Mapping[str, Any], sensors: str) -> None:
-    """Refuses infrared that reaches beyond the last point at which a sensor tells distances."""
+    """Checks that the policy's infrared reaches no further than the sensors measure distances."""
     reach, farthest = meta["sensors"]["range"], response.REACH[sensors]
     if meta["observation"]["encoding"] == "metric" and reach > farthest:
         raise ConfigError(

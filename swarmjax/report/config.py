@@ -8,7 +8,7 @@ from swarmjax.config import ConfigError, Section, about
 
 @dataclass(frozen=True, kw_only=True)
 class ReportConfig(Section):
-    """Which run is drawn or which are compared, and where to."""
+    """Settings: the run to draw or the runs to compare, and where to write the report."""
 
     command: ClassVar[str] = "report"
 

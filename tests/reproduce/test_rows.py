@@ -106,7 +106,7 @@ REFUSED = {
     "no arm": (lambda out: _change(out, "reproduce.json", seconds={}), "no finished arm"),
     "two seeds": (
         lambda out: _change(out, "reproduce.json", seeds=[0, 1]),
-        "has 2 seeds: an interval takes 3 or more",
+        "has 2 seeds: an interval needs 3 or more",
     ),
     "seeds": (lambda out: _change(out, "reproduce.json", seeds=["0"] * 3), "as seeds"),
     "budget": (lambda out: _change(out, "reproduce.json", budget=None), "as budget"),
