@@ -22,9 +22,7 @@ class ReplayConfig(Section):
     command: ClassVar[str] = "replay"
     inherited: ClassVar[Mapping[str, str]] = AS_TRAINED
 
-    policy: str = field(
-        metadata=about("path of a policy.npz; to compare two, a.npz,b.npz")
-    )
+    policy: str = field(metadata=about("path of a policy.npz; to compare two, a.npz,b.npz"))
     stage: StageConfig
     suite: str | None = field(
         default=None,

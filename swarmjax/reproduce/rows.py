@@ -150,7 +150,9 @@ def _read_facts(out: Path) -> Row:
 
 def _check_format(found: Row, path: Path) -> None:
     if found.get("format") != FORMAT:
-        raise ConfigError(f"{path} has format {found.get('format')!r}, but only format {FORMAT} is supported.")
+        raise ConfigError(
+            f"{path} has format {found.get('format')!r}, but only format {FORMAT} is supported."
+        )
 
 
 def _read_logs(run: Path, seeds: Sequence[int]) -> tuple[RunLog, ...]:
