@@ -294,7 +294,7 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
 def _custom(robot: Any, given: Orders) -> list[str]:
     """Returns the words of customData.
 
-    If controllerArgs name the target, other programs may use customData, so it is not read.
+    If controllerArgs name the target, other programs may use customData, so only `robot=` counts.
     """
     words = robot.getCustomData().split()
     return [word for word in words if given.target is None or word.startswith("robot=")]
