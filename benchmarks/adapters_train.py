@@ -97,7 +97,7 @@ def train_sb3(given: AdapterTrainConfig) -> tuple[float, int, float]:
     env.reset()
     env.step(np.zeros((env.num_envs, 2), np.float32))
     recent: list[bool] = []
-    peers.find("torch", "the extra sb3").set_num_threads(1)  # next to JAX's threads, more are slower
+    peers.find("torch", "the extra sb3").set_num_threads(1)  # more are slower next to JAX's
 
     def look(values: dict[str, Any], _: Any) -> bool:
         ended = [info for info in values["infos"] if info]

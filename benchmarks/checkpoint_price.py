@@ -43,7 +43,7 @@ class PriceConfig(Section):
     """Settings: how often a checkpoint is written, and how long training lasts."""
 
     every: float = field(default=5.0, metadata=about("seconds between checkpoints", above=0.0))
-    seconds: float = field(default=20.0, metadata=about("seconds of training per measurement", above=0.0))
+    seconds: float = field(default=20.0, metadata=about("training time of each call", above=0.0))
 
 
 class Clock(Display):

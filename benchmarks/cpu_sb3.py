@@ -38,7 +38,7 @@ class Sb3Config(Section):
 
     arenas: int = field(default=16, metadata=about("arenas", 1, 4096))
     workers: int = field(default=2, metadata=about("processes that simulate", 1, 256))
-    seconds: float = field(default=30.0, metadata=about("minimum time of all iterations", above=0.0))
+    seconds: float = field(default=30.0, metadata=about("minimum time of iterations", above=0.0))
 
     def _check(self) -> None:
         if self.arenas % self.workers:

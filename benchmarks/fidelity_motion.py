@@ -109,7 +109,7 @@ def _speeds(first: Sequence[Rig], second: Sequence[Rig]) -> list[Row]:
     radius = [rolling_radius(each) for each in first]
     limits = {PROTO: 6.28, f"{FIRMWARE}, 1100 steps/s": 6.91}
     tops = {PROTO: 0.1256, ENKI: 0.128, XPUCK: 0.13, f"{FIRMWARE}, 1100 steps/s": 0.138}
-    # The old guide's value is also the paper's. The motors that the guide describes cannot reach it.
+    # The old guide's value is also the paper's. The motors described in the guide cannot reach it.
     tops[f"{GUIDE}, of old"] = 0.25
     ways = {PROTO: 0.020, "e-puck.gctronic.com": 0.02037, ARGOS: 0.02067}
     return [
