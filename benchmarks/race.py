@@ -10,7 +10,7 @@ Brax differs in these points:
 
 - one constant learning rate for actor and critic (`learning_rate`, by default our actor's);
 - Adam's epsilon;
-- a critic whose last layer starts as large as the others, since Brax has one initialisation for all;
+- a critic whose last layer starts as large as the others (Brax has one initialisation for all);
 - minibatches of robots instead of arenas or tiles of samples;
 - no bound on normalised observations;
 - no compiler options for XLA (`loop.compiler_options`);
