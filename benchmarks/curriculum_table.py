@@ -95,13 +95,13 @@ def tables(lines: Sequence[Line]) -> dict[Key, dict[str, Line]]:
         key = Key(*(line[name] for name in Key._fields))
         arms = found.setdefault(key, {})
         if line["arm"] in arms:
-            raise ConfigError(f"arm {line['arm']} of {_title(key)} is there twice: leave one out.")
+            raise ConfigError(f"arm {line['arm']} of {_title(key)} appears twice: leave one out.")
         for name in _SHARED:
             for other in arms.values():
                 if _differs(name, line[name], other[name]):
                     raise ConfigError(
                         f"arms {other['arm']} and {line['arm']} of {_title(key)} differ in {name}: "
-                        "judge them alike."
+                        "judge them in the same way."
                     )
         arms[line["arm"]] = line
     return found
@@ -256,7 +256,7 @@ def _line(text: str, where: str) -> Line:
     except ValueError as error:
         raise ConfigError(f"{where} cannot be read: {error}.") from None
     if not isinstance(line, dict) or line.get("benchmark") != "curriculum":
-        raise ConfigError(f"{where} is none of the lines of benchmarks.curriculum.")
+        raise ConfigError(f"{where} is not a line of benchmarks.curriculum.")
     for key in ("arm", *Key._fields, *_SHARED, "judged"):
         if key not in line:
             raise ConfigError(f"{where} has no {key}: it is damaged.")
@@ -302,7 +302,7 @@ def main(arguments: Sequence[str]) -> int:
     if measure not in MEASURES:
         raise ConfigError(f"measure is '{measure}': give one of {', '.join(MEASURES)}.")
     if not files:
-        raise ConfigError("there is no file: give those that benchmarks.curriculum printed.")
+        raise ConfigError("no file is given: give files with lines of benchmarks.curriculum.")
     found = tables([line for name in files for line in read(Path(name))])
     if "out" in given:
         _draw_all(found, measure, Path(given["out"]))

@@ -177,8 +177,8 @@ def write(lines: Sequence[Line], docs: Path) -> None:
     page = docs / PAGE
     if not found or _MESSAGE not in sums or not page.exists():
         raise ConfigError(
-            f"lines need some of devices_speed and all_reduce's of {_MESSAGE} bytes, and docs a "
-            f"{PAGE}: give other lines or docs."
+            f"lines must have results of devices_speed and of all_reduce with {_MESSAGE} bytes, "
+            f"and docs must have {PAGE}: give other lines or docs."
         )
     text = pages.insert(page.read_text(), PAGE, "measured", measured_table(found))
     text = pages.insert(text, PAGE, "model", model_table(found, sums[_MESSAGE]))

@@ -56,7 +56,7 @@ def results(words: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Runs both engines; yields one line per cell."""
     settings = load_levels(EvaluateConfig, words)
     if settings.policy is None:
-        raise ConfigError("compare cannot be given: the engines are compared, by policy=FILE.")
+        raise ConfigError("compare cannot be given: only the engines are compared: policy=FILE.")
     found = [evaluate(replace(settings, engine=engine)) for engine in ("c", "mjx")]
     c, mjx = found
     cells = zip(c.result["cells"], mjx.result["cells"], c.trials, mjx.trials, strict=True)

@@ -108,7 +108,7 @@ def read(out: Path) -> list[dict[str, Any]]:
         try:
             found.append(dict(json.loads(line)))
         except (ValueError, TypeError):
-            raise ConfigError(f"{out} in line {number} is no line of a campaign.") from None
+            raise ConfigError(f"{out} in line {number} is not a line of a campaign.") from None
     return found
 
 

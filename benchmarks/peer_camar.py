@@ -2,8 +2,8 @@
 
 `python -m benchmarks.peer_camar [arenas=4096,65536] ...` needs the extra `camar` and prints a JSON
 line for each number of arenas. It times calls of `steps` control steps with random actions, each
-call one compiled scan. Resets are CAMAR's own optimistic ones: for every `reset_ratio` arenas and
-step one fresh map is drawn, and all of these arenas that end in this step share it.
+call one compiled scan. Resets are CAMAR's own optimistic ones: each step draws one fresh map per
+`reset_ratio` arenas, and the arenas that end in this step share these maps.
 """
 
 import sys

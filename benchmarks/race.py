@@ -354,7 +354,7 @@ def _check(race: RaceConfig, trained: TrainConfig) -> None:
         updates = _brax_updates(trained, PLAYGROUND)
     if updates < race.points:
         raise ConfigError(
-            f"points is {race.points}, but the budget is {updates} updates: give at most as many."
+            f"points is {race.points}, but the budget is {updates} updates: give at most {updates}."
         )
 
 

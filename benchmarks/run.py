@@ -86,8 +86,8 @@ def left(entry: SuiteEntry, lines: Sequence[Line]) -> list[str | None]:
       lines: lines of `out`.
 
     Returns:
-      The values that are missing, or that failed or were skipped when last tried. For an entry
-      without values this is [None] or nothing.
+      The values that are missing, or that failed or were skipped when last tried. An entry without
+      values counts as one value, None.
     """
     values = entry.values or (None,)
     return [value for value in values if not _is_done(entry, value, lines)]
@@ -162,7 +162,7 @@ def read(path: Path) -> list[Line]:
         try:
             found.append(json.loads(line))
         except ValueError:
-            raise ConfigError(f"{path} in line {number} is no JSON: take it out.") from None
+            raise ConfigError(f"{path} in line {number} is not JSON: remove it.") from None
     return found
 
 

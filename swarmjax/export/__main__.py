@@ -69,10 +69,10 @@ def _targets(settings: ExportConfig, trained: TrainConfig) -> dict[int, Path]:
 
 
 def _target(settings: ExportConfig, folder: Path) -> Path:
-    """Returns the path of a single policy, without a look at files that already exist."""
+    """Returns the path of a single policy, whether or not it already exists."""
     out = Path(settings.out) if settings.out else folder / _default(settings)
     if out.name in ("", ".."):
-        raise ConfigError(f"out is {out}, which others use too: give a name of its own.")
+        raise ConfigError(f"out is {out}, which has no name of its own: give another name.")
     ending = Path(_NAMES[settings.format]).suffix
     if out.suffix != ending and ending:
         raise ConfigError(f"out is {out}, but format is {settings.format}: end it in {ending}.")
@@ -98,8 +98,8 @@ def _check_controller(out: Path) -> None:
         )
     if out.name in _IMPORTED:
         raise ConfigError(
-            f"out is {out}, whose name is also the controller's, and that of a module that it "
-            "imports: give another, as in swarmjax_epuck."
+            f"out is {out}, whose name is also the controller's, but it imports a module of that "
+            "name: give another, as in swarmjax_epuck."
         )
 
 

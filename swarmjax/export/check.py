@@ -25,21 +25,21 @@ def expressible(meta: Mapping[str, Any], form: str, sensors: str) -> None:
     if "network" in meta:
         raise PolicyError(
             f"format is {form}, but the policy's network is {show(meta['network'])}, code of an "
-            "extension that no other form holds: give format=npz, or train with algo.network=mlp."
+            "extension that only npz supports: give format=npz, or train with algo.network=mlp."
         )
     if form != "webots":
         return
     if "neighbours" in meta["observation"]:
         raise PolicyError(
-            "format is webots, but the policy hears neighbours, and the controller has no board "
-            "for range and bearing: give format=c or onnx, and a controller of your own."
+            "format is webots, but the policy uses neighbour messages, and the controller has no "
+            "board for range and bearing: give format=c or onnx, and your own controller."
         )
     known = webots_controller.QUANTITIES
     unknown = [name for name in meta["observation"]["names"] if name not in known]
     if unknown:
         raise PolicyError(
             f"format is webots, but the policy observes {', '.join(unknown)}, which the controller "
-            "cannot measure: give format=c or onnx, and a controller of your own."
+            "cannot measure: give format=c or onnx, and your own controller."
         )
     _check_range(meta, sensors)
 
@@ -50,6 +50,6 @@ def _check_range(meta: Mapping[str, Any], sensors: str) -> None:
     if meta["observation"]["encoding"] == "metric" and reach > farthest:
         raise ConfigError(
             f"format is webots, but the policy was trained with infrared to {reach:g} m, and "
-            f"sensors={sensors} tell distances to {farthest:g} m: train with "
+            f"sensors={sensors} measure distances only to {farthest:g} m: train with "
             f"task.sensor_range={epuck.SENSOR_RANGE:g}, or give format=c or onnx."
         )

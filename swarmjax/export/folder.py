@@ -86,7 +86,7 @@ def check_folder(path: Path) -> None:
         raise _unwritable(path, error) from None
     if strange:
         raise ConfigError(
-            f"out is {path}, where {strange} is not as an export left it: give another folder, "
+            f"out is {path}, where {strange} is not as an export wrote it: give another folder, "
             "or move it away."
         )
 

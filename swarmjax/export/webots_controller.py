@@ -210,7 +210,7 @@ def find_devices(robot: Any, period: int) -> Devices:
         if device is None:
             raise ValueError(
                 f"the robot has no device {name!r}: an E-puck with a GPS and a Compass in its "
-                "turretSlot has all that this needs."
+                "turretSlot has all of them."
             )
     for name in (*INFRARED, "gps", "compass"):
         found[name].enable(period)
@@ -241,7 +241,7 @@ def control_period(trained: Policy, basic_step: float) -> int:
     period = 1000 * trained.meta["task"]["control_step"]
     if abs(round(period) - period) > 1e-6 * period:
         raise ValueError(
-            f"the control step of the policy is {period:g} ms: Webots has whole milliseconds only."
+            f"the control step of the policy is {period:g} ms: Webots needs whole milliseconds."
         )
     steps = round(period / basic_step)
     if steps < 1 or abs(steps * basic_step - period) > 1e-6 * period:

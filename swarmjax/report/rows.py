@@ -146,8 +146,8 @@ def measure(history: History) -> str:
 def trained_lately(history: History) -> np.ndarray:
     """Tells where [N, T, S] a stage's newest verdict is about the current networks.
 
-    It is for two cohorts (see `curriculum`) after the stage last had a share of the arenas, since
-    a verdict may still arrive in that time. After that the verdict is an old one.
+    A verdict counts as current for two cohorts (see `curriculum`) after the stage last had a share
+    of the arenas, since a new verdict may still arrive in that time.
     """
     lag = verdict_updates(history)
     updates = history.updates[None, :, None]
@@ -234,7 +234,7 @@ def _checked(raw: Row, stages: int, where: str, *, levels: bool) -> Row:
     for key in (*_NUMBERS, *keys):
         if key not in raw:
             raise ConfigError(
-                f"{where} has no {key}: the run is of a version that did not write it."
+                f"{where} has no {key}: the run is from a version that did not write it."
             )
     check(raw, _NUMBERS, WHOLE, where)
     check(raw, ("train_s", *CURVES), NUMBER_OR_NULL, where)
@@ -278,7 +278,7 @@ def per_stage(found: object, stages: int, what: str) -> np.ndarray:
     """
     fits = isinstance(found, list) and len(found) == stages and all(map(NUMBER_OR_NULL.fits, found))
     if not fits:
-        raise ConfigError(f"{what} that is no list of {stages} numbers, one a stage.")
+        raise ConfigError(f"{what}, which is not a list of {stages} numbers, one per stage.")
     return np.array(found, np.float32)
 
 
@@ -295,7 +295,7 @@ def read_config(run: Path) -> TrainConfig:
     try:
         return from_stored(stored)
     except ConfigError as error:
-        raise ConfigError(f"{path} does not fit: {error}") from None
+        raise ConfigError(f"{path} is not valid: {error}") from None
 
 
 def read_object(path: Path) -> Row:
@@ -353,5 +353,5 @@ def _object(line: bytes, where: str) -> Row:
     except (ConfigError, UnicodeDecodeError):
         found = None
     if not isinstance(found, dict):
-        raise ConfigError(f"{where} is damaged: go on with the run, or take it out.")
+        raise ConfigError(f"{where} is damaged: resume the run, or remove the line.")
     return found

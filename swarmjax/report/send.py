@@ -23,8 +23,8 @@ def of_run(run: Path, history: History) -> list[Logger]:
     found += [WandbRuns(history.config, run)] if asked.wandb else []
     if not found:
         raise ConfigError(
-            "send is true, but the run logs to nothing that takes figures: its run.tensorboard is "
-            "false and its run.wandb is null."
+            "send is true, but the run has no logger for figures: its run.tensorboard is false and "
+            "its run.wandb is null."
         )
     return found
 

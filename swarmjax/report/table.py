@@ -100,7 +100,7 @@ def find(text: str) -> list[Path]:
         named = sorted(glob(part)) if set(part) & set("*?[") else [part]
         within = [run for path in named for run in _within(Path(path), part)]
         if not part or not within:
-            raise ConfigError(f"runs is {show(text)}, and {show(part)} is and holds no run.")
+            raise ConfigError(f"runs is {show(text)}, but {show(part)} neither is nor holds a run.")
         found += within
     twice = [str(run) for run in found if found.count(run) > 1]
     if twice:

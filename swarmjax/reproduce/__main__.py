@@ -89,10 +89,10 @@ def _read(out: Path) -> dict:
     path = out / FACTS
     section.check_text("resume", str(out))
     if not path.exists():
-        raise ConfigError(f"resume is {out}, which is no reproduction: it has no {FACTS}.")
+        raise ConfigError(f"resume is {out}, which is not a reproduction: it has no {FACTS}.")
     settings = report_rows.read_object(path).get("settings")
     if not isinstance(settings, dict):
-        raise ConfigError(f"{path} has no keys and values as settings: it is damaged.")
+        raise ConfigError(f"{path} has no settings: it is damaged.")
     return settings
 
 

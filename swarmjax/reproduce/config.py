@@ -112,7 +112,7 @@ class ReproduceConfig(Section):
                 raise ConfigError(f"arms names {arm} more than once: give each once.")
             first = arm.removesuffix("_expanded")
             if first not in self.arms:
-                raise ConfigError(f"arms names {arm}, but not {first}, which it goes on with.")
+                raise ConfigError(f"arms names {arm}, but not {first}, which it continues.")
 
 
 def load_reproduce(

@@ -74,7 +74,7 @@ def above_zero(values: np.ndarray) -> tuple[bool | None, str]:
 
 
 def crowded(values: np.ndarray) -> tuple[bool | None, str]:
-    """Tests whether the last robot to arrive senses no more than the first: no crowding then.
+    """Tests for crowding; contradicted if the last robot to arrive senses no more than the first.
 
     If it senses more, crowding is possible but not proven, so the reading stays open.
     """

@@ -1,7 +1,7 @@
 """Draws the figures of a reproduction with Matplotlib: the paper's figures and additional ones.
 
 A figure shows those of its arms that have finished. Colours are from Okabe & Ito 2008, "Color
-universal design". Arms also differ in their dashes.
+universal design". Arms also have different dashes.
 """
 
 from collections.abc import Callable

@@ -167,7 +167,7 @@ def judged(data: Reproduction, arm: str, *, key: str, stage: str) -> np.ndarray:
 def crowding(data: Reproduction, arm: str, *, stage: str) -> np.ndarray:
     """Counts how many more steps the last robot to arrive sensed something than the first one.
 
-    The first robot finds nobody at the targets. The last one finds all others that arrived.
+    The first robot finds no other robot at the targets. The last one finds all that arrived before.
 
     Args:
       data: the reproduction's data.

@@ -118,7 +118,7 @@ def read(out: Path) -> Reproduction:
     seeds = tuple(sorted(facts["seeds"]))
     finished = [arm for arm in ARMS if arm in facts["seconds"]]
     if not finished:
-        raise ConfigError(f"{out / FACTS} names no finished arm: go on with the reproduction.")
+        raise ConfigError(f"{out / FACTS} names no finished arm: continue the reproduction.")
     return Reproduction(
         facts=facts,
         seeds=seeds,
@@ -131,7 +131,7 @@ def _read_facts(out: Path) -> Row:
     """Reads `reproduce.json`, the facts of the reproduction."""
     path = out / FACTS
     if not path.exists():
-        raise ConfigError(f"{out} is no reproduction: it has no {FACTS}.")
+        raise ConfigError(f"{out} is not a reproduction: it has no {FACTS}.")
     facts = report_rows.read_object(path)
     _check_format(facts, path)
     report_rows.check(facts, ("budget", "fine_tune"), report_rows.WHOLE, str(path))
@@ -163,7 +163,7 @@ def _read_logs(run: Path, seeds: Sequence[int]) -> tuple[RunLog, ...]:
     for where, row in report_rows.read_lines(run, EPISODES):
         _check_episode(row, where)
         if row["seed"] not in by_seed:
-            raise ConfigError(f"{where} has seed {row['seed']}, which is none of {FACTS}.")
+            raise ConfigError(f"{where} has seed {row['seed']}, which is not in {FACTS}.")
         rows = by_seed[row["seed"]]
         if rows and row["update"] < rows[-1]["update"]:
             raise ConfigError(f"{where} goes back to update {row['update']}: it is damaged.")
@@ -182,7 +182,7 @@ def _check_episode(row: Row, where: str) -> None:
         found: Any = row.get(key)
         fits = isinstance(found, list) and len(found) == row["robots"] > 0
         if not fits or not all(map(kind.fits, found)):
-            raise ConfigError(f"{where} has {key} that is no list of {row['robots']} values.")
+            raise ConfigError(f"{where} has {key}, which is not a list of {row['robots']} values.")
 
 
 def _log(rows: list[Row]) -> RunLog:

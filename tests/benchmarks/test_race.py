@@ -53,11 +53,11 @@ def test_brax_is_given_playgrounds_numbers(tiny_config: TrainConfig) -> None:
                 "algo.rollout_length=8",
                 "budget=8192",
             ],
-            "points is 30, but the budget is 12 updates: give at most as many.",
+            "points is 30, but the budget is 12 updates: give at most 12.",
         ),
         (
             ["arenas=40", "budget=12800"],
-            "points is 30, but the budget is 10 updates: give at most as many.",
+            "points is 30, but the budget is 10 updates: give at most 10.",
         ),
         (
             ["stage=s1"],
