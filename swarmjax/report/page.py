@@ -18,19 +18,19 @@ STYLES = (builder.STYLE, "report/report.css")
 _TOP = 5  # stages named per reweighing
 
 _CAPTIONS = {
-    "mix": "On which stages the arenas were.",
-    "success": "Success of each stage: the share of a whole cohort, all episodes that began within "
-    "one step limit. Above each panel the last one; the thick line is drawn where every seed has "
-    "one.",
-    "curves": "How learning went, at each update. Return and contacts are sums over an episode and "
-    "means over the robots of the episodes that ended in the update; short episodes end first, so "
-    "the first ones say little. Entropy is that of the policy's actions, in nats.",
-    "levels": "What the curriculum over levels did: how many levels of each stage are kept, how "
-    "many episodes began on one of them, and how those went.",
-    "practised": "The levels of each stage with the highest scores, as the newest checkpoint of "
-    "the first seed has them: success over the episodes that are remembered, and the score. Robots "
-    "are discs, their targets circles of the same colour.",
-    "grid": "Success of each cell at last, in percent; grey: not a stage of this run.",
+    "mix": "Share of the arenas on each stage.",
+    "success": "Success of each stage, over a whole cohort: all episodes that began within one "
+    "step limit. The number above each panel is the last one. The thick line is drawn where every "
+    "seed has a value.",
+    "curves": "Learning curves over updates. Return and contacts are sums over an episode, and "
+    "means over the robots of the episodes that ended in the update. Short episodes end first, so "
+    "the first values mean little. Entropy is that of the policy's actions, in nats.",
+    "levels": "The curriculum over levels: how many levels of each stage are kept, how many "
+    "episodes began on one of them, and the success and score of these levels.",
+    "practised": "The levels of each stage with the highest scores, from the newest checkpoint of "
+    "the first seed: success over the remembered episodes, and the score. Robots are discs, their "
+    "targets circles of the same colour.",
+    "grid": "Last success of each cell, in percent. Grey cells are not stages of this run.",
 }
 
 

@@ -246,9 +246,9 @@ _CONTACTS = (_by_mean("contacts_per_robot", LAST), _by_sampling(measures.contact
 _CROWDING = ("last to arrive minus first", partial(measures.crowding, stage=LAST))
 _MORE_SHARE = partial(higher, unit=SHARE)
 _STEADY_IS = (
-    f"Steady is the first episode from which on {measures.WINDOW} episodes, and all to the end of "
-    f"the run, have at least {measures.STEADY:g} of successes, and no later {measures.WINDOW} less "
-    f"than {measures.KEPT:g}."
+    f"Steady is the first episode from which {measures.WINDOW} episodes, and all to the end of the "
+    f"run, have at least {measures.STEADY:g} of successes, and no later {measures.WINDOW} episodes "
+    f"have less than {measures.KEPT:g}."
 )
 _DIFFERENCE = "The interval of the paired difference excludes 0, on the claim's side."
 
@@ -337,8 +337,8 @@ CLAIMS = (
         where="section 4, on Figure 8",
         criterion="Control steps with something within infrared range, of the last robot to arrive "
         f"minus the first one, over the last {measures.WINDOW} episodes on {LAST}, curriculum. "
-        "Contradicted if the interval does not exceed 0. More of them is what crowding would bring "
-        "about, but the data do not say what a ray met, so the claim cannot be reproduced by them.",
+        "Contradicted if the interval does not exceed 0. Crowding would cause more of them, but "
+        "the data do not show what a ray met, so they cannot reproduce the claim.",
         figures="figure 8",
         readings=_readings(("curriculum",), crowded, _CROWDING),
     ),
