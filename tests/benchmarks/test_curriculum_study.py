@@ -328,7 +328,7 @@ def test_the_command_reads_files_and_draws(
     other = refusal(curriculum_table.main, [str(path)])
     assert other == f"{path} in line 1 is not a line of benchmarks.curriculum."
     assert "cannot be read" in refusal(curriculum_table.main, [str(tmp_path / "none.jsonl")])
-    assert "there is no file" in refusal(curriculum_table.main, [])
+    assert "no file is given" in refusal(curriculum_table.main, [])
     assert "measure is 'time'" in refusal(curriculum_table.main, [str(path), "measure=time"])
 
 

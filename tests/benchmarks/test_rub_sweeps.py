@@ -140,7 +140,7 @@ def test_sweeps_of_a_warp_are_those_of_its_slowest_arena() -> None:
 @pytest.mark.parametrize(
     ("word", "said"),
     [
-        ("designs=magic", "designs has 'magic': give of plain"),
+        ("designs=magic", "designs has 'magic': give some of plain"),
         ("arenas=104", "arenas is 104: give a multiple of 32"),
         ("robot.hull_friction=0", "discs with friction"),
         ("sim.solver=mjx", "discs with friction"),

@@ -138,7 +138,7 @@ def test_export_refuses(
         (given, "format=c", f"out={tmp_path / 'file' / 'c'}"): "which cannot be written: Not a d",
         (given, f"out={tmp_path / 'file' / 'a.npz'}"): "which cannot be written: ",
         (given, "format=c", "out=."): "out is ., which has no name of its own: give another name.",
-        (given, "format=webots", "out=a/.."): "out is a/.., which has no name of its own: give a ",
+        (given, "format=webots", "out=a/.."): "out is a/.., which has no name of its own: give ",
         **{
             (given, "format=webots", f"out={tmp_path / name}"): (
                 f"{name}, whose name is also the controller's, but it imports a module of that name"

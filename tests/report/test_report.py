@@ -128,6 +128,6 @@ def test_figures_and_pages_are_sent_to_the_loggers_of_the_run(tmp_path: Path) ->
 def test_figures_of_a_run_without_loggers_are_not_sent(tmp_path: Path) -> None:
     trained = replace(CONFIG, run=RunConfig(tensorboard=False))
     run = write(tmp_path / "run", [row(0)], trained=trained)
-    with pytest.raises(ConfigError, match=r"^send is true, but the run logs to nothing"):
+    with pytest.raises(ConfigError, match=r"^send is true, but the run has no logger for figures"):
         report.main([f"run={run}", "send=true"])
     assert not (run / "report").exists()
