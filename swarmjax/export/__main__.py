@@ -45,7 +45,7 @@ def main(arguments: Sequence[str]) -> int:
     targets = _targets(settings, trained)
     leaves, update, skipped = checkpoint.restore(run, settings.step)
     for sentence in skipped:
-        sys.stderr.write(f"swarmjax.export: {sentence}: it was passed over.\n")
+        sys.stderr.write(f"swarmjax.export: {sentence}: it was skipped.\n")
     for seed, out in targets.items():
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / POLICY

@@ -210,10 +210,10 @@ def _memory(trained: Policy) -> dict[str, str]:
     if not size:
         names = ("type", "parameter", "code", "begin", "reset", "argument", "word")
         return dict.fromkeys((f"memory_{name}" for name in names), "") | {
-            "kept": "Nothing is kept in RAM between calls.",
+            "kept": "It keeps nothing in RAM between calls.",
             "memory_start": "",
         }
-    what, code = "What a robot remembers.", _MEMORY_CODE
+    what, code = "The memory of a robot.", _MEMORY_CODE
     if trained.history > 1:
         what = f"The {trained.history - 1} observations before the last one, newest first."
         code = _HISTORY_CODE
@@ -225,8 +225,8 @@ def _memory(trained: Policy) -> dict[str, str]:
         "memory_reset": _MEMORY_RESET,
         "memory_argument": "&memory[i % POLICY_LEARNERS], ",
         "memory_word": "&memory, ",
-        "kept": f"A robot keeps {4 * size} bytes between calls, a\n`PolicyMemory`.",
-        "memory_start": "Where an episode begins:\n\n    PolicyMemory memory;\n\n"
+        "kept": f"A robot keeps {4 * size} bytes between calls, in a\n`PolicyMemory`.",
+        "memory_start": "At the start of an episode:\n\n    PolicyMemory memory;\n\n"
         "    policy_begin(&memory);\n\n",
     }
 

@@ -80,11 +80,11 @@ def _about(trained: Policy, answers: Literal["webots", "real"], name: str) -> di
     robot, task = meta["robot"], meta["task"]
     learners = len(trained.mean)
     each = (
-        f"   - of the {learners} policies each robot takes its own: add `robot=0` to "
+        f"   - one of the {learners} policies for each robot: add `robot=0` to "
         f"`robot={learners - 1}`.\n"
     )
     stops = f"A robot stops at {task['target_radius']:g} m from its target."
-    stays = "A robot drives on at its target: the policy is trained to stay there by itself."
+    stays = "A robot keeps driving at its target: the policy is trained to stay there by itself."
     who = {
         "webots": "the sensors that Webots simulates",
         "real": "the sensors of real e-pucks, zeroed to read 0 in free space",

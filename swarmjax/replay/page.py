@@ -96,10 +96,10 @@ def _facts(settings: ReplayConfig, policies: Sequence[Policy], words: str) -> li
         ("time", f"control steps of {settings.task.control_step:g} s, {_most_steps(settings)}"),
         ("reward", f"by the weights that the policy was trained with{earned}"),
         (
-            "exactness",
-            f"positions to {length / 2:g} mm and headings to {angle / 2:g} rad of the simulated "
-            f"ones, rays to {500 * pack.RAY:g} mm, each reward term's sum to "
-            f"{pack.REWARD / 2:g}",
+            "precision",
+            f"errors of at most {length / 2:g} mm for positions, {angle / 2:g} rad for headings, "
+            f"{500 * pack.RAY:g} mm for rays and {pack.REWARD / 2:g} for the sum of each reward "
+            "term",
         ),
         ("versions", ", ".join(f"{name} {found}" for name, found in _versions().items())),
         ("made by", words),
@@ -110,7 +110,7 @@ def _most_steps(settings: ReplayConfig) -> str:
     """Writes how long an episode may be; cells of a suite may have their own step limit."""
     limit = f"{settings.evaluation.step_limit} at most"
     is_given = settings.suite is None or settings.steps is not None
-    return limit if is_given else f"{limit} unless the cell has a step limit of its own"
+    return limit if is_given else f"{limit}, unless the cell has its own step limit"
 
 
 def _choice(settings: ReplayConfig) -> str:
@@ -120,8 +120,8 @@ def _choice(settings: ReplayConfig) -> str:
         return origin
     count = f"the first {settings.episodes:,}" if settings.suite is None else "all"
     return (
-        f"the {settings.worst} that {settings.policies[0]} did worst in among {count} {origin}, "
-        "the worst first: fewest targets reached, then most contacts, then longest"
+        f"the {settings.worst} worst levels of {settings.policies[0]} among {count} {origin}, "
+        "worst first: fewest targets reached, then most contacts, then longest"
     )
 
 

@@ -26,7 +26,7 @@ _POINTS, _STRETCHES = 600, 200  # per curve and per band: about one per pixel
 _NAMED = 24  # stages named along a colour strip; more names would overlap
 SMALL = (5.4, 3.2)  # inches
 _SEED, _ALL, _LIMIT = "0.62", "#0b4f9e", "#c04000"
-_STEPS = "arena control steps of a seed"
+_STEPS = "arena control steps per seed"
 _CURVES = {
     "return": "return per robot",
     "contacts_per_robot": "contacts per robot",

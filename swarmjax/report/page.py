@@ -109,7 +109,7 @@ def facts(history: History) -> list[tuple[str, str]]:
         ("seeds", seeds),
         (
             "trained",
-            f"{spent}, {history.arena_steps[-1]:,} arena control steps of a seed, "
+            f"{spent}, {history.arena_steps[-1]:,} arena control steps per seed, "
             f"{words.count(trained.arenas, 'arena')}{time}",
         ),
         ("last stage", _last_stage(history)),
@@ -171,7 +171,7 @@ def _counted(decisions: Sequence[Row]) -> str:
 def _origin(summary: Row) -> str:
     """Names the device and the commit that computed a run."""
     if not summary:
-        return "not written down before the end of the run"
+        return "not recorded before the end of the run"
     return f"{summary.get('device')}, commit {summary.get('commit') or 'unknown'}"
 
 
