@@ -8,8 +8,8 @@ left the line, it continues along the line.
 A point automaton knows its position. Here a robot integrates its own commands to a heading. The
 heading, distance and bearing of the target give its position.
 
-The line is infinite, not only the part between start and target. A robot that leaves an outline
-beyond the target may thus also be closer to the target.
+The line is infinite, not only the part between start and target. A robot may thus also leave an
+outline beyond the target, where that is closer to it.
 
 The paper's obstacles stand still, but robots are obstacles that move. Three rules are added:
 

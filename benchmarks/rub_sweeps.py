@@ -34,7 +34,7 @@ from swarmjax.sim.fast.discs import TOLERANCE, DiscRobots, Discs
 
 STAGES = "s6", "fence", "world_fence", "world_door", "crowd", "world_crowd"
 DEFAULTS = ("robot.hull_friction=1", "arenas=512")
-STEPS, EVERY = 480, 24  # control steps per arena; every 24th is kept
+STEPS, EVERY = 480, 24  # control steps per arena, and between two kept states
 CONVERGED, EXACT = 2000, 1e-13  # maximum of sweeps in float64, which end when forces change by less
 NOISE = 0.5  # standard deviation of the actions of robots that head for their targets
 WARP = 32  # threads of a GPU that wait for each other

@@ -13,7 +13,7 @@ import numpy as np
 
 from swarmjax.config import ConfigError
 
-CELL = 0.01  # m; in a passage of 0.09 m on s6 a centre has 0.016 m, which 0.02 m could miss
+CELL = 0.01  # m; a 0.09 m passage on s6 leaves a centre 0.016 m, which 0.02 m cells could miss
 COARSE_CELL, LARGE = 0.02, 2.0  # m; COARSE_CELL is for arenas with a side above LARGE
 MARGIN, DEARER = 0.015, 3.0  # steps within MARGIN (m) of the hull's limit cost DEARER times as much
 REACH = 24  # maximum distance of a way-point, in cells along the path

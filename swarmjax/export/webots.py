@@ -53,7 +53,7 @@ def sensors(answers: Literal["webots", "real"]) -> dict[str, Any]:
         `answers`, and the points of Webots' table as `distance` (m) and `counts`, to be
         interpolated linearly. For real sensors also `fit`: a count n above free space, at most
         `span` [K], means a distance of sqrt(`strength` / n) - `depth` + `to_hull` [K] m, clipped to
-        0 to `reach`.
+        the range from 0 to `reach`.
     """
     counts = np.array([row[1] for row in epuck.INFRARED_TABLE])
     found: dict[str, Any] = {

@@ -188,7 +188,7 @@ def record(
     arenas = engine_c.start(judge, levels)
     mount = electronics.mount(arenas.factors)
     frames = [_look(judge, arenas, np.zeros_like(arenas.pose[..., :2]))]
-    over = np.zeros(len(levels), bool)  # with `hold` robots may leave again; it still stays over
+    over = np.zeros(len(levels), bool)  # with `hold` robots may leave again; over stays over
     driver = engine_c.by_policy(judge)
     memory = driver.init(arenas)
     while len(frames) <= judge.config.step_limit and not over.all():

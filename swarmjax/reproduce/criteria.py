@@ -1,4 +1,4 @@
-"""Tests whether a claim holds: compares the interval of a value or paired difference to a limit."""
+"""Tests whether a claim holds: is the interval of a value or a difference beyond a limit?"""
 
 import numpy as np
 

@@ -93,9 +93,9 @@ def steady(success: np.ndarray, window: int = WINDOW, share: float = STEADY) -> 
     `share` successes. So do all episodes from there to the end of the run, taken together. No later
     window has less than `KEPT`.
 
-    Every later window is not required to have `share`, because that would measure the length of the
-    run. A policy that succeeds in nine of ten episodes has fewer than 16 successes in one window of
-    23, so some window near the end of any run would fail.
+    Later windows need not have `share`, because such a rule would measure the length of the run. A
+    policy that succeeds in nine of ten episodes has fewer than 16 successes in one window of 23, so
+    some window near the end of any run would fail.
 
     Args:
       success: [E] whether an episode succeeded.
