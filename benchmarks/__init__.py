@@ -1,1 +1,1 @@
-"""Benchmarks: one question a file, one JSON line a result."""
+"""Benchmarks: each file answers one question and prints one JSON line per result."""

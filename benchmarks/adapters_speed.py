@@ -1,11 +1,11 @@
-"""How fast is each adapter, beside the bare environment?
+"""How fast is each adapter, compared with the bare environment?
 
 `python -m benchmarks.adapters_speed [who=bare,gymnasium,...] [stage=s1] [arenas=256] [steps=200]`
-prints a JSON line for each of them: `steps` control steps a call, five calls after one that is not
-counted, all robots driving straight on. Compiling is `compile_s`, the first call less the median of
-the others. `pettingzoo` steps one arena, from the host; `jaxmarl` and `playground` map one over
-`arenas`; those of the device loop by `scan`, and all others step by step. One whose library is
-missing is left out, with the reason.
+prints a JSON line for each adapter. It times five calls of `steps` control steps each, after one
+warm-up call, with all robots driving straight ahead. `compile_s` is the first call minus the median
+of the others. `pettingzoo` steps one arena, from the host. `jaxmarl` and `playground` map one arena
+over `arenas`. Adapters on the device loop with `scan`; all others loop step by step on the host. An
+adapter whose library is missing is left out, and the reason is printed.
 """
 
 import statistics
@@ -29,7 +29,7 @@ Call = Callable[[], Any]
 
 @dataclass(frozen=True, kw_only=True)
 class AdapterSpeedConfig(Section):
-    """What is measured, and how long."""
+    """Settings: what to measure, and for how long."""
 
     who: tuple[str, ...] = field(
         default=(
@@ -46,11 +46,11 @@ class AdapterSpeedConfig(Section):
     )
     stage: str = field(default="s1", metadata=about("stage"))
     arenas: int = field(default=256, metadata=about("arenas", 1, 2**20))
-    steps: int = field(default=200, metadata=about("control steps of a call", 1, 10**6))
+    steps: int = field(default=200, metadata=about("control steps per call", 1, 10**6))
 
 
 def _scan(reset: Callable[[Any], Any], step: Callable[[Any], Any], key: Any, steps: int) -> Call:
-    """Loops on the device; goes on where the last call ended."""
+    """Loops on the device; each call continues where the last one ended."""
     held = [jax.jit(reset)(key)]
     many = jax.jit(lambda state: jax.lax.scan(lambda s, _: (step(s), None), state, length=steps)[0])
 
@@ -100,7 +100,7 @@ def sb3(given: AdapterSpeedConfig) -> Call:
 
 
 def pettingzoo(given: AdapterSpeedConfig) -> Call:
-    """One arena, reset where nobody is left."""
+    """Steps one arena, and resets it when no robot is left."""
     adapter = peers.find("swarmjax.adapters.pettingzoo", "the extra pettingzoo")
     env = adapter.SwarmParallelEnv(swarmjax.make_env(given.stage, arenas=1))
     action = _straight(1)[0]
@@ -126,7 +126,7 @@ def jaxmarl(given: AdapterSpeedConfig) -> Call:
 
 
 def brax(given: AdapterSpeedConfig) -> Call:
-    """Brax's environment of all robots."""
+    """Steps Brax's environment with all robots."""
     adapter = peers.find("swarmjax.adapters.brax_env", "the extra brax")
     env = adapter.SwarmBraxEnv(swarmjax.make_env(given.stage, arenas=given.arenas))
     keys, told = jax.random.split(jax.random.key(0), env.num_envs), _straight(env.num_envs)
@@ -134,7 +134,7 @@ def brax(given: AdapterSpeedConfig) -> Call:
 
 
 def playground(given: AdapterSpeedConfig) -> Call:
-    """One arena, mapped, without Playground's wrappers."""
+    """Steps one arena, mapped over `arenas`, without Playground's wrappers."""
     adapter = peers.find("swarmjax.adapters.playground", "the extra playground")
     env = adapter.SwarmMjxEnv(swarmjax.make_env(given.stage, arenas=1))
     keys = jax.random.split(jax.random.PRNGKey(0), given.arenas)
@@ -155,7 +155,7 @@ def torch(given: AdapterSpeedConfig) -> Call:
     def call() -> None:
         for _ in range(given.steps):
             held[:] = [env.step(action)]
-        held[0].reward.sum().item()  # waits
+        held[0].reward.sum().item()  # waits for the device
 
     return call
 

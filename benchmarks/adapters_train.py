@@ -1,10 +1,10 @@
 """Do other libraries train the swarm through their adapters?
 
 `python -m benchmarks.adapters_train who=brax|sb3|torch [seed=0] [arenas=64] [budget=3000000]`
-trains `s1` by Brax's PPO, by that of Stable-Baselines3, or by examples/torch_ppo.py, until 0.9 of
-the targets are reached, and prints a JSON line. Seconds are those of training without what
-compiles. Brax's evaluator judges the policy's mean on an episode of each robot; the others count
-the last 200 robots of training, whose policies explore. It needs the extra of that name.
+trains `s1` with the PPO of Brax, of Stable-Baselines3 or of examples/torch_ppo.py until 0.9 of the
+targets are reached, and prints a JSON line. Its seconds are training time without compiling. Brax's
+evaluator judges the policy's mean action on one episode of each robot. The other two count the last
+200 robots of training, whose policies explore. It needs the extra with the library's name.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ TARGET, RECENT = 0.9, 200
 
 @dataclass(frozen=True, kw_only=True)
 class AdapterTrainConfig(Section):
-    """Who trains, and on how much."""
+    """Settings: which library trains, and how much."""
 
     who: Literal["brax", "sb3", "torch"] = field(default="brax", metadata=about("trains"))
     seed: int = field(default=0, metadata=about("random seed", 0, 2**31 - 1))
@@ -36,12 +36,12 @@ class AdapterTrainConfig(Section):
     budget: int = field(default=3_000_000, metadata=about("robot steps, at most", 1, 10**12))
 
 
-class _Reached(Exception):  # noqa: N818  # no error: training is over
-    """The target was reached."""
+class _Reached(Exception):  # noqa: N818  # not an error: training is over
+    """The share of targets was reached."""
 
 
 def train_brax(given: AdapterTrainConfig) -> tuple[float, int, float]:
-    """Trains by Brax's PPO.
+    """Trains with Brax's PPO.
 
     Returns:
         The share of targets reached, robot steps, and seconds.
@@ -82,14 +82,14 @@ def train_brax(given: AdapterTrainConfig) -> tuple[float, int, float]:
             seed=given.seed,
         )
     share, steps, _ = curve[-1]
-    # The first calls compile: they are taken to be as long as the median of the others.
+    # The first calls compile, so they are counted with the median time of the others.
     calls = np.diff([seconds for *_, seconds in curve])
     calls[:2] = np.median(calls[2:]) if len(calls) > 2 else calls.min()
     return share, steps, float(calls.sum())
 
 
 def train_sb3(given: AdapterTrainConfig) -> tuple[float, int, float]:
-    """Trains by Stable-Baselines3's PPO; returns as `train_brax`."""
+    """Trains with Stable-Baselines3's PPO; returns the same as `train_brax`."""
     library = peers.find("stable_baselines3", "the extra sb3")
     callbacks = peers.find("stable_baselines3.common.callbacks", "the extra sb3")
     adapter = peers.find("swarmjax.adapters.sb3", "the extra sb3")
@@ -97,7 +97,7 @@ def train_sb3(given: AdapterTrainConfig) -> tuple[float, int, float]:
     env.reset()
     env.step(np.zeros((env.num_envs, 2), np.float32))
     recent: list[bool] = []
-    peers.find("torch", "the extra sb3").set_num_threads(1)  # beside JAX's, more are slower
+    peers.find("torch", "the extra sb3").set_num_threads(1)  # more are slower next to JAX's
 
     def look(values: dict[str, Any], _: Any) -> bool:
         ended = [info for info in values["infos"] if info]
@@ -122,7 +122,7 @@ def train_sb3(given: AdapterTrainConfig) -> tuple[float, int, float]:
 
 
 def train_torch(given: AdapterTrainConfig) -> tuple[float, int, float]:
-    """Trains by examples/torch_ppo.py; returns as `train_brax`."""
+    """Trains with examples/torch_ppo.py; returns the same as `train_brax`."""
     peers.find("torch", "the extra torch")
     path = Path(__file__).parents[1] / "examples" / "torch_ppo.py"
     spec = importlib.util.spec_from_file_location("torch_ppo", path)

@@ -1,8 +1,8 @@
 """How long does a sum over devices take?
 
-`python -m benchmarks.all_reduce devices=N [sizes=1,1024,16384,1048576]` sums arrays of float32 over
-the first N devices, many sums one after the other in a program, and prints a JSON line for each
-size: microseconds of a sum, the median of `REPEATS` calls.
+`python -m benchmarks.all_reduce devices=N [sizes=1,1024,16384,1048576]` sums float32 arrays over
+the first N devices. One program runs many sums in sequence. It prints a JSON line for each size:
+microseconds per sum, the median of `REPEATS` calls.
 """
 
 import json
@@ -24,7 +24,7 @@ from swarmjax.config import Section, about
 from swarmjax.shards import AXIS
 from swarmjax.training import mesh
 
-SUMS = 200  # of a call
+SUMS = 200  # per call
 REPEATS = 7
 
 
@@ -34,7 +34,7 @@ class AllReduceConfig(Section):
 
     devices: int = field(default=2, metadata=about("that sum", 2, 2**16))
     sizes: tuple[int, ...] = field(
-        default=(1, 1024, 16_384, 1_048_576), metadata=about("numbers of an array", 1, 2**30)
+        default=(1, 1024, 16_384, 1_048_576), metadata=about("numbers per array", 1, 2**30)
     )
 
 
@@ -42,11 +42,11 @@ def seconds(devices: int, size: int) -> float:
     """Times a sum.
 
     Args:
-      devices: that sum.
-      size: numbers of the array.
+      devices: number of devices.
+      size: numbers in the array.
 
     Returns:
-      Seconds of one sum.
+      Seconds per sum.
     """
 
     def sums(x: Array) -> Array:
@@ -71,7 +71,7 @@ def seconds(devices: int, size: int) -> float:
 
 
 def lines(given: AllReduceConfig) -> Iterator[dict[str, Any]]:
-    """Times all sizes; yields a line each."""
+    """Times all sizes; yields one line per size."""
     for size in given.sizes:
         yield {
             "benchmark": "all_reduce",

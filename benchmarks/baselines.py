@@ -1,12 +1,12 @@
-"""What others reach on the same levels in the same engine: controllers that never learned.
+"""What do controllers without learning reach on the same levels in the same engine?
 
 `python -m benchmarks.baselines suite=NAME [who=straight,bug2,orca] [evaluate keys]`, or
-`stage=NAME`, judges each in MuJoCo C and prints a JSON line for each cell:
+`stage=NAME`, judges each controller in MuJoCo C and prints a JSON line for each cell:
 
-- `straight` drives straight at its target and ignores the infrared; `still` never moves;
-- `bug2` follows outlines, from a robot's ten observations and a memory (`benchmarks.bug2`);
-- `orca`, `hrvo`, `hl`, `social_force` know all positions and the map (`benchmarks.planners`), and
-  need the extra `navground`.
+- `straight` drives straight to its target and ignores the infrared. `still` never moves.
+- `bug2` follows outlines, from a robot's ten observations and a memory (`benchmarks.bug2`).
+- `orca`, `hrvo`, `hl` and `social_force` know all positions and the map (`benchmarks.planners`).
+  They need the extra `navground`.
 """
 
 import math
@@ -36,21 +36,21 @@ from swarmjax.task import observation
 from swarmjax.task.level import Level
 from swarmjax.task.stage_files import load_levels
 
-# Action (speed, turn rate; -1..1) at bearing 0, and what each radian to the left or right adds:
-# full speed and twice the bearing as a turn, slower the further the target is off the nose.
+# Action (speed, turn rate; -1..1) at bearing 0, and what each radian to the left or right adds. The
+# turn is twice the bearing. The speed is full at bearing 0 and falls with the bearing.
 POLICIES = {
     "straight": ((1.0, 0.0), (-2.0, 2.0), (-2.0, -2.0)),
     "still": ((-1.0, 0.0), (0.0, 0.0), (0.0, 0.0)),
 }
 NAMES = (*POLICIES, "bug2", *planners.SETTINGS)
-BATCH = 32  # arenas of a process at once; of 40 robots on 4 by 4 m they fill 0.2 GB with ways
+BATCH = 32  # arenas at once per process; with 40 robots on 4 x 4 m their paths fill 0.2 GB
 _FIXED = (
     "policy",
     "compare",
     "engine",
     "action",
     "out",
-)  # keys of `evaluate` that say nothing here
+)  # keys of `evaluate` without meaning here
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +68,7 @@ class BaselinesConfig(Section):
 
 
 class _Batch(NamedTuple):
-    """Levels that one process runs by one baseline."""
+    """Levels that one process runs with one baseline."""
 
     config: EvaluateConfig
     policy: Policy
@@ -81,9 +81,9 @@ def write(path: Path, ahead: Sequence[float], *sides: Sequence[float]) -> None:
     """Writes a policy that is piecewise linear in the bearing.
 
     Args:
-      path: of the `policy.npz`.
+      path: path of the `policy.npz`.
       ahead: [2] action at bearing 0.
-      sides: [2] each: what a radian to the left, and to the right, adds.
+      sides: [2] each: change of the action per radian to the left, and to the right.
     """
     split = np.zeros((1, observation.SIZE, 2), np.float32)
     split[0, observation.NAMES.index("target_bearing")] = [1.0, -1.0]
@@ -93,7 +93,7 @@ def write(path: Path, ahead: Sequence[float], *sides: Sequence[float]) -> None:
         "actor/hidden_0/bias": none[:, :2],
         "actor/mean/kernel": np.array([sides], np.float32),
         "actor/mean/bias": np.array([ahead], np.float32),
-        "actor/log_std": none[:, :2] - 200.0,  # a deviation of 0 in float32
+        "actor/log_std": none[:, :2] - 200.0,  # exp(-200) is 0 in float32
         "normalizer/mean": none,
         "normalizer/std": none + 1.0,
     }
@@ -130,14 +130,14 @@ def results(who: Sequence[str], arguments: Sequence[str]) -> Iterator[dict[str, 
     """Judges baselines.
 
     Args:
-      who: of `NAMES`.
+      who: some of `NAMES`.
       arguments: keys of `evaluate`.
 
     Yields:
-      A line for each of them and each cell.
+      A line for each baseline and each cell.
 
     Raises:
-      ConfigError: if a key is unsound, or a package is missing.
+      ConfigError: if a key is invalid, or a package is missing.
     """
     for word in arguments:
         if word.partition("=")[0] in _FIXED:
@@ -159,9 +159,9 @@ def results(who: Sequence[str], arguments: Sequence[str]) -> Iterator[dict[str, 
 
 
 def _read(who: Sequence[str], arguments: Sequence[str]) -> tuple[EvaluateConfig, dict[str, Policy]]:
-    """Reads the settings, and the policy by which each baseline is judged.
+    """Reads the settings, and the policy with which each baseline is judged.
 
-    The policy of those that have none says no more than the range of commands.
+    For a baseline that is no policy, the file only sets the range of commands.
     """
     found = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -185,7 +185,7 @@ def _split(
 
 
 def _simulate(job: _Batch) -> tuple[Outcome, float]:
-    """Runs a batch; returns what it came to, and the processor's seconds."""
+    """Runs a batch; returns its outcome and the processor time in seconds."""
     began = time.process_time()
     judge = evaluate_judge.load(job.config, job.policy, job.half)
     outcome = engine_c.simulate(judge, cells.split(job.levels), controller(job.who, judge))
@@ -193,7 +193,7 @@ def _simulate(job: _Batch) -> tuple[Outcome, float]:
 
 
 def controller(who: str, judge: Judge) -> Controller | None:
-    """Makes the controller of a baseline; None where the judge's policy is all of it."""
+    """Makes the controller of a baseline; None for a baseline that is only a policy."""
     if who in POLICIES:
         return None
     return bug2.load(judge) if who == "bug2" else planners.load(who, judge)
@@ -202,7 +202,7 @@ def controller(who: str, judge: Judge) -> Controller | None:
 def _line(
     settings: EvaluateConfig, suite: str | None, who: str, cell: Cell, outcome: Outcome
 ) -> dict[str, Any]:
-    """Puts what a baseline came to on a cell into plain data for JSON."""
+    """Writes a baseline's results on a cell as plain data for JSON."""
     step, mine = settings.task.control_step, trials.specialise(settings, cell, settings.policy)
     found = measures.per_level(outcome, step, mine.step_limit)
     packages = ("navground", "scipy") if who in planners.SETTINGS else ()

@@ -1,10 +1,12 @@
-"""How far does a robot turn that is blocked by a wall while its wheels slip?
+"""How far does a robot turn while a wall blocks it and its wheels slip?
 
-`python -m benchmarks.blocked` presses one robot against a wall for `SECONDS`, wheel speeds held,
-and prints a JSON line for each start and body: how far it turned and slid. Beside MuJoCo C with
-either body it integrates the same by hand: a rigid disc on two wheels of Coulomb friction, against
-a frictionless wall. There both wheels push forward with all their grip, whatever their speeds, so
-that nothing is left to turn with; a servo that turns freely while it is blocked is wrong.
+`python -m benchmarks.blocked` presses one robot against a wall for `SECONDS` at constant wheel
+speeds, and prints a JSON line for each start and body: how far it turned and slid.
+
+It runs MuJoCo C with both bodies, and a reference integrated by hand: a rigid disc on two wheels
+with Coulomb friction, against a frictionless wall. In the reference both wheels push forward with
+all their grip at any speed, so no grip is left to turn the robot. A body that turns freely while
+blocked is therefore wrong.
 """
 
 import json
@@ -21,7 +23,7 @@ from swarmjax.sim.config import RobotConfig
 
 SECONDS = 2.0
 GAP = 0.001  # m; between hull and wall at the start
-# Wheel speeds left and right (rad/s) and heading from the wall's normal (rad).
+# Left and right wheel speed (rad/s), and heading relative to the wall's normal (rad).
 STARTS = (
     (6.28, 0.7, -0.49),
     (6.28, 0.7, 0.49),
@@ -29,7 +31,7 @@ STARTS = (
     (6.28, 3.0, 0.2),
     (6.28, 0.7, 0.0),
 )
-# Bodies and physics steps (s): training's, the judge's, and finer ones.
+# Bodies and physics steps (s): those of training, of the judge, and finer ones.
 TIMESTEPS: tuple[tuple[Literal["planar", "wheeled"], float], ...] = (
     ("planar", 0.032),
     ("wheeled", 0.016),
@@ -37,13 +39,13 @@ TIMESTEPS: tuple[tuple[Literal["planar", "wheeled"], float], ...] = (
     ("wheeled", 0.002),
     ("wheeled", 0.0005),
 )
-_STEP = 2e-5  # s, of the reference; 1e-5 changes its angles by less than 0.01 rad
-_SHARP = 1e-3  # m/s; slip below which the reference's friction is proportional to it
-_WALL = 4e3, 64.0  # N/m, N s/m: it gives way by 0.4 mm under the robot's push
+_STEP = 2e-5  # s; step of the reference; 1e-5 changes its angles by less than 0.01 rad
+_SHARP = 1e-3  # m/s; for slower slip the reference's friction is proportional to the slip
+_WALL = 4e3, 64.0  # N/m, N s/m: the wall yields by 0.4 mm under the robot's push
 
 
 class _Rigid(NamedTuple):
-    """A disc in the plane: x, y (m), yaw (rad), their rates, traction [2, 2] of the wheels (N)."""
+    """A planar disc: x, y (m), yaw (rad), their rates, traction [2, 2] of the wheels (N)."""
 
     pose: np.ndarray
     rate: np.ndarray
@@ -51,12 +53,12 @@ class _Rigid(NamedTuple):
 
 
 def reference(wheels: Sequence[float], yaw: float, step: float = _STEP) -> np.ndarray:
-    """Integrates a rigid robot on Coulomb wheels against the east wall.
+    """Integrates a rigid robot with Coulomb wheels against the east wall.
 
     Args:
       wheels: left and right speed, rad/s.
       yaw: heading at the start, rad.
-      step: s.
+      step: time step, s.
 
     Returns:
       x (m), y (m), yaw (rad) after `SECONDS`.
@@ -70,7 +72,7 @@ def reference(wheels: Sequence[float], yaw: float, step: float = _STEP) -> np.nd
 
 
 def _advance(state: _Rigid, rim: np.ndarray, step: float) -> _Rigid:
-    """Moves the disc on by one semi-implicit Euler step."""
+    """Advances the disc by one semi-implicit Euler step."""
     yaw, rate = state.pose[2], state.rate
     ahead = np.array([np.cos(yaw), np.sin(yaw)])
     left = np.array([-ahead[1], ahead[0]])
@@ -89,7 +91,7 @@ def _advance(state: _Rigid, rim: np.ndarray, step: float) -> _Rigid:
 
 
 def _loads(traction: np.ndarray, ahead: np.ndarray, left: np.ndarray) -> np.ndarray:
-    """Weight on either wheel [2], N: traction at the floor loads a skid, and one wheel more."""
+    """Computes the weight on each wheel [2], N; traction shifts load to a skid and to one wheel."""
     total, height = traction.sum(axis=0), epuck.COM_HEIGHT
     weight = epuck.MASS * epuck.GRAVITY
     skid = min(abs(total @ ahead) * height / epuck.SKID_X, weight)
@@ -98,7 +100,7 @@ def _loads(traction: np.ndarray, ahead: np.ndarray, left: np.ndarray) -> np.ndar
 
 
 def simulate(mine: rig.Rig, wheels: Sequence[float], yaw: float) -> np.ndarray:
-    """The same in MuJoCo C.
+    """Simulates the same robot in MuJoCo C.
 
     Args:
       mine: the robot.
@@ -114,7 +116,7 @@ def simulate(mine: rig.Rig, wheels: Sequence[float], yaw: float) -> np.ndarray:
 
 
 def results() -> Iterator[dict[str, Any]]:
-    """Runs all starts; yields a line each."""
+    """Runs all starts; yields a line for each start and body."""
     rigs = {
         f"{body}, {1e3 * step:g} ms": rig.load(RobotConfig(body=body), step)
         for body, step in TIMESTEPS

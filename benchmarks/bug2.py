@@ -1,26 +1,29 @@
-"""Bug2 (Lumelsky & Stepanov 1987) from a robot's own ten observations and its own commands.
+"""Implements Bug2 (Lumelsky & Stepanov 1987) from a robot's ten observations and its commands.
 
 "Path-planning strategies for a point mobile automaton moving amidst unknown obstacles of arbitrary
-shape", Algorithmica 2, section 4: drive along the line from the start to the target; on an
-obstacle follow its outline on one side until the line is met nearer to the target than where it
-was left, and go on along it. A point automaton knows where it is; here a robot integrates its own
-commands to a heading, and has its place from that and from distance and bearing of the target.
+shape", Algorithmica 2, section 4: drive along the line from the start to the target. At an obstacle
+follow its outline on one side. When the robot meets the line closer to the target than where it
+left the line, it continues along the line.
 
-The line is the whole one through start and target, not the part between them alone: an outline
-that is left beyond the target is left nearer to it as well.
+A point automaton knows its position. Here a robot integrates its own commands to a heading. The
+heading, distance and bearing of the target give its position.
 
-Robots are obstacles whose outlines move. The paper's obstacles stand still; three rules are added:
+The line is infinite, not only the part between start and target. A robot may thus also leave an
+outline beyond the target, where that is closer to it.
 
-1. All turn right where they meet something, so that it is on their left: two that meet head on
-   pass each other. A robot that stands, arrived or not, is followed round like any outline.
-2. An outline that is not sensed for `LOST` metres was a robot's that has gone: the line starts anew
-   from here. One that has been followed all the way round without meeting the line nearer was not
-   that which barred it: the line starts anew, and the next outline is followed on the other side.
-3. A robot that has come nowhere for `STUCK` seconds, in front of another one or between two, does
-   as after a full round. That ends most deadlocks, not all.
+The paper's obstacles stand still, but robots are obstacles that move. Three rules are added:
 
-A contact turns a robot in a way that its commands do not tell; its line is then off by as much
-until it starts anew.
+1. All robots turn right when they meet something, so that it is on their left. Two robots that meet
+   head on thus pass each other. A standing robot is followed like any outline.
+2. If an outline is not sensed for `LOST` metres, it belonged to a robot that has gone, and a new
+   line starts here. If a robot has gone all the way round an outline without meeting the line
+   closer to the target, the outline was not the one that blocked it. A new line starts, and the
+   next outline is followed on the other side.
+3. If a robot makes no progress for `STUCK` seconds, in front of another robot or between two, it
+   does the same as after a full round. This ends most deadlocks, but not all.
+
+A contact turns a robot without its commands showing it. Its line is then off by this angle until a
+new line starts.
 """
 
 import math
@@ -36,20 +39,20 @@ from swarmjax.sim import drive as sim_drive
 from swarmjax.sim.drive import Drive
 from swarmjax.task import observation
 
-# Columns of an observation whose wall is on the left, and on the right: near the nose, diagonal,
-# beside, behind on that side; then the first three of the other side.
+# Columns of an observation with the wall on the left, and on the right. First come the rays on that
+# side: near the nose, diagonal, beside, behind. Then come the first three on the other side.
 _LEFT, _RIGHT = (7, 6, 5, 4, 0, 1, 2), (0, 1, 2, 3, 7, 6, 5)
 _TARGET = tuple(observation.NAMES.index(name) for name in ("target_distance", "target_bearing"))
 
 
 class Senses(NamedTuple):
-    """What a robot observes, [...] each, lengths of rays in m.
+    """A robot's observation, [...] each, with ray lengths in m.
 
     Attributes:
-      nose, diagonal, beside, behind: rays on the side of the wall, from ahead to behind.
-      other_nose, other_diagonal, other_beside: rays of the other side.
-      distance: to the target, m.
-      bearing: of the target, rad; left is positive.
+      nose, diagonal, beside, behind: rays on the side of the wall, from front to back.
+      other_nose, other_diagonal, other_beside: rays on the other side.
+      distance: distance to the target, m.
+      bearing: bearing of the target, rad; left is positive.
     """
 
     nose: np.ndarray
@@ -64,21 +67,21 @@ class Senses(NamedTuple):
 
 
 class BugMemory(NamedTuple):
-    """What a robot remembers, [...] each.
+    """A robot's memory, [...] each.
 
     Attributes:
-      heading: from the direction in which the line leads, rad.
-      following: whether it follows an outline.
+      heading: angle from the direction of the line, rad.
+      following: whether the robot follows an outline.
       side: 1.0 with the outline on the left, -1.0 on the right.
-      hit: distance to the target where the line was left, m.
-      beyond: place beside the line a control step ago, m; left is positive.
-      gap: to what was beside it a control step ago, m.
-      lost: way since the outline was last sensed, m.
-      way: since the line was left, m.
-      mark: [..., 3] a pose on the outline (m, m, rad), to know by that it has been round.
-      marked: way at which that was.
-      anchor: [..., 2] place near which it has been of late, m.
-      waited: for how long, s.
+      hit: distance to the target where the robot left the line, m.
+      beyond: offset from the line one control step ago, m; left is positive.
+      gap: distance to the outline beside the robot one control step ago, m.
+      lost: distance driven since the outline was last sensed, m.
+      way: distance driven since the robot left the line, m.
+      mark: [..., 3] a pose on the outline (m, m, rad) that shows when the robot has gone round it.
+      marked: value of `way` at the mark.
+      anchor: [..., 2] position near which the robot has recently been, m.
+      waited: how long it has been there, s.
     """
 
     heading: np.ndarray
@@ -96,14 +99,14 @@ class BugMemory(NamedTuple):
 
 
 class BugBody(NamedTuple):
-    """What a robot knows of itself.
+    """A robot's knowledge of itself.
 
     Attributes:
-      drive: its drive.
-      hull_radius: m.
+      drive: the robot's drive.
+      hull_radius: radius of the hull, m.
       target_radius: distance that counts as arrival, m.
-      sensor_range: of its rays, m.
-      control_step: s.
+      sensor_range: range of the rays, m.
+      control_step: time per control step, s.
     """
 
     drive: Drive
@@ -113,21 +116,22 @@ class BugBody(NamedTuple):
     control_step: float
 
 
-# Lengths in m, chosen on benchmarks/maps, fence2, and levels of s6 and crowd_dense with seed 7.
+# Lengths in m. They were chosen on benchmarks/maps, fence2, and levels of s6 and crowd_dense with
+# seed 7.
 GAP = 0.012  # between hull and outline
-AHEAD = 0.025  # ray near the nose that bars the way; a wall is then 0.017 m before the hull
-ASIDE = 0.0167  # diagonal ray whose end the hull would meet: 0.025 + 0.717 * 0.0167 = 0.037
-NEARER = 0.03  # than where the line was left, for going on along it
-ROUND = 0.03  # from the mark, and within a right angle of its heading, is there again
-LOST = 0.33  # a full circle of the arc that seeks the outline, 2 pi (0.037 + 0.012) = 0.31
-STILL, STUCK = 0.02, 3.0  # m, s: has come nowhere
+AHEAD = 0.025  # a shorter ray near the nose blocks the way; a wall is then 0.017 m before the hull
+ASIDE = 0.0167  # the hull would hit the end of this diagonal ray: 0.025 + 0.717 * 0.0167 = 0.037
+NEARER = 0.03  # the robot takes up the line this much closer to the target than where it left
+ROUND = 0.03  # back at the mark: within this distance and within a right angle of its heading
+LOST = 0.33  # a full circle of the arc that seeks the outline: 2 pi (0.037 + 0.012) = 0.31
+STILL, STUCK = 0.02, 3.0  # m, s: no progress
 SPEED, CORNER_SPEED = 0.11, 0.08  # m/s, along an outline and round its corners
 TURN = 2.5  # rad/s, on the spot
-BY_ANGLE, BY_GAP = 4.0, 60.0  # rad/s for each rad, and for each m
+BY_ANGLE, BY_GAP = 4.0, 60.0  # rad/s per rad, and per m
 
 
 def start(seen: np.ndarray) -> BugMemory:
-    """Lets robots begin: the line leads from here to the target.
+    """Starts a line from the robots' positions to their targets.
 
     Args:
       seen: [..., O] observations.
@@ -155,7 +159,7 @@ def start(seen: np.ndarray) -> BugMemory:
 
 
 def sense(seen: np.ndarray, side: np.ndarray) -> Senses:
-    """Names what is observed, seen from the side of the outline.
+    """Names the observations as seen from the side of the outline.
 
     Args:
       seen: [..., O] observations, metric.
@@ -171,7 +175,7 @@ def sense(seen: np.ndarray, side: np.ndarray) -> Senses:
 
 
 def locate(heading: np.ndarray, senses: Senses) -> np.ndarray:
-    """Returns places [..., 2], m: along the line, where the target is 0, and to its left."""
+    """Returns positions [..., 2], m: along the line, with the target at 0, and left of the line."""
     toward = heading + senses.bearing
     return -senses.distance[..., None] * np.stack([np.cos(toward), np.sin(toward)], axis=-1)
 
@@ -180,9 +184,9 @@ def act(memory: BugMemory, seen: np.ndarray, body: BugBody) -> tuple[BugMemory, 
     """Takes one control step.
 
     Args:
-      memory: [...] of the robots.
-      seen: [..., O] what they observe, metric.
-      body: what they know of themselves.
+      memory: [...] memory of the robots.
+      seen: [..., O] their observations, metric.
+      body: their knowledge of themselves.
 
     Returns:
       The memory, and actions [..., 2] in -1..1.
@@ -199,7 +203,7 @@ def act(memory: BugMemory, seen: np.ndarray, body: BugBody) -> tuple[BugMemory, 
 
 
 def _begin_anew(memory: BugMemory, senses: Senses, body: BugBody) -> BugMemory:
-    """Rules 2 and 3: where the outline makes no sense, the line starts here."""
+    """Applies rules 2 and 3: starts a new line where the outline is of no use."""
     place = locate(memory.heading, senses)
     near = np.linalg.norm(place - memory.mark[..., :2], axis=-1) < ROUND
     back = near & (np.cos(memory.heading - memory.mark[..., 2]) > 0.0)
@@ -219,7 +223,7 @@ def _begin_anew(memory: BugMemory, senses: Senses, body: BugBody) -> BugMemory:
 
 
 def _choose(memory: BugMemory, senses: Senses, place: np.ndarray) -> BugMemory:
-    """Leaves the line where something bars it, and the outline where it meets the line again."""
+    """Leaves the line where something blocks it, and the outline where it meets the line again."""
     ahead = np.minimum(senses.nose, senses.other_nose) < AHEAD
     aside = np.minimum(senses.diagonal, senses.other_diagonal) < ASIDE
     hits = ~memory.following & (ahead | aside) & (np.abs(senses.bearing) < math.pi / 4)
@@ -227,8 +231,8 @@ def _choose(memory: BugMemory, senses: Senses, place: np.ndarray) -> BugMemory:
     meets = beside * memory.beyond <= 0.0
     leaves = memory.following & meets & (senses.distance < memory.hit - NEARER)
     way = np.where(hits, 0.0, memory.way)
-    # The mark moves on each time that the way has doubled (Brent 1980): whatever the robot comes
-    # to go round, be it not what it met on the line, it then knows.
+    # The mark moves on whenever the distance driven has doubled (Brent 1980). The robot thus also
+    # notices a full round of an outline other than the one that it first met.
     marks = hits | (way > 2.0 * np.maximum(memory.marked, LOST))
     pose = np.concatenate([place, memory.heading[..., None]], axis=-1)
     return memory._replace(
@@ -244,7 +248,7 @@ def _choose(memory: BugMemory, senses: Senses, place: np.ndarray) -> BugMemory:
 
 
 def _head_for_target(senses: Senses, body: BugBody) -> np.ndarray:
-    """Twists [..., 2] straight to the target, as the baseline that does nothing else."""
+    """Computes twists [..., 2] straight to the target, as the baseline `straight` does."""
     off = np.abs(senses.bearing)
     speed = body.drive.max_speed * np.clip(1.0 - off, 0.0, 1.0)
     limit = body.drive.max_turn_rate
@@ -252,12 +256,12 @@ def _head_for_target(senses: Senses, body: BugBody) -> np.ndarray:
 
 
 def _follow(memory: BugMemory, senses: Senses, gap: np.ndarray, body: BugBody) -> np.ndarray:
-    """Twists [..., 2] along the outline: m/s, and rad/s with left positive."""
+    """Computes twists [..., 2] along the outline: m/s, and rad/s with left positive."""
     near = 0.99 * body.sensor_range
     other = senses.other_beside - (senses.beside - gap)
     wanted = np.minimum(GAP, 0.5 * (gap + other))
     turn = BY_ANGLE * _angle(memory, senses, gap, body) + BY_GAP * (gap - wanted)
-    # Only the diagonal ray: where it would end along a wall at the wanted gap.
+    # The diagonal ray alone: compares it with its length along a wall at the desired gap.
     _, y, yaw = epuck.SENSOR_POSES[6]
     expected = (body.hull_radius + GAP - y) / math.sin(yaw)
     turn = np.where(senses.beside < near, turn, BY_GAP * (senses.diagonal - expected))
@@ -277,9 +281,9 @@ def _follow(memory: BugMemory, senses: Senses, gap: np.ndarray, body: BugBody) -
 
 
 def _angle(memory: BugMemory, senses: Senses, gap: np.ndarray, body: BugBody) -> np.ndarray:
-    """Direction of the outline from the nose, rad; away from the robot is positive.
+    """Estimates the outline's direction from the nose, rad; away from the robot is positive.
 
-    From the ends of two rays where both are sensed, else from how fast the gap grows.
+    Uses the ends of two rays if both sense something, else the growth of the gap.
     """
     x, y, yaw = epuck.SENSOR_POSES[6]
     ahead = x + senses.diagonal * math.cos(yaw)
@@ -292,7 +296,7 @@ def _angle(memory: BugMemory, senses: Senses, gap: np.ndarray, body: BugBody) ->
 def _remember(
     memory: BugMemory, senses: Senses, gap: np.ndarray, twist: np.ndarray, body: BugBody
 ) -> BugMemory:
-    """Integrates what the wheels make of the twist, over this control step."""
+    """Integrates the motion of the wheels over this control step."""
     drive, step = body.drive, body.control_step
     wheels = sim_drive.wheel_speeds(twist, drive, np)
     moved = sim_drive.body_velocity(wheels, drive.wheel_radius, drive.track, np) * step
@@ -313,7 +317,7 @@ def _remember(
 
 
 def _action(twist: np.ndarray, drive: Drive) -> np.ndarray:
-    """Actions [..., 2] in -1..1 that command twists [..., 2]."""
+    """Converts twists [..., 2] to actions [..., 2] in -1..1."""
     speed = 2.0 * twist[..., 0] / drive.max_speed - 1.0
     return np.stack([speed, twist[..., 1] / drive.max_turn_rate], axis=-1)
 
@@ -325,16 +329,16 @@ class Bug2:
     body: BugBody
 
     def init(self, arenas: Arenas) -> BugMemory:
-        """Returns the memory [A, R] of robots that start."""
+        """Returns the memory [A, R] of robots at their start."""
         return start(arenas.observation)
 
     def act(self, memory: BugMemory, arenas: Arenas) -> tuple[BugMemory, np.ndarray]:
-        """Takes one control step; of the arenas it reads the observations alone."""
+        """Takes one control step; reads only the observations of the arenas."""
         return act(memory, arenas.observation, self.body)
 
 
 def load(judge: Judge) -> Bug2:
-    """Makes the controller of a judge's robots, which know their own numbers."""
+    """Makes the controller for a judge's robots, from their body's numbers."""
     task, robot = judge.config.task, judge.config.robot
     body = BugBody(
         drive=judge.drive,

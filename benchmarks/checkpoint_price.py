@@ -1,11 +1,11 @@
 """What do checkpoints cost training?
 
 `python -m benchmarks.checkpoint_price [every=S] [seconds=S] [key=value ...]` compiles the program
-of a config once and trains with it in turn: with a checkpoint every `every` seconds, and without.
-The other words are those of `swarmjax.train`. It prints a JSON line: arena control steps a second
-of both, and the share of the speed that checkpoints take, the median over `PAIRS` pairs with a 95 %
-interval by order statistics. `price_at_60_s` is that share if one is written every minute: each
-checkpoint costs the same.
+of a config once. It then trains alternately with a checkpoint every `every` seconds, and without.
+The other words are those of `swarmjax.train`. It prints a JSON line with the arena control steps
+per second of both, and the share of the speed that checkpoints take: the median over `PAIRS` pairs
+with a 95 % interval by order statistics. `price_at_60_s` is this share for one checkpoint a minute,
+since each checkpoint costs the same time.
 """
 
 import json
@@ -34,23 +34,23 @@ from swarmjax.sim import dispatch
 from swarmjax.training.loop import TrainState
 
 PAIRS = 6
-WARM_UP_S = 20.0  # of training before the clock starts: calls grow, and robots learn to arrive
+WARM_UP_S = 20.0  # training before the clock starts: calls grow longer, and robots learn to arrive
 _NEVER = 1e6  # minutes
 
 
 @dataclass(frozen=True, kw_only=True)
 class PriceConfig(Section):
-    """How often a checkpoint is written, and how long is trained."""
+    """Settings: how often a checkpoint is written, and how long training lasts."""
 
     every: float = field(default=5.0, metadata=about("seconds between checkpoints", above=0.0))
-    seconds: float = field(default=20.0, metadata=about("of training, each time", above=0.0))
+    seconds: float = field(default=20.0, metadata=about("training time of each call", above=0.0))
 
 
 class Clock(Display):
-    """Notes when the calls of a run end, and shows nothing.
+    """Records when the calls of a run end, and shows nothing.
 
     Attributes:
-        ends: Seconds of `time.perf_counter` and updates that were done, call by call.
+        ends: For each call, seconds of `time.perf_counter` and the updates done by then.
     """
 
     def __init__(self) -> None:
@@ -61,21 +61,21 @@ class Clock(Display):
         """Shows nothing."""
 
     def hear(self, rows: Sequence[Row], speeds: Row) -> None:
-        """Notes the end of a call."""
+        """Records the end of a call."""
         self.ends.append((time.perf_counter(), rows[-1]["update"]))
 
     def show(self, summary: Row, speeds: Row, seconds_left: float) -> None:
         """Shows nothing."""
 
     def updates_per_s(self) -> float:
-        """Speed from the end of the first call to that of the last one."""
+        """Computes the speed between the end of the first call and the end of the last one."""
         (began, first), (ended, last) = self.ends[0], self.ends[-1]
         return (last - first) / (ended - began)
 
 
 @dataclass(frozen=True)
 class Steady:
-    """A compiled program with what it is called with."""
+    """A compiled program and its arguments."""
 
     program: Built
     schedule: Schedule
@@ -83,7 +83,7 @@ class Steady:
     state: TrainState
 
     def train(self, minutes: float, seconds: float) -> tuple[float, int]:
-        """Trains a copy of the state; returns updates a second and how many were saved."""
+        """Trains a copy of the state; returns updates per second and the number of checkpoints."""
         clock, config = Clock(), self.program.config
         run = replace(config.run, checkpoint_minutes=minutes, checkpoint_share=0.0)
         program = replace(self.program, config=replace(config, run=run))
@@ -94,7 +94,7 @@ class Steady:
             directory.write_json(place / directory.CONFIG, {})
             trainer.train(place, program, self.schedule, self.compiled, copy, clock, stop)
             saved = directory.read_rows(place / directory.SAVED, None)
-        # The first and the last are written with either.
+        # The first and the last checkpoint are written in both cases.
         return clock.updates_per_s(), len(saved) - 2
 
 
@@ -109,7 +109,7 @@ def load(settings: TrainConfig) -> Steady:
 
 
 def result(config: PriceConfig, settings: TrainConfig) -> dict[str, Any]:
-    """Trains in turn with checkpoints and without; returns the line."""
+    """Trains alternately with checkpoints and without; returns the line."""
     steady = load(settings)
     found = in_turn(
         lambda: steady.train(config.every / 60.0, config.seconds),

@@ -1,13 +1,15 @@
-"""How many seconds from the command until a swarm reaches its targets, and how good is it then?
+"""How many seconds after the command does a swarm reach its targets, and how good is it then?
 
 `python -m benchmarks.command_to_success seed=0,1,2 [stop_at=0.95] [key=value ...]` takes the keys
-of `swarmjax.train` and runs that command once for each seed, in a process of its own, with whatever
-caches there are. The run is asked to stop as soon as the success of its last stage was measured at
-`stop_at` of the targets, over a whole cohort of training episodes; it saves its policy, which is
-then judged in MuJoCo C on the wheeled body. It prints a JSON line for each seed: the seconds from
-the command, compilation included, until 0.90 and 0.95 were measured, until the policy was saved,
-and the share of targets that it reached before the judge. `benchmarks.time_to_success` says the
-same of a run that is there already, without what comes before its first update.
+of `swarmjax.train` and runs that command once per seed, in its own process, with the caches that
+exist. The run is asked to stop as soon as its last stage has a measured success of `stop_at` of the
+targets, over a whole cohort of training episodes. The saved policy is then judged in MuJoCo C on
+the wheeled body.
+
+It prints a JSON line for each seed: the seconds from the command, including compilation, until 0.90
+and 0.95 were measured and until the policy was saved, and the judged share of targets.
+`benchmarks.time_to_success` measures the same for a finished run, without the time before its first
+update.
 """
 
 import sys
@@ -37,7 +39,7 @@ SHARES = (0.90, 0.95)
 
 @dataclass(frozen=True, kw_only=True)
 class SuccessConfig(Section):
-    """Which seeds, and how they are judged."""
+    """Settings: which seeds, and how to judge them."""
 
     seed: tuple[int, ...] = field(
         default=(0,), metadata=about("random seeds, one after the other", 0, MAX_COUNT)
@@ -45,20 +47,20 @@ class SuccessConfig(Section):
     stop_at: float = field(
         default=0.95, metadata=about("share of targets at which training stops", 0.95, 1.0)
     )
-    episodes: int = field(default=500, metadata=about("that the policy is judged on", 1, 10**6))
+    episodes: int = field(default=500, metadata=about("episodes to judge the policy on", 1, 10**6))
 
 
 def train(words: Sequence[str], run: Path, stop_at: float) -> tuple[dict[str, float | None], Row]:
-    """Trains until the last stage is reached at a share of the targets, or the budget is spent.
+    """Trains until the last stage reaches a share of the targets, or the budget is spent.
 
     Args:
-      words: of training.
-      run: its directory.
+      words: the words for training.
+      run: the run directory.
       stop_at: the share.
 
     Returns:
-      Seconds from the command until each of `SHARES` was measured, None if it was not, and until
-      the policy was saved; and the last row of the metrics.
+      Seconds from the command until each of `SHARES` was measured, or None if it was not, and until
+      the policy was saved. Also the last row of the metrics.
     """
     watched, row = Watched(words, run, {}), {}
     found: dict[str, float | None] = dict.fromkeys((f"seconds_to_{x:.2f}" for x in SHARES), None)
@@ -73,7 +75,7 @@ def train(words: Sequence[str], run: Path, stop_at: float) -> tuple[dict[str, fl
 
 
 def judge(run: Path, stage: str, episodes: int) -> dict[str, Any]:
-    """Share of targets that a run's policy reaches in MuJoCo C on wheels, and how it acts there."""
+    """Judges a run's policy in MuJoCo C on wheels; returns targets reached and the action mode."""
     path = run / POLICY
     settings = load_levels(
         EvaluateConfig,
@@ -86,7 +88,7 @@ def judge(run: Path, stage: str, episodes: int) -> dict[str, Any]:
 
 
 def results(given: SuccessConfig, words: Sequence[str]) -> Iterator[Row]:
-    """Trains and judges every seed; yields a line each."""
+    """Trains and judges every seed; yields one line per seed."""
     trained = load_train(words)
     for seed in given.seed:
         with tempfile.TemporaryDirectory() as name:

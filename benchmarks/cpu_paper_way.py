@@ -1,12 +1,12 @@
-"""How fast is the paper's way to train: PPO-PyTorch's update, and one arena of MuJoCo C?
+"""How fast is training as in the paper, with PPO-PyTorch's update and one arena of MuJoCo C?
 
 `python -m benchmarks.cpu_paper_way [seconds=30] [rollout=6000] [key=value ...]` takes the keys of
-`swarmjax.evaluate` and needs PyTorch (`torch-peers.txt`). The numbers are those of
-`algo=paper`; the program does what nikhilbarhate99/PPO-PyTorch does (commit 728cce8), written
-anew: each robot has an actor and a critic of its own and is asked for its action by itself, returns
-are Monte Carlo and normalised, and after every `rollout` control steps each pair of networks takes
-80 steps on the whole of it. Whole cycles are timed until `seconds` are over, after a short one that
-is not counted.
+`swarmjax.evaluate` and needs PyTorch (`torch-peers.txt`). The settings are those of `algo=paper`.
+
+The program is a rewrite of nikhilbarhate99/PPO-PyTorch (commit 728cce8). Each robot has its own
+actor and critic and computes its action separately. Returns are Monte Carlo and normalised. After
+every `rollout` control steps, each pair of networks takes 80 optimiser steps on the whole rollout.
+It times whole cycles until `seconds` are over, after a short warm-up cycle.
 """
 
 import itertools
@@ -26,23 +26,23 @@ from swarmjax.ppo.config import AlgoConfig
 from swarmjax.run.settings import load_train
 from swarmjax.task import observation
 
-_WARM = 200  # control steps of the cycle that is not counted
+_WARM = 200  # control steps of the warm-up cycle
 
 
 @dataclass(frozen=True, kw_only=True)
 class PaperWayConfig(Section):
-    """How long it is measured."""
+    """Settings: how long to measure."""
 
-    seconds: float = field(default=30.0, metadata=about("of cycles, at least", above=0.0))
-    rollout: int = field(default=6000, metadata=about("control steps of a cycle", 2, 10**6))
-    epochs: int = field(default=80, metadata=about("steps of each optimiser in a cycle", 1, 10**4))
+    seconds: float = field(default=30.0, metadata=about("minimum time of all cycles", above=0.0))
+    rollout: int = field(default=6000, metadata=about("control steps per cycle", 2, 10**6))
+    epochs: int = field(default=80, metadata=about("steps of each optimiser per cycle", 1, 10**4))
 
 
 class Robot:
-    """One robot's networks, its optimiser, and what it remembers of a cycle."""
+    """One robot's networks, its optimiser, and its data of the current cycle."""
 
     def __init__(self, torch: Any, algo: AlgoConfig) -> None:
-        """Makes both networks as PyTorch begins them."""
+        """Makes both networks with PyTorch's default initialisation."""
         self._torch, self._algo = torch, algo
         self._actor = _network(
             torch, algo.hidden_sizes, mujoco_arena.ACTION_SIZE, last=torch.nn.Tanh()
@@ -64,7 +64,7 @@ class Robot:
         self.ended: list[bool] = []
 
     def act(self, seen: np.ndarray) -> np.ndarray:
-        """Draws an action for an observation [O], and remembers both."""
+        """Draws an action for an observation [O], and stores both."""
         with self._torch.no_grad():
             state = self._torch.as_tensor(seen)
             chosen = self._distribution(state)
@@ -79,7 +79,7 @@ class Robot:
         return self._torch.distributions.MultivariateNormal(self._actor(state), covariance)
 
     def learn(self, epochs: int) -> None:
-        """Takes so many steps on all that it remembers."""
+        """Takes `epochs` optimiser steps on all stored data."""
         torch, algo = self._torch, self._algo
         seen, done = torch.stack(self._seen), torch.stack(self._done)
         before = torch.stack(self._log_prob)
@@ -100,7 +100,7 @@ class Robot:
 
 
 def _network(torch: Any, hidden: Sequence[int], size: int, last: Any = None) -> Any:
-    """Layers with tanh between them, and `last` behind the last one."""
+    """Makes layers with tanh between them, and `last` after the last one."""
     widths, layers = [observation.SIZE, *hidden], []
     for wide, narrow in itertools.pairwise(widths):
         layers += [torch.nn.Linear(wide, narrow), torch.nn.Tanh()]
@@ -109,12 +109,12 @@ def _network(torch: Any, hidden: Sequence[int], size: int, last: Any = None) -> 
 
 
 def discounted(reward: Sequence[float], ended: Sequence[bool], discount: float) -> np.ndarray:
-    """Adds rewards up to the end of each episode, or of the cycle.
+    """Sums rewards up to the end of each episode, or of the cycle.
 
     Args:
-      reward: [T].
+      reward: [T] rewards.
       ended: [T] whether the robot's episode ended with the step.
-      discount: of a control step.
+      discount: discount per control step.
 
     Returns:
       [T] discounted sums.
@@ -127,12 +127,12 @@ def discounted(reward: Sequence[float], ended: Sequence[bool], discount: float) 
 
 
 def cycle(arena: MujocoArena, robots: Sequence[Robot], steps: int, epochs: int) -> None:
-    """Drives for so many control steps from a fresh level on, then lets every robot learn.
+    """Drives for `steps` control steps from a fresh level, then lets every robot learn.
 
     Args:
       arena: one arena.
-      robots: its robots; one that has arrived waits, and remembers nothing.
-      steps: control steps.
+      robots: the arena's robots; an arrived robot waits and stores nothing.
+      steps: number of control steps.
       epochs: steps of each optimiser.
     """
     seen, drives = arena.reset(), list(robots)
@@ -149,7 +149,7 @@ def cycle(arena: MujocoArena, robots: Sequence[Robot], steps: int, epochs: int) 
 def _control_step(
     arena: MujocoArena, robots: Sequence[Robot], drives: Sequence[Robot], seen: np.ndarray
 ) -> tuple[Moved, list[Robot]]:
-    """One control step; returns what it came to, and the robots that are still on their way."""
+    """Takes one control step; returns its results and which robots are still on their way."""
     none = np.zeros(mujoco_arena.ACTION_SIZE, np.float32)
     ask = zip(robots, seen, strict=True)
     action = np.stack([robot.act(each) if robot in drives else none for robot, each in ask])

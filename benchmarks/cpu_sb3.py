@@ -2,11 +2,11 @@
 
 `python -m benchmarks.cpu_sb3 [arenas=16] [workers=2] [seconds=30] [key=value ...]` takes the keys
 of `swarmjax.evaluate` and needs `torch-peers.txt`. Every robot is one environment of
-Stable-Baselines3, all of them share its policy, and `workers` processes simulate the arenas.
-Networks, batch a robot, epochs, minibatches, discount and clip are those of `algo=ppo`;
-observations are not normalised. It has no mask: a robot that has arrived waits in the batch, with
-reward 0, until its arena is over. An iteration, rollout and update, is timed again and again until
-`seconds` are over, after one that is not counted.
+Stable-Baselines3, all robots share its policy, and `workers` processes simulate the arenas.
+Networks, batch per robot, epochs, minibatches, discount and clip are those of `algo=ppo`.
+Observations are not normalised. Stable-Baselines3 has no mask, so an arrived robot waits in the
+batch with reward 0 until its arena is over. Iterations of rollout and update are timed until
+`seconds` are over, after one warm-up iteration.
 """
 
 import itertools
@@ -29,16 +29,16 @@ from swarmjax.ppo import optimizer
 from swarmjax.run.settings import load_train
 from swarmjax.task import observation
 
-_LEVELS = 1_000_000  # numbers of levels that each arena has to itself
+_LEVELS = 1_000_000  # level numbers reserved for each arena
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sb3Config(Section):
-    """How it is measured."""
+    """Settings of the measurement."""
 
     arenas: int = field(default=16, metadata=about("arenas", 1, 4096))
     workers: int = field(default=2, metadata=about("processes that simulate", 1, 256))
-    seconds: float = field(default=30.0, metadata=about("of iterations, at least", above=0.0))
+    seconds: float = field(default=30.0, metadata=about("minimum time of iterations", above=0.0))
 
     def _check(self) -> None:
         if self.arenas % self.workers:
@@ -48,13 +48,13 @@ class Sb3Config(Section):
 
 
 def serve(pipe: Connection, judged: EvaluateConfig, numbers: Sequence[int]) -> None:
-    """Simulates some arenas in a process of its own, until it is sent None.
+    """Simulates some arenas in its own process, until it receives None.
 
     Args:
-      pipe: brings actions [A R, 2] and takes observation [A R, O], reward, done, truncated [A R]
-        and, where done, what was seen before a reset; the first message brings no action.
+      pipe: receives actions [A R, 2]; the first message has no action. It sends observation
+        [A R, O], reward, done, truncated [A R] and, where done, the observation before the reset.
       judged: settings of the arenas.
-      numbers: [A] of the arenas.
+      numbers: [A] numbers of the arenas.
     """
     arenas = [MujocoArena(judged, number * _LEVELS) for number in numbers]
     seen = [arena.reset() for arena in arenas]
@@ -68,11 +68,11 @@ def serve(pipe: Connection, judged: EvaluateConfig, numbers: Sequence[int]) -> N
 
 
 def _step(arena: MujocoArena, action: np.ndarray, waits: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Steps an arena, and resets it where it is over.
+    """Steps an arena, and resets it if its episode is over.
 
     Returns:
       [R, ...]: observation after any reset, reward, done, truncated, observation before the reset,
-      and who waits.
+      and which robots wait.
     """
     moved = arena.step(action)
     arrives = moved.arrived & ~waits
@@ -85,7 +85,7 @@ def _step(arena: MujocoArena, action: np.ndarray, waits: np.ndarray) -> tuple[np
 
 
 class Workers:
-    """Processes that simulate arenas; a robot is an environment."""
+    """Processes that simulate arenas; each robot is an environment."""
 
     def __init__(self, given: Sb3Config, judged: EvaluateConfig) -> None:
         """Starts them."""
@@ -100,12 +100,12 @@ class Workers:
         self.first = np.concatenate([pipe.recv() for pipe in self._pipes])
 
     def send(self, actions: np.ndarray) -> None:
-        """Lets all arenas make a control step, [A R, 2]."""
+        """Sends the actions [A R, 2] of a control step to all arenas."""
         for pipe, part in zip(self._pipes, np.split(actions, len(self._pipes)), strict=True):
             pipe.send(part)
 
     def receive(self) -> list[np.ndarray]:
-        """What `_step` returns of all robots, but who waits."""
+        """Receives the results of `_step` for all robots, except which robots wait."""
         found = [pipe.recv() for pipe in self._pipes]
         return [np.concatenate([each[i] for each in found]) for i in range(5)]
 
@@ -116,9 +116,9 @@ class Workers:
 
 
 def vectorised(workers: Workers) -> Any:
-    """Puts the arenas behind the interface of Stable-Baselines3, whose class is made here.
+    """Wraps the arenas in the interface of Stable-Baselines3.
 
-    It cannot be made before the library is there.
+    The class is defined in this function, since the library may not be installed.
     """
     spaces = peers.find("gymnasium.spaces", peers.TORCH)
     base = peers.find("stable_baselines3.common.vec_env", peers.TORCH).VecEnv
@@ -146,7 +146,7 @@ def vectorised(workers: Workers) -> Any:
 
 
 def ppo_settings(robots: int) -> dict[str, Any]:
-    """Numbers of `algo=ppo` under the names of Stable-Baselines3, for so many robots in all."""
+    """Translates the settings of `algo=ppo` to Stable-Baselines3, for `robots` robots in total."""
     trained = load_train(["stage=s6"])
     algo = trained.algo
     return {

@@ -1,16 +1,18 @@
-"""Where does a curriculum pay? Its modes against training on the goal alone, at equal arena steps.
+"""Where does a curriculum help? Compares its modes with training on the goal alone at equal steps.
 
 `python -m benchmarks.curriculum goal=s6 arms=final,sequential,mixed,adaptive [key=value ...]` takes
-the keys of `curriculum_arms.StudyConfig` and of `swarmjax.train`, but `stage`, `algo.policy` and
-`curriculum.mode`, which the arms are about; `seeds` is 10 unless given. Each arm trains all its
-seeds in one program, stops at points that are evenly spread over the logarithm of the arena steps,
-and judges every seed's policies there, on the device, on the same levels: of the goal, of the 1.5 m
-arena that no arm trains on (with 5 robots compiled in), and of the first stage of the goal's
-curriculum, whether the arm has seen it or not. It prints a JSON line for each arm and policy as
-soon as it is done; `benchmarks.curriculum_table` makes tables and plots of them.
+the keys of `curriculum_arms.StudyConfig` and of `swarmjax.train`, except `stage`, `algo.policy` and
+`curriculum.mode`, which the arms set. `seeds` is 10 by default.
 
-The baseline `final` trains on the goal alone. Where an option of a mode is what differs, arms are
-run one at a time and labelled: `arms=adaptive label=progress curriculum.score=progress`.
+Each arm trains all its seeds in one program. It stops at points that are evenly spaced over the
+logarithm of the arena steps, and judges the policies of every seed on the device. All arms use the
+same levels: of the goal, of the 1.5 m arena that no arm trains on (with 5 robots compiled in), and
+of the first stage of the goal's curriculum, whether the arm has trained on it or not. It prints a
+JSON line for each arm and policy as soon as it is done. `benchmarks.curriculum_table` makes tables
+and plots from the lines.
+
+The baseline `final` trains on the goal alone. To compare options of one mode, run one arm at a time
+and label it: `arms=adaptive label=progress curriculum.score=progress`.
 """
 
 import hashlib
@@ -46,7 +48,7 @@ Judge = Callable[[LearnerState], dict[str, dict[str, np.ndarray]]]
 
 
 def load_judge(study: StudyConfig, trained: TrainConfig, judged: dict[str, StageConfig]) -> Judge:
-    """Makes the judge of all points, arms and policies; compiled once for each kind of policy.
+    """Makes the judge of all points, arms and policies; it compiles once for each kind of policy.
 
     Args:
       study: the study.
@@ -54,7 +56,8 @@ def load_judge(study: StudyConfig, trained: TrainConfig, judged: dict[str, Stage
       judged: the stages, by role.
 
     Returns:
-      From learners [N, L] to the means [N] over the levels of each of the `Outcomes`, by role.
+      A function from learners [N, L] to the mean [N] over levels of each of the `Outcomes`, by
+      role.
     """
     stages, arenas = tuple(judged.values()), len(judged) * study.levels
     world = env.load(
@@ -83,18 +86,18 @@ def load_judge(study: StudyConfig, trained: TrainConfig, judged: dict[str, Stage
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Curves:
-    """What came of an arm.
+    """The results of an arm.
 
     Attributes:
-      judged: by role and measure, [N, P].
-      transitions: [N, P] robot steps that each seed trained on until then.
+      judged: [N, P] results by role and measure.
+      transitions: [N, P] robot steps that each seed has trained on by then.
       stage: [N, P] index of the newest stage.
-      mix: [P, S] share of the arenas on each stage, all seeds together.
-      broken_arenas: episodes of training that ended as the physics broke, all seeds together.
-      train_s: [P] seconds of training until then, compilation and judging apart.
+      mix: [P, S] share of the arenas on each stage, over all seeds.
+      broken_arenas: training episodes that ended because the physics broke, over all seeds.
+      train_s: [P] seconds of training by then, without compiling and judging.
       judge_s: seconds of judging.
-      compile_s: seconds that compiling the training took.
-      judge_compile_s: seconds of judging once before, with what is compiled on the way.
+      compile_s: seconds of compiling the training.
+      judge_compile_s: seconds of a first judging, including its compilation.
     """
 
     judged: dict[str, dict[str, list[list[float]]]]
@@ -112,8 +115,8 @@ def measure(trained: TrainConfig, at: np.ndarray, judge: Judge) -> Curves:
     """Trains one arm, and judges it at every point.
 
     Args:
-      trained: its config.
-      at: [P] updates, rising.
+      trained: the arm's config.
+      at: [P] updates, increasing.
       judge: judges learners [N, L].
 
     Returns:
@@ -123,7 +126,7 @@ def measure(trained: TrainConfig, at: np.ndarray, judge: Judge) -> Curves:
     state = jax.jit(mesh.init(program))(schedule)
     compiled = trainer.compile_chunk(program, schedule, state)
     call = partial(compiled.call, schedule)
-    # Warp builds its kernels at its first step, which is no part of training either.
+    # Warp builds its kernels in its first step, which does not count as training either.
     judge_compile_s, _ = _timed(partial(judge, jax.device_get(state.learners)))
     rows, train_s, judge_s = [], [], 0.0
     for n in np.diff(at, prepend=0):
@@ -150,12 +153,12 @@ def measure(trained: TrainConfig, at: np.ndarray, judge: Judge) -> Curves:
 
 
 def _curve(rows: Sequence[np.ndarray]) -> list[list[float]]:
-    """[N, P] of P rows [N], to five digits."""
+    """Turns P rows [N] into lists [N, P], with five digits."""
     return np.array(rows, np.float64).T.round(5).tolist()
 
 
 def _timed[T](call: Callable[[], T]) -> tuple[float, T]:
-    """Returns the seconds that a call took, and what it returned, once that is there."""
+    """Returns the seconds of a call and its result, once the result is ready."""
     began = time.perf_counter()
     result = jax.block_until_ready(call())
     return time.perf_counter() - began, result
@@ -164,7 +167,7 @@ def _timed[T](call: Callable[[], T]) -> tuple[float, T]:
 def _train(
     program: Program, call: Callable[..., Any], state: TrainState, n: int
 ) -> tuple[TrainState, dict[str, Any]]:
-    """Trains all seeds for n updates, in calls no longer than the program reports."""
+    """Trains all seeds for n updates, in calls of at most the program's report interval."""
     transitions, broken, metrics, last = 0, 0, {}, 0
     for done in range(0, n, program.rows):
         last = min(program.rows, n - done)
@@ -182,7 +185,7 @@ def _train(
 
 
 def results(study: StudyConfig, words: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Trains and judges all arms; yields a line each."""
+    """Trains and judges all arms; yields one line per arm and policy."""
     arms = [
         (arm, policy, curriculum_arms.load_arm(study, arm, policy, words))
         for policy in study.policies
@@ -200,7 +203,7 @@ def results(study: StudyConfig, words: Sequence[str]) -> Iterator[dict[str, Any]
 
 
 def _line(study: StudyConfig, arm: str, trained: TrainConfig, at: np.ndarray) -> dict[str, Any]:
-    """What an arm was."""
+    """Describes an arm."""
     whole = to_dict(trained)
     digest = hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
     return {

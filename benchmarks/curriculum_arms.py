@@ -1,7 +1,7 @@
-"""What a study of curricula compares: its arms, the points on their way, and who judges them.
+"""Defines what a study of curricula compares: its arms, the points in training, and the stages.
 
-An arm is a curriculum mode with the stages that lead to the goal; `final` is the baseline, the goal
-alone. `benchmarks.curriculum` says how it is called.
+An arm is a curriculum mode with the stages that lead to the goal. `final` is the baseline with the
+goal alone. `benchmarks.curriculum` describes the command.
 """
 
 from collections.abc import Sequence
@@ -20,15 +20,15 @@ from swarmjax.task.stage_config import StageConfig
 BASELINE = "final"
 HELD_OUT = "expanded"
 GRID_GOAL = "s6"
-HELD_OUT_ROBOTS = 5  # policies that trained with more are judged on their goal alone
+HELD_OUT_ROBOTS = 5  # policies trained with more robots are judged on their goal alone
 _CHOSEN = {"stage": "goal", "algo.policy": "policies", "curriculum.mode": "arms"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class StudyConfig(Section):
-    """What is compared, and how it is judged."""
+    """Settings: what to compare, and how to judge it."""
 
-    goal: str = field(default="s6", metadata=about("stage that all arms are for"))
+    goal: str = field(default="s6", metadata=about("final stage of all arms"))
     arms: tuple[Literal["final", "sequential", "mixed", "adaptive", "adaptive-grid"], ...] = field(
         default=("final", "sequential", "mixed", "adaptive"),
         metadata=about("final: the goal alone; adaptive-grid: stage=grid instead of the list"),
@@ -36,9 +36,9 @@ class StudyConfig(Section):
     policies: tuple[Literal["shared", "independent"], ...] = field(
         default=("shared", "independent"), metadata=about("algo.policy")
     )
-    label: str | None = field(default=None, metadata=about("what the one arm is called"))
+    label: str | None = field(default=None, metadata=about("name of the arm, if there is only one"))
     points: int = field(default=10, metadata=about("points at which arms are judged", 2, 1000))
-    first: int = field(default=100_000, metadata=about("arena steps of the first one", 1, 10**15))
+    first: int = field(default=100_000, metadata=about("arena steps at the first point", 1, 10**15))
     levels: int = field(default=256, metadata=about("of each stage", 1, 2**20))
     level_seed: int = field(default=2, metadata=about("of their levels", 0, MAX_COUNT))
 
@@ -53,16 +53,16 @@ class StudyConfig(Section):
 
 
 def parse(words: Sequence[str]) -> tuple[StudyConfig, list[str]]:
-    """Takes the study's own words out of those of the command line.
+    """Separates the study's words from those for training.
 
     Args:
-      words: `key=value`.
+      words: `key=value` words of the command line.
 
     Returns:
-      The study, and the words that are for training.
+      The study, and the words for training.
 
     Raises:
-      ConfigError: if a word of the study is unsound, or one of training is what arms are about.
+      ConfigError: if a word of the study is invalid, or a word for training is set by the arms.
     """
     for key in (word.partition("=")[0] for word in words):
         if key in _CHOSEN:
@@ -71,7 +71,7 @@ def parse(words: Sequence[str]) -> tuple[StudyConfig, list[str]]:
 
 
 def curriculum_of(goal: str) -> str:
-    """The file of configs/stage/ whose sequence leads to a goal."""
+    """Returns the name of the file in configs/stage/ whose stages lead to a goal."""
     return "curriculum" if goal == "s6" else f"{goal}_curriculum"
 
 
@@ -82,13 +82,13 @@ def load_arm(study: StudyConfig, arm: str, policy: str, words: Sequence[str]) ->
       study: the study.
       arm: one of its arms.
       policy: one of its policies.
-      words: of training, `key=value`.
+      words: `key=value` words for training.
 
     Returns:
       The config; all arms of a study have the same arenas and budget.
 
     Raises:
-      ConfigError: if a word is unsound.
+      ConfigError: if a word is invalid.
     """
     chosen = {
         BASELINE: [f"stage={study.goal}"],
@@ -98,14 +98,14 @@ def load_arm(study: StudyConfig, arm: str, policy: str, words: Sequence[str]) ->
 
 
 def points(study: StudyConfig, trained: TrainConfig) -> np.ndarray:
-    """Updates [P] after which the arms are judged, evenly spread over their logarithm.
+    """Computes the updates [P] after which arms are judged, evenly spaced in the logarithm.
 
     Args:
       study: the study.
       trained: the config of an arm.
 
     Returns:
-      Rising whole numbers, the last one the whole budget; fewer than asked if some are the same.
+      Increasing integers up to the whole budget; fewer than requested if some are equal.
 
     Raises:
       ConfigError: if the budget ends before the first point.
@@ -121,7 +121,7 @@ def points(study: StudyConfig, trained: TrainConfig) -> np.ndarray:
 
 
 def roles(study: StudyConfig, trained: TrainConfig, words: Sequence[str]) -> dict[str, StageConfig]:
-    """The stages that are judged, by what they are judged for."""
+    """Returns the stages that are judged, by their role."""
     load = partial(_stages, words)
     found = {"goal": load(study.goal)[-1]}
     if trained.sim.max_robots == HELD_OUT_ROBOTS:

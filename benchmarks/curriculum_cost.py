@@ -1,10 +1,10 @@
-"""What does the curriculum's engine cost in training speed?
+"""How much training speed does the curriculum's engine cost?
 
 `python -m benchmarks.curriculum_cost [key=value ...]` takes the keys of `swarmjax.train` and trains
-pairs of programs in turn: a list of one stage, and a curriculum of `COPIES` of that very stage in
-each mode, so that both simulate the same mix and differ by the engine alone. It prints a JSON line
-for each mode: the median ratio of its speed to the single stage's, and the 95 % interval of that
-median by order statistics, which asks nothing of the distribution.
+pairs of programs alternately: one stage alone, and a curriculum of `COPIES` copies of that stage in
+each mode. Both simulate the same mix and differ only in the curriculum's engine. It prints a JSON
+line for each mode: the median ratio of its speed to that of the single stage, and the 95 % interval
+of this median by order statistics, which assumes no distribution.
 """
 
 import json
@@ -21,11 +21,11 @@ from swarmjax.sim import dispatch
 
 PAIRS = 20
 COPIES = {"sequential": 6, "mixed": 6, "adaptive": 6, "adaptive-grid": 48}
-CALL_SECONDS = 0.7  # of a call, about
+CALL_SECONDS = 0.7  # approximate time per call
 
 
 def curriculum(settings: TrainConfig, name: str) -> TrainConfig:
-    """Copies the one stage of a config, and chooses the mode of an arm of `COPIES`."""
+    """Makes the config of an arm: `COPIES` copies of the config's stage, in the arm's mode."""
     stage = settings.stage[-1]
     copies = tuple(replace(stage, name=f"{stage.name}-{i}") for i in range(COPIES[name]))
     words = [f"curriculum.mode={name.removesuffix('-grid')}"]
@@ -34,7 +34,7 @@ def curriculum(settings: TrainConfig, name: str) -> TrainConfig:
 
 
 def results(settings: TrainConfig) -> Iterator[dict[str, Any]]:
-    """Compiles all arms, then compares each with the single stage; yields a line each."""
+    """Compiles all arms, then compares each with the single stage; yields one line per arm."""
     single = replace(settings, stage=settings.stage[-1:])
     programs = [single, *(curriculum(settings, name) for name in COPIES)]
     with ThreadPoolExecutor(len(programs)) as pool:

@@ -1,19 +1,19 @@
-"""Tables and learning curves of what `benchmarks.curriculum` has printed.
+"""Makes tables and learning curves from the lines of `benchmarks.curriculum`.
 
 `python -m benchmarks.curriculum_table FILE... [measure=all_reached] [out=DIR]` prints a Markdown
-table for each goal, kind of policy, number of arenas and budget; with `out` it also draws the
-learning curves of each into DIR, as `<goal>-<policy>-<arenas>-<budget>-<measure>.png`. The measure
-is the share of targets that were reached, or of episodes in which all were.
+table for each goal, kind of policy, number of arenas and budget. With `out` it also draws the
+learning curves into DIR, as `<goal>-<policy>-<arenas>-<budget>-<measure>.png`. The measure is the
+share of targets reached, or the share of episodes in which all targets were reached.
 
-Every figure is the interquartile mean over seeds, with the 95 % interval of a stratified bootstrap
-over them (swarmjax.evaluate.statistics). The columns:
+Every number is the interquartile mean over seeds, with the 95 % interval of a stratified bootstrap
+over seeds (swarmjax.evaluate.statistics). The columns are:
 
-- `goal`, `1.5 m`: the share at the end, on the goal and in the arena never trained.
-- `to 0.8`, `to 0.9`: arena steps until a seed's share on the goal is first so large.
+- `goal`, `1.5 m`: the final share, on the goal and in the arena that no arm trained on.
+- `to 0.8`, `to 0.9`: arena steps until a seed's share on the goal first reaches this value.
 - `area`, `area (log)`: mean share on the goal over training, by arena steps and by their logarithm.
-- `forgotten`: the best share on the first stage at any point, less the last one; `-` where the
-  first stage was not judged.
-- `P(end)`, `P(area)`: probability that a seed ends higher than one of the baseline, and that its
+- `forgotten`: the best share on the first stage at any point, minus the last one; `-` if the first
+  stage was not judged.
+- `P(end)`, `P(area)`: probability that a seed ends higher than a seed of the baseline, and that its
   `area` is larger.
 """
 
@@ -49,7 +49,7 @@ Line = dict[str, Any]
 
 
 class Key(NamedTuple):
-    """What the arms of one table have in common."""
+    """The settings that all arms of a table share."""
 
     goal: str
     policy: str
@@ -58,15 +58,15 @@ class Key(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """What each seed of an arm came to, [N] each.
+    """The results of each seed of an arm, [N] each.
 
     Attributes:
-      goal: share on the goal at the end.
-      held_out: on the 1.5 m arena; None where it was not judged.
-      steps: by threshold, arena steps until it was first reached; inf if it never was.
+      goal: final share on the goal.
+      held_out: final share in the 1.5 m arena; None if it was not judged.
+      steps: arena steps until each threshold was first reached; inf if it never was.
       area: mean share over arena steps.
-      log_area: mean share over their logarithm.
-      forgotten: best share on the first stage less the last one; None where it was not judged.
+      log_area: mean share over the logarithm of arena steps.
+      forgotten: best share on the first stage minus the last one; None if it was not judged.
     """
 
     goal: np.ndarray
@@ -78,51 +78,51 @@ class Figures(NamedTuple):
 
 
 def tables(lines: Sequence[Line]) -> dict[Key, dict[str, Line]]:
-    """Puts together the lines of each table, by arm, the baseline first.
+    """Groups the lines by table and arm, with the baseline first.
 
     Args:
-      lines: as `benchmarks.curriculum` prints them.
+      lines: lines of `benchmarks.curriculum`.
 
     Returns:
       The arms of each table.
 
     Raises:
-      ConfigError: if an arm is there twice, or arms of a table were judged differently; a role
-        that only some were judged for makes no difference.
+      ConfigError: if an arm appears twice, or arms of a table were judged differently. A role that
+        only some arms have is no difference.
     """
     found: dict[Key, dict[str, Line]] = {}
     for line in sorted(lines, key=lambda line: line["arm"] != BASELINE):
         key = Key(*(line[name] for name in Key._fields))
         arms = found.setdefault(key, {})
         if line["arm"] in arms:
-            raise ConfigError(f"arm {line['arm']} of {_title(key)} is there twice: leave one out.")
+            raise ConfigError(f"arm {line['arm']} of {_title(key)} appears twice: leave one out.")
         for name in _SHARED:
             for other in arms.values():
                 if _differs(name, line[name], other[name]):
                     raise ConfigError(
                         f"arms {other['arm']} and {line['arm']} of {_title(key)} differ in {name}: "
-                        "judge them alike."
+                        "judge them in the same way."
                     )
         arms[line["arm"]] = line
     return found
 
 
 def _differs(name: str, one: Any, other: Any) -> bool:
-    """Tells whether two lines differ in what arms share; of roles, in those that both have."""
+    """Tells whether two lines differ in a shared setting; roles count only if both have them."""
     if name != "roles":
         return one != other
     return any(one[role] != other[role] for role in one.keys() & other.keys())
 
 
 def figures(line: Line, measure: str) -> Figures:
-    """Works out what each seed came to.
+    """Computes the results of each seed.
 
     Args:
-      line: of an arm.
+      line: line of an arm.
       measure: one of `MEASURES`.
 
     Returns:
-      Its figures.
+      The arm's figures.
     """
     steps = np.array(line["arena_steps"], float)
     curve = {role: np.array(found[measure]) for role, found in line["judged"].items()}
@@ -141,7 +141,7 @@ def table(key: Key, arms: dict[str, Line], measure: str) -> str:
     """Writes the table of some arms.
 
     Args:
-      key: what they have in common.
+      key: the settings that they share.
       arms: their lines, by name.
       measure: one of `MEASURES`.
 
@@ -162,7 +162,7 @@ def _title(key: Key) -> str:
 
 
 def _cells(mine: Figures) -> Iterator[str]:
-    """Words of an arm's own columns."""
+    """Writes the columns of an arm's own results."""
     yield _share(mine.goal)
     yield _share(mine.held_out)
     for steps in mine.steps.values():
@@ -172,7 +172,7 @@ def _cells(mine: Figures) -> Iterator[str]:
 
 
 def _chances(mine: Figures, baseline: Figures | None) -> Iterator[str]:
-    """Words of how likely an arm is to beat the baseline."""
+    """Writes the columns of the probabilities that an arm beats the baseline."""
     if baseline is None:
         return
     for name in ("goal", "area"):
@@ -182,7 +182,7 @@ def _chances(mine: Figures, baseline: Figures | None) -> Iterator[str]:
 
 
 def _over_seeds(values: np.ndarray) -> Interval[float]:
-    """Interquartile mean of values [N], with its interval."""
+    """Computes the interquartile mean of values [N], with its interval."""
     return statistics.bootstrap(values[:, None], statistics.iqm)
 
 
@@ -191,7 +191,7 @@ def _share(values: np.ndarray | None) -> str:
 
 
 def _count(steps: float) -> str:
-    """Puts steps in words, to two digits."""
+    """Writes a number of steps with two digits."""
     return "never" if np.isinf(steps) else f"{float(f'{steps:.2g}'):,.0f}"
 
 
@@ -204,10 +204,10 @@ def draw(key: Key, arms: dict[str, Line], measure: str, path: Path) -> None:
     """Draws the learning curves of some arms, with their bands.
 
     Args:
-      key: what they have in common.
+      key: the settings that they share.
       arms: their lines, by name.
       measure: one of `MEASURES`.
-      path: of the picture.
+      path: path of the picture.
     """
     judged = {role for line in arms.values() for role in line["judged"]}
     roles = [role for role in _TITLES if role in judged]
@@ -219,7 +219,7 @@ def draw(key: Key, arms: dict[str, Line], measure: str, path: Path) -> None:
 
 
 def _draw_curves(axes: Axes, arms: dict[str, Line], role: str, measure: str) -> None:
-    """Draws the curves of one stage, of the arms that were judged on it."""
+    """Draws the curves on one stage for the arms that were judged on it."""
     there = {name: line for name, line in arms.items() if role in line["judged"]}
     for name, line in there.items():
         band = curve(np.array(line["judged"][role][measure]))
@@ -239,7 +239,8 @@ def read(path: Path) -> list[Line]:
     """Reads the lines of a file.
 
     Raises:
-      ConfigError: if it cannot be read, or a line is none of `benchmarks.curriculum`, or damaged.
+      ConfigError: if the file cannot be read, or a line is damaged or not from
+        `benchmarks.curriculum`.
     """
     try:
         texts = path.read_text().splitlines()
@@ -249,13 +250,13 @@ def read(path: Path) -> list[Line]:
 
 
 def _line(text: str, where: str) -> Line:
-    """Reads a line, with all that a table takes of it."""
+    """Reads a line and checks all values that a table needs."""
     try:
         line = json.loads(text)
     except ValueError as error:
         raise ConfigError(f"{where} cannot be read: {error}.") from None
     if not isinstance(line, dict) or line.get("benchmark") != "curriculum":
-        raise ConfigError(f"{where} is none of the lines of benchmarks.curriculum.")
+        raise ConfigError(f"{where} is not a line of benchmarks.curriculum.")
     for key in ("arm", *Key._fields, *_SHARED, "judged"):
         if key not in line:
             raise ConfigError(f"{where} has no {key}: it is damaged.")
@@ -266,7 +267,7 @@ def _line(text: str, where: str) -> Line:
 
 
 def _check_judged(line: Line, where: str) -> None:
-    """Refuses a line without curves of its goal, or with some that are not whole."""
+    """Checks that a line has curves of its goal and that all its curves are complete."""
     if "goal" not in line["judged"]:
         raise ConfigError(f"{where} has no judged.goal: it is damaged.")
     for role, found in line["judged"].items():
@@ -282,13 +283,13 @@ def _check_judged(line: Line, where: str) -> None:
 
 
 def _are_curves(steps: Any, curves: Any) -> bool:
-    """Tells whether curves are [N, P] finite numbers over steps [P] that rise from above 0."""
+    """Tells whether curves are [N, P] finite numbers over positive increasing steps [P]."""
     try:
         at, values = np.array(steps), np.array(curves)
         if {at.dtype.kind, values.dtype.kind} <= {"i", "f"} and values.ndim == 2:
             area_under(at, values)
             return bool(at[0] > 0)
-    except ValueError:  # of lists that make no array, or of what statistics refuses
+    except ValueError:  # from ragged lists, or from the statistics
         return False
     return False
 
@@ -301,7 +302,7 @@ def main(arguments: Sequence[str]) -> int:
     if measure not in MEASURES:
         raise ConfigError(f"measure is '{measure}': give one of {', '.join(MEASURES)}.")
     if not files:
-        raise ConfigError("there is no file: give those that benchmarks.curriculum printed.")
+        raise ConfigError("no file is given: give files with lines of benchmarks.curriculum.")
     found = tables([line for name in files for line in read(Path(name))])
     if "out" in given:
         _draw_all(found, measure, Path(given["out"]))
@@ -311,7 +312,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _draw_all(found: dict[Key, dict[str, Line]], measure: str, out: Path) -> None:
-    """Draws the learning curves of every table into a directory, which is made."""
+    """Draws the learning curves of every table into a directory, and creates the directory."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         for key, arms in found.items():

@@ -1,14 +1,15 @@
-"""Writes docs/scaling.md: what several devices gain, and what a model of it predicts for more.
+"""Writes docs/scaling.md: the speed-up by several devices, and a model's predictions for more.
 
 `python -m benchmarks.devices_page [lines=benchmarks/results/devices.jsonl] [docs=docs]` writes the
-tables between the page's markers, and the plot `figures/devices.png`. It takes the newest line of
-each comparison that `benchmarks.devices_speed` printed, and those of `benchmarks.all_reduce`.
+tables between the page's markers, and the plot `figures/devices.png`. It uses the newest line of
+each comparison of `benchmarks.devices_speed`, and the lines of `benchmarks.all_reduce`.
 
-The model of an update on N devices of equal share: the time of one device, and for each sum over
-devices its latency. Within a host that is measured; between hosts it grows with the logarithm of
-their number. Devices wait for the slowest one; with times that vary normally around their mean the
-expected slowest of N is `EXPECTED_MAX[N]` deviations above it (Harter 1961, "Expected values of
-normal order statistics", table 1, for 2 and 8; simulated for 64 and 512).
+The model describes an update on N devices with equal shares of the work. The update takes the time
+of one device, plus the latency of each sum over devices. The latency within a host is measured. The
+latency between hosts grows with the logarithm of their number. Devices also wait for the slowest
+one. If times vary normally, the slowest of N is expected `EXPECTED_MAX[N]` deviations above the
+mean (Harter 1961, "Expected values of normal order statistics", table 1, for 2 and 8; simulated for
+64 and 512).
 """
 
 import json
@@ -28,18 +29,18 @@ from swarmjax.config import ConfigError, Section, about
 Line = dict[str, Any]
 PAGE, FIGURE = "scaling.md", "figures/devices.png"
 EXPECTED_MAX = {1: 0.0, 2: 0.564, 8: 1.424, 64: 2.34, 512: 3.05}
-# Sums of an update: one for each of 8 minibatches, and 5 for advantages, observations and tallies,
-# as the compiled program has them (tests/training/test_mesh.py). A line tells its own number.
+# Sums per update: one for each of 8 minibatches, and 5 for advantages, observations and tallies, as
+# in the compiled program (tests/training/test_mesh.py). Each line also has its own number.
 REDUCES = 13
-_HOST = 8  # devices of a host
-_HOP_US = 15.0  # that a doubling of hosts adds to a sum; assumed, not measured
-_ROLLOUT = 32  # control steps of an update, the default
+_HOST = 8  # devices per host
+_HOP_US = 15.0  # added to a sum by each doubling of hosts; assumed, not measured
+_ROLLOUT = 32  # control steps per update, the default
 _MESSAGE = 65_536  # bytes: networks of 40 kB, rounded up to a size that was timed
 
 
 @dataclass(frozen=True, kw_only=True)
 class PageConfig(Section):
-    """Where the figures come from, and where they go."""
+    """Settings: where the numbers come from, and where the page goes."""
 
     lines: str = field(
         default="benchmarks/results/devices.jsonl", metadata=about("file of JSON lines")
@@ -48,7 +49,7 @@ class PageConfig(Section):
 
 
 def update_ms(line: Line, devices: int) -> float:
-    """Milliseconds of an update, of one device or of all that a line compares."""
+    """Returns the milliseconds per update, for one device or for all devices of a line."""
     one = devices == 1
     steps = line["arenas"] if one else line["arenas_in_all"]
     speed = line["arena_steps_per_s_of_one"] if one else line["arena_steps_per_s"]
@@ -56,11 +57,11 @@ def update_ms(line: Line, devices: int) -> float:
 
 
 def sum_us(devices: int, measured_us: float) -> float:
-    """Microseconds of a sum over devices.
+    """Predicts the microseconds of a sum over devices.
 
     Args:
       devices: N, in hosts of 8.
-      measured_us: of two devices of one host.
+      measured_us: measured time for two devices of one host.
     """
     return measured_us + _HOP_US * log2(ceil(devices / _HOST))
 
@@ -69,10 +70,10 @@ def predict(one_ms: float, devices: int, measured_us: float, deviation_ms: float
     """Predicts the weak efficiency of N devices, 0..1.
 
     Args:
-      one_ms: of an update of one device.
+      one_ms: time of an update on one device.
       devices: N, a key of `EXPECTED_MAX`.
-      measured_us: of a sum over two devices of one host.
-      deviation_ms: by which updates of devices differ.
+      measured_us: time of a sum over two devices of one host.
+      deviation_ms: standard deviation of the update times of devices.
     """
     if devices == 1:
         return 1.0
@@ -81,11 +82,13 @@ def predict(one_ms: float, devices: int, measured_us: float, deviation_ms: float
 
 
 def deviation_ms(line: Line, measured_us: float) -> float:
-    """Takes what two devices lose beyond their sums for waiting; 0 if they lose less.
+    """Estimates the deviation of update times from the loss of two devices beyond their sums.
+
+    It attributes this loss to waiting. It is 0 if the devices lose less than their sums take.
 
     Args:
-      line: of a weak comparison of two devices.
-      measured_us: of a sum.
+      line: line of a weak comparison of two devices.
+      measured_us: time of a sum.
     """
     lost = update_ms(line, 2) - update_ms(line, 1) - line["sums"] * measured_us * 1e-3
     return max(0.0, lost) / EXPECTED_MAX[2]
@@ -95,10 +98,10 @@ def newest(lines: Sequence[Line]) -> list[Line]:
     """Takes the newest line of each comparison.
 
     Args:
-      lines: of any benchmarks, the newest last.
+      lines: lines of any benchmarks, the newest last.
 
     Returns:
-      Those of `devices_speed`, in the order in which their comparisons first come.
+      Lines of `devices_speed`, in the order in which their comparisons first appear.
     """
     keys = ("robot", "scaling", "processes", "arenas", "arenas_in_all")
     mine = [line for line in lines if line["benchmark"] == "devices_speed"]
@@ -106,7 +109,7 @@ def newest(lines: Sequence[Line]) -> list[Line]:
 
 
 def measured_table(lines: Sequence[Line]) -> str:
-    """Makes the table of what was measured."""
+    """Makes the table of the measurements."""
     rows = [
         "| robots | scaling | processes | arenas, one and two devices | update, ms, one and two "
         "| million arena steps/s, one and two | efficiency |",
@@ -126,7 +129,7 @@ def measured_table(lines: Sequence[Line]) -> str:
 
 
 def model_table(lines: Sequence[Line], measured_us: float) -> str:
-    """Makes the table of what the model predicts."""
+    """Makes the table of the model's predictions."""
     rows = ["| robots | arenas a device | 2, measured | 2 | 8 | 64 | 512 |", "|---" * 7 + "|"]
     for line in (line for line in lines if line["scaling"] == "weak"):
         found = _predictions(line, measured_us)
@@ -143,7 +146,7 @@ def _predictions(line: Line, measured_us: float) -> dict[int, float]:
 
 
 def draw(lines: Sequence[Line], measured_us: float) -> Figure:
-    """Draws the efficiency that was measured, and the model's curves."""
+    """Draws the measured efficiency and the model's curves."""
     plot = Figure(figsize=(7.0, 4.0), layout="constrained")
     axes = plot.subplots()
     axes.grid(visible=True, alpha=0.3)
@@ -174,14 +177,14 @@ def write(lines: Sequence[Line], docs: Path) -> None:
     page = docs / PAGE
     if not found or _MESSAGE not in sums or not page.exists():
         raise ConfigError(
-            f"lines need some of devices_speed and all_reduce's of {_MESSAGE} bytes, and docs a "
-            f"{PAGE}: give other lines or docs."
+            f"lines must have results of devices_speed and of all_reduce with {_MESSAGE} bytes, "
+            f"and docs must have {PAGE}: give other lines or docs."
         )
     text = pages.insert(page.read_text(), PAGE, "measured", measured_table(found))
     text = pages.insert(text, PAGE, "model", model_table(found, sums[_MESSAGE]))
     page.write_text(text)
     plot = draw(found, sums[_MESSAGE])
-    # Without the version of Matplotlib, so that the same plot is the same file.
+    # Without Matplotlib's version, so that the same plot gives the same file.
     plot.savefig(docs / FIGURE, dpi=90, metadata={"Software": None})
 
 

@@ -1,13 +1,14 @@
 """How much faster do several devices train than one?
 
 `python -m benchmarks.devices_speed devices=N [scaling=weak|strong] [key=value ...]` takes the keys
-of `swarmjax.train` and trains on one device and on N, in turn. `scaling=weak` gives each device
-`arenas` arenas; `scaling=strong` spreads `arenas` over all. It prints a JSON line: arena steps a
-second of both, their ratio, and `efficiency`, the ratio over N, each the median over `PAIRS` pairs
-with a 95 % interval by order statistics. Compile time is apart.
+of `swarmjax.train` and trains alternately on one device and on N. `scaling=weak` gives each device
+`arenas` arenas. `scaling=strong` spreads `arenas` over all devices. It prints a JSON line with the
+arena steps per second of both, their ratio, and `efficiency`, the ratio divided by N. Each number
+is the median over `PAIRS` pairs with a 95 % interval by order statistics. Compile time is listed
+separately.
 
-With `run.coordinator`, `run.processes` and `run.process` it is started once for each process. The
-first process then trains on its own device in turn with all of them, and prints the line.
+With `run.coordinator`, `run.processes` and `run.process`, start the command once for each process.
+The first process then trains alternately on its own device and on all devices, and prints the line.
 """
 
 import json
@@ -30,13 +31,13 @@ from swarmjax.run import hosts
 from swarmjax.run.settings import TrainConfig, load_train
 
 PAIRS = 10
-OTHER_SUMS = 5  # over devices, of an update beside its minibatches
-CALL_SECONDS = 0.8  # of a call of one device, about
+OTHER_SUMS = 5  # sums over devices per update, other than those of minibatches
+CALL_SECONDS = 0.8  # approximate time per call on one device
 
 
 @dataclass(frozen=True, kw_only=True)
 class DevicesConfig(Section):
-    """What is held fixed when devices are added."""
+    """Settings: what stays fixed when devices are added."""
 
     scaling: Literal["weak", "strong"] = field(
         default="weak", metadata=about("weak: arenas of each device; strong: arenas of all devices")
@@ -44,16 +45,16 @@ class DevicesConfig(Section):
 
 
 def parse(words: Sequence[str]) -> tuple[DevicesConfig, TrainConfig, TrainConfig]:
-    """Makes the settings of the comparison, of one device and of all.
+    """Makes the settings of the comparison, for one device and for all.
 
     Args:
-      words: of the command line.
+      words: words of the command line.
 
     Returns:
-      What is held fixed, the settings of one device, and those of all.
+      The comparison, the settings for one device, and those for all devices.
 
     Raises:
-      ConfigError: if a word is unsound, or there is one device alone.
+      ConfigError: if a word is invalid, or there is only one device.
     """
     given, rest = key_value.parse(DevicesConfig, words)
     every = load_train(["stage=s6", "budget=1e11", *rest])
@@ -66,20 +67,20 @@ def parse(words: Sequence[str]) -> tuple[DevicesConfig, TrainConfig, TrainConfig
 
 
 def result(given: DevicesConfig, one: TrainConfig, every: TrainConfig) -> dict[str, Any] | None:
-    """Compiles both programs and times them in turn.
+    """Compiles both programs and times them alternately.
 
     Args:
-      given: what is held fixed.
-      one: settings of one device.
-      every: settings of all devices.
+      given: the comparison.
+      one: settings for one device.
+      every: settings for all devices.
 
     Returns:
-      The line; None in all processes but the first.
+      The line; None in all processes except the first.
     """
     alone, spread = (Arm(one) if hosts.is_first() else None), Arm(every)
     updates = _updates(alone)
     one_call, other_call = partial(_speed, alone, updates), partial(_speed, spread, updates)
-    _, *pairs = in_turn(one_call, other_call, 1 + PAIRS)  # the first pair is not counted
+    _, *pairs = in_turn(one_call, other_call, 1 + PAIRS)  # the first pair is a warm-up
     if alone is None:
         return None
     return _line(given, alone, spread, updates, pairs)
@@ -88,7 +89,7 @@ def result(given: DevicesConfig, one: TrainConfig, every: TrainConfig) -> dict[s
 def _line(
     given: DevicesConfig, alone: Arm, spread: Arm, updates: int, pairs: list[tuple[float, float]]
 ) -> dict[str, Any]:
-    """Sums the pairs up."""
+    """Summarises the pairs."""
     one, every = alone.settings, spread.settings
     ratio, low, high = median([many / single for single, many in pairs])
     return {
@@ -113,7 +114,7 @@ def _line(
 
 
 def _updates(alone: Arm | None) -> int:
-    """Chooses the updates of a call, the same in all processes."""
+    """Chooses the number of updates per call, the same in all processes."""
     updates = 1
     if alone is not None:
         alone.time(1)
@@ -122,7 +123,7 @@ def _updates(alone: Arm | None) -> int:
 
 
 def _speed(arm: Arm | None, updates: int) -> float:
-    """Arena steps a second of one call; other processes wait for the first one's own arm."""
+    """Times one call in arena steps per second; processes without the arm only wait for it."""
     if hosts.count() > 1:
         multihost_utils.sync_global_devices("before a call")
     if arm is None:

@@ -1,9 +1,9 @@
-"""Do the engine that trains and the judge agree on a policy, level by level?
+"""Do the training engine and the judge agree on a policy, level by level?
 
 `python -m benchmarks.engines policy=FILE [evaluate keys]` runs both on the same levels and prints a
-JSON line for each cell: targets reached by either with their intervals, on how many levels they
-come to the same, and the largest differences. Only the engine differs, not the policy, the levels
-or the length of a physics step.
+JSON line for each cell: the targets reached in each engine with their intervals, the number of
+levels with equal results, and the largest differences. Only the engine differs, not the policy, the
+levels or the length of a physics step.
 """
 
 import json
@@ -22,15 +22,15 @@ from swarmjax.evaluate.evaluation import evaluate
 from swarmjax.evaluate.trials import Trial
 from swarmjax.task.stage_files import load_levels
 
-SAME_TIME = 0.032  # s; arrivals may fall into neighbouring control steps
+SAME_TIME = 0.032  # s; arrivals may fall into adjacent control steps
 
 
 def compare(c: Trial, mjx: Trial) -> dict[str, Any]:
-    """Compares what the engines found on a cell.
+    """Compares the results of the engines on a cell.
 
     Args:
-      c: by the judge.
-      mjx: by the engine that trains.
+      c: the judge's trial.
+      mjx: the training engine's trial.
 
     Returns:
       Plain data for JSON.
@@ -53,10 +53,10 @@ def compare(c: Trial, mjx: Trial) -> dict[str, Any]:
 
 
 def results(words: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Runs both engines; yields a line for each cell."""
+    """Runs both engines; yields one line per cell."""
     settings = load_levels(EvaluateConfig, words)
     if settings.policy is None:
-        raise ConfigError("compare cannot be given: the engines are compared, by policy=FILE.")
+        raise ConfigError("compare cannot be given: only the engines are compared: policy=FILE.")
     found = [evaluate(replace(settings, engine=engine)) for engine in ("c", "mjx")]
     c, mjx = found
     cells = zip(c.result["cells"], mjx.result["cells"], c.trials, mjx.trials, strict=True)

@@ -1,9 +1,9 @@
-"""What the project does when something goes wrong: campaigns of faults, one JSON line a trial.
+"""What does the project do when something goes wrong? Runs campaigns of faults.
 
 `python -m benchmarks.faults campaign=NAME out=FILE [count=N] [seed=S]` tries one fault after the
-other and appends a line for each to `out`. It may be stopped at any time: started again, it goes on
-with the trials that `out` lacks. `campaign=table out=FILE` prints a summary of what `out` holds.
-A line tells its `campaign`, `trial`, `seed`, `commit` and `outcome`, and what the campaign adds.
+other and appends a JSON line for each trial to `out`. It may be stopped at any time. Started again,
+it continues with the trials that `out` lacks. `campaign=table out=FILE` prints a summary of `out`.
+A line has its `campaign`, `trial`, `seed`, `commit` and `outcome`, and the campaign's own entries.
 """
 
 import json
@@ -32,15 +32,15 @@ from swarmjax.config.section import MAX_COUNT
 Trial = Callable[[int, Path], dict[str, Any]]
 TABLE = "table"
 _BEGINNING = b'{"campaign'  # of a line
-_STRIDE = 1_000_000  # trials of a campaign at most: each has a seed of its own
+_STRIDE = 1_000_000  # maximum trials per campaign: each has its own seed
 
 
 class Campaign(NamedTuple):
     """Faults of one kind.
 
     Attributes:
-        trial: tries one: from its seed and an empty folder to what its line says.
-        trials: how many are tried unless a word says otherwise.
+        trial: tries one fault, from a seed and an empty folder; returns the entries of its line.
+        trials: the default number of trials.
     """
 
     trial: Trial
@@ -48,7 +48,7 @@ class Campaign(NamedTuple):
 
 
 CAMPAIGNS: dict[str, Campaign] = {
-    "kills": Campaign(faults_runs.kills, 50),  # of four kills each
+    "kills": Campaign(faults_runs.kills, 50),  # with four kills each
     "terms": Campaign(faults_runs.terms, 50),
     "checkpoints": Campaign(faults_runs.checkpoints, 2000),
     "disk": Campaign(faults_disk.trial, 40),
@@ -61,15 +61,15 @@ CAMPAIGNS: dict[str, Campaign] = {
 
 @dataclass(frozen=True, kw_only=True)
 class FaultsConfig(Section):
-    """Which faults are tried."""
+    """Settings: which faults to try."""
 
     campaign: str = field(metadata=about(f"{', '.join(CAMPAIGNS)}; or table, the summary of out"))
-    out: str = field(metadata=about("file of the lines; those that it has are not tried again"))
+    out: str = field(metadata=about("file of the lines; its trials are not tried again"))
     count: int | None = field(
-        default=None, metadata=about("trials; null: as many as the campaign asks for", 1, _STRIDE)
+        default=None, metadata=about("number of trials; null: the campaign's default", 1, _STRIDE)
     )
     seed: int = field(
-        default=0, metadata=about("of the faults; another one tries others", 0, MAX_COUNT)
+        default=0, metadata=about("seed of the faults; each seed tries other faults", 0, MAX_COUNT)
     )
 
     def _check(self) -> None:
@@ -82,16 +82,16 @@ def parse(words: Sequence[str]) -> FaultsConfig:
     """Makes the settings from `key=value` words.
 
     Args:
-        words: of the command line.
+        words: words of the command line.
 
     Raises:
-        ConfigError: a word is unsound.
+        ConfigError: a word is invalid.
     """
     return key_value.load(FaultsConfig, words)
 
 
 def read(out: Path) -> list[dict[str, Any]]:
-    """Reads the lines of a file; the last one may be torn, and is then left out.
+    """Reads the lines of a file, and skips an incomplete last line.
 
     Args:
         out: the file; it need not exist.
@@ -108,15 +108,15 @@ def read(out: Path) -> list[dict[str, Any]]:
         try:
             found.append(dict(json.loads(line)))
         except (ValueError, TypeError):
-            raise ConfigError(f"{out} in line {number} is no line of a campaign.") from None
+            raise ConfigError(f"{out} in line {number} is not a line of a campaign.") from None
     return found
 
 
 def run(settings: FaultsConfig) -> Iterator[dict[str, Any]]:
-    """Tries the faults that the file lacks, and yields a line each once it is written.
+    """Tries the faults that the file lacks, and yields each line once it is written.
 
     Args:
-        settings: of the campaign.
+        settings: the campaign's settings.
     """
     out, campaign = Path(settings.out), CAMPAIGNS[settings.campaign]
     asked = (settings.campaign, settings.seed)
@@ -136,7 +136,7 @@ def run(settings: FaultsConfig) -> Iterator[dict[str, Any]]:
 
 
 def _drop_torn(out: Path) -> None:
-    """Cuts off a last line that a stop left half written."""
+    """Cuts off a last line that was only partly written."""
     out.parent.mkdir(parents=True, exist_ok=True)
     if not out.exists():
         return
@@ -148,10 +148,10 @@ def _drop_torn(out: Path) -> None:
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Sums lines up: for each campaign the outcomes, and the largest of each number.
+    """Summarises lines: for each campaign the outcomes, and the maximum of each number.
 
     Args:
-        rows: of the file.
+        rows: the lines of the file.
 
     Returns:
         A table in Markdown.
@@ -169,7 +169,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _most(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Names the largest value of each number that rows have."""
+    """Writes the largest value of each number in the rows."""
     found: dict[str, float] = {}
     for row in rows:
         for key, value in row.items():

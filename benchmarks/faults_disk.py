@@ -1,12 +1,12 @@
 """Campaign of `benchmarks.faults` against the disk, the directory and the clock of a run.
 
-The first `SIZES` trials give a run a disk that is too small, each of another size, up to one that
-just holds it. The rest take turns: a disk that becomes read-only, a directory that is removed, two
-processes on one directory, and a clock that is set back. Afterwards the run is started once more
-where nothing hinders it, and must end as an undisturbed run does.
+The first `SIZES` trials give a run a disk that is too small, with sizes up to one that just holds
+the run. The other trials alternate between four faults: a disk that becomes read-only, a directory
+that is removed, two processes on one directory, and a clock that is set back. Afterwards the run is
+started once more without a fault, and must end like an undisturbed run.
 
-Disks are mounted in a namespace of their own (`unshare`, util-linux); the clock is that of
-`libfaketime`. A trial that lacks either says `not tried`.
+Disks are mounted in their own namespace (`unshare`, util-linux). The clock is set by `libfaketime`.
+If either is missing, the outcome of the trial is `not tried`.
 """
 
 import contextlib
@@ -27,21 +27,21 @@ from swarmjax.run import directory
 
 SIZES = 20
 PAGE = 4096  # bytes; a tmpfs has whole pages
-MOST_SECONDS = 120.0  # a run that takes longer hangs
+MOST_SECONDS = 120.0  # a run that takes longer counts as hanging
 _LIBRARY = "/usr/lib/*/faketime/libfaketime.so.1"  # Debian's package `libfaketime`
 
 
 def trial(seed: int, folder: Path) -> dict[str, Any]:
-    """Hinders a run, then lets it end.
+    """Disturbs a run, then lets it end.
 
     Args:
-        seed: Of the trial; its number chooses the hindrance.
-        folder: Of the trial, empty.
+        seed: Seed of the trial; its number chooses the fault.
+        folder: Empty folder of the trial.
 
     Returns:
-        The kind of hindrance, what the run ended with, and what came of it.
+        The kind of fault, how the run ended, and the outcome.
     """
-    undisturbed()  # before a run starts: it takes as long as one
+    undisturbed()  # before the disturbed run starts, since it takes as long as a run
     number, random = seed % 1_000_000, np.random.default_rng(seed)
     if number < SIZES:
         return _judge("full disk", _full(number, folder), folder / "run")
@@ -50,7 +50,7 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
 
 
 def _judge(kind: str, told: dict[str, Any], run: Path) -> dict[str, Any]:
-    """Lets the run end and says whether anything was lost."""
+    """Lets the run end and tells whether anything was lost."""
     if "missing" in told:
         return {"outcome": "not tried", "kind": kind, **told}
     process = start(run)
@@ -62,12 +62,12 @@ def _judge(kind: str, told: dict[str, Any], run: Path) -> dict[str, Any]:
 
 
 def _hindered(words: list[str], allowed: set[int], **given: Any) -> dict[str, Any]:
-    """Runs a command that may fail, with one sentence.
+    """Runs a command that may fail, but only with one sentence.
 
     Args:
         words: The command.
-        allowed: Exit codes that it may have.
-        given: For `subprocess.run`.
+        allowed: Allowed exit codes.
+        given: Arguments for `subprocess.run`.
     """
     began = time.perf_counter()
     try:
@@ -89,7 +89,7 @@ def _hindered(words: list[str], allowed: set[int], **given: Any) -> dict[str, An
 
 @functools.cache
 def _needed() -> int:
-    """Bytes of disk that an undisturbed run needs at its end."""
+    """Returns the bytes of disk that an undisturbed run needs at its end."""
     with tempfile.TemporaryDirectory() as folder:
         start(Path(folder) / "run").communicate()
         files = [path for path in Path(folder).rglob("*") if path.is_file()]
@@ -97,13 +97,13 @@ def _needed() -> int:
 
 
 def _on_a_disk(folder: Path, size: int, options: str, run: Path | None = None) -> dict[str, Any]:
-    """Trains on a disk of its own, and brings what it holds back to `folder`/run.
+    """Trains on a separate disk, and copies the run back to `folder`/run.
 
     Args:
-        folder: Of the trial.
-        size: Of the disk, bytes.
-        options: Of the mount, once `run` lies there.
-        run: A run that lies on the disk already.
+        folder: Folder of the trial.
+        size: Size of the disk, bytes.
+        options: Options of the mount once `run` has been copied to the disk.
+        run: A run that the disk already holds.
     """
     if shutil.which("unshare") is None:
         return {"missing": "unshare"}
@@ -127,7 +127,7 @@ def _full(number: int, folder: Path) -> dict[str, Any]:
 
 
 def _read_only(random: np.random.Generator, folder: Path) -> dict[str, Any]:
-    """Goes on with a run on a disk that is read-only by then."""
+    """Resumes a run on a disk that has become read-only."""
     run = folder / "run"
     _begin(run, random)
     return _on_a_disk(folder, 8 * _needed(), "ro", run if run.exists() else None)
@@ -151,7 +151,7 @@ def _removed(random: np.random.Generator, folder: Path) -> dict[str, Any]:
     gone = subprocess.Popen(["sh", "-c", remove])
     told = _hindered(train_command(run), {0, 1})
     gone.wait()
-    shutil.rmtree(run, ignore_errors=True)  # what was written after
+    shutil.rmtree(run, ignore_errors=True)  # files written after the removal
     return told
 
 
@@ -162,13 +162,13 @@ def _two(random: np.random.Generator, folder: Path) -> dict[str, Any]:
     time.sleep(random.uniform(0.0, 0.8) * undisturbed().ends_s)
     told = _hindered(train_command(run), {0, 2})
     first.communicate()
-    # One of them trains and the other is refused; one that comes late finds nothing left to do.
+    # One process trains and the other is refused; a late one finds nothing left to do.
     codes = {first.returncode, told["code"]}
     return told | {"answered": told["answered"] and 0 in codes and codes <= {0, 2}}
 
 
 def _clock(random: np.random.Generator, folder: Path) -> dict[str, Any]:
-    """Goes on with a run a day before it began."""
+    """Resumes a run with the clock a day before the run began."""
     library = next(iter(Path("/").glob(_LIBRARY[1:])), None)
     if library is None:
         return {"missing": "libfaketime"}

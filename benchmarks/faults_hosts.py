@@ -1,8 +1,8 @@
 """Campaign of `benchmarks.faults` against runs of two processes: one of them is killed.
 
-A trial starts two processes with a device each, kills one of them at a random moment, and looks how
-the other ends. The run then goes on with one device, or with two, to its end. On a machine with
-GPUs the processes take one each; elsewhere they are CPU processes over gloo.
+A trial starts two processes with one device each, kills one of them at a random moment, and checks
+how the other one ends. The run is then resumed with one device, or with two, to its end. On a
+machine with GPUs each process uses one GPU. Elsewhere they are CPU processes over gloo.
 """
 
 import contextlib
@@ -33,8 +33,8 @@ WORDS = (
     "run.checkpoint_share=0.1",
     "resume=auto",
 )
-SECONDS = 4.0  # within which one is killed, from the first metrics on
-MOST_SECONDS = 30.0  # until the other has ended
+SECONDS = 4.0  # one process is killed within this time after the first metrics
+MOST_SECONDS = 30.0  # the other process must end within this time
 _TIMEOUT = 400.0  # s
 _POLL = 0.02  # s
 
@@ -43,11 +43,11 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
     """Kills one of two processes; then lets the run end, on one device or on two.
 
     Args:
-      seed: of the moment, of who is killed and of how the run goes on.
-      folder: an empty one.
+      seed: seed for the moment, for the process that is killed and for how the run is resumed.
+      folder: an empty folder.
 
     Returns:
-      The fields of the line.
+      The entries of the line.
     """
     random, run = np.random.default_rng(seed), folder / "run"
     victim, devices = int(random.integers(2)), 1 + seed % 2
@@ -71,13 +71,13 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
 
 
 class Lost(NamedTuple):
-    """How a process ended whose peer was killed.
+    """How a process ended after its peer was killed.
 
     Attributes:
-      updates: that the run had done.
-      code: the exit code.
-      said: on standard error.
-      seconds: from the kill to its end.
+      updates: updates that the run had done.
+      code: exit code.
+      said: text on standard error.
+      seconds: seconds from the kill to the end.
     """
 
     updates: int
@@ -87,18 +87,18 @@ class Lost(NamedTuple):
 
     @property
     def is_sound(self) -> bool:
-        """Whether it ended in time, without a traceback, with the code that asks for a restart."""
+        """Whether it ended in time, without a traceback, with the exit code for a restart."""
         soon, short = self.seconds < MOST_SECONDS, "Traceback" not in self.said
         return self.code == REQUEUE and soon and short and self.updates > 0
 
 
 def _lose_one(run: Path, victim: int, after: float) -> Lost:
-    """Starts two processes, and kills one some seconds after the first metrics."""
+    """Starts two processes, and kills one of them `after` seconds after the first metrics."""
     both = _start(run, 2)
     try:
         _wait_for_metrics(run, both)
         time.sleep(after)
-        # The parent of a process says how its child ended, so the child is killed.
+        # Kills the child, since its parent reports how the child ended.
         _kill_child(both[victim])
         updates, began = _updates(run), time.monotonic()
         _, said = both[1 - victim].communicate(timeout=_TIMEOUT)
@@ -120,7 +120,7 @@ def gpus() -> int:
 
 
 def _start(run: Path, devices: int) -> list[subprocess.Popen[str]]:
-    """Starts or goes on with a run, in a process for each device."""
+    """Starts or resumes a run, with one process per device."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         coordinator = f"127.0.0.1:{free.getsockname()[1]}"
@@ -143,7 +143,7 @@ def _start(run: Path, devices: int) -> list[subprocess.Popen[str]]:
 
 
 def _own_device(process: int) -> dict[str, str]:
-    """Returns the variables that give a process one device."""
+    """Returns the environment variables that give a process one device."""
     if gpus():
         # Several trials may share a machine.
         return {"CUDA_VISIBLE_DEVICES": str(process), "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
@@ -171,13 +171,13 @@ def _rows(run: Path) -> Iterator[dict[str, Any]]:
 
 
 def _updates(run: Path) -> int:
-    """Counts the updates that the metrics hold, once each and in order; -1 if they do not."""
+    """Counts the updates in the metrics; -1 if one is missing, repeated or out of order."""
     found = [row["update"] for row in _rows(run)]
     return len(found) if found == list(range(len(found))) else -1
 
 
 def _success(run: Path) -> float | None:
-    """Reads the share of targets that the run ended with."""
+    """Reads the share of targets at the end of the run."""
     with contextlib.suppress(OSError, ValueError, KeyError):
         summary = json.loads((run / directory.SUMMARY).read_text())
         return next(iter(summary["targets_reached"][0].values()))

@@ -1,9 +1,9 @@
-"""Fuzzed command lines, YAML files, runs and policies, over all commands.
+"""Fuzzes command lines, YAML files, runs and policies, over all commands.
 
-Sound words and files are mutated. Nine of ten trials go, in this process, as far as a command goes
-before it works: settings made, files read. The tenth is a process of its own that does next to
-nothing if it is let. Each either runs or is refused in one sentence, with code 2, within ten
-seconds; memory and time are limited.
+A trial mutates valid words and files. Nine of ten trials run inside this process and only do what a
+command does before its work: they make settings and read files. The tenth trial is a separate
+process with very little work. Each trial must either run, or be refused in one sentence with exit
+code 2 within ten seconds. Memory and time are limited.
 """
 
 import contextlib
@@ -38,19 +38,19 @@ from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
 from swarmjax.run.settings import TrainConfig, load_run, load_train
 from swarmjax.suite import SuiteConfig
 
-# Until a refusal, of the processor: the machine may have other work, which a clock would count.
+# Processor time until a refusal; a clock would also count other work of the machine.
 MOST_SECONDS = 10.0
-_MOST_WAITING = 60.0  # s of the clock, after which something hangs
-_MOST_MEMORY = 2**31  # bytes that a trial may take beside what this process has
-_PROCESS_MEMORY = 2**34  # bytes of addresses; JAX reserves more than it uses
-_PROCESS_SECONDS = 180.0  # of one that runs, on a machine that others use too
-_EVERY = 10  # trials, of which one is a process
+_MOST_WAITING = 60.0  # s by the clock; a trial that takes longer hangs
+_MOST_MEMORY = 2**31  # bytes that a trial may take in addition to this process
+_PROCESS_MEMORY = 2**34  # bytes of address space; JAX reserves more than it uses
+_PROCESS_SECONDS = 180.0  # for a process that runs, on a machine with other work
+_EVERY = 10  # one of this many trials is a process
 _ROOT = Path(__file__).resolve().parents[1]
 _PYTHONPATH = os.pathsep.join([str(_ROOT), os.environ.get("PYTHONPATH", "")])
 Words = Sequence[str]
 
 
-# As far as a command goes before it works
+# What a command does before its work
 
 
 def _train(words: Words) -> None:
@@ -103,7 +103,7 @@ LOADERS: dict[str, tuple[Callable[[Words], None], type[Section]]] = {
     "suite": (_suite, SuiteConfig),
     "reproduce": (_reproduce, ReproduceConfig),
 }
-# What a sound command line is mutated from; the files are those of `_write_files`.
+# Valid command lines to mutate; `_write_files` writes their files.
 _SOUND: dict[str, list[str]] = {
     "train": ["stage=mine.yaml", "stage=s6 robot=wheeled", "init_from=run", "resume=run", ""],
     "evaluate": [
@@ -117,7 +117,7 @@ _SOUND: dict[str, list[str]] = {
     "suite": ["suite=suite.yaml", "suite=dev", "suite=suite.yaml write=true"],
     "reproduce": ["seeds=3 budget=6000 fine_tune=6000", "arms=[baseline] minutes=1", "resume=run"],
 }
-# So that a process that is let run does next to nothing; the last word for a key counts.
+# Appended so that a process that runs has very little work; the last word for a key counts.
 _TINY: dict[str, list[str]] = {
     "train": ["run.dry=true", "arenas=8", "algo.rollout_length=2", "task.step_limit=4"],
     "evaluate": ["episodes=1", "steps=2", "workers=1"],
@@ -156,7 +156,7 @@ _NASTY = [
 
 
 def _write_files(draw: random.Random) -> None:
-    """Writes the files that words name into the working folder, and spoils one of them."""
+    """Writes the files named in words into the working folder, and damages one of them."""
     faults_policies.write_sound(Path("policy.npz"), draw)
     faults_policies.write_sound(Path("b.npz"), draw)
     Path("mine.yaml").write_text(_STAGE)
@@ -173,7 +173,7 @@ def _write_files(draw: random.Random) -> None:
 
 
 def _write_run(run: Path) -> None:
-    """Writes the directory of a run that never saved anything."""
+    """Writes the directory of a run without checkpoints."""
     run.mkdir()
     config = to_dict(load_train(["stage=s1", "budget=1e6"]))
     (run / "config.json").write_text(json.dumps(config))
@@ -198,7 +198,7 @@ def _spoil(name: str, draw: random.Random) -> None:
 
 
 def _mutate_text(text: str, draw: random.Random) -> str:
-    """Changes YAML or JSON: a letter, a line, a value, or all of it."""
+    """Changes YAML or JSON: a letter, a line, a value, or the whole text."""
     lines = text.splitlines(keepends=True) or [""]
     at, line = draw.randrange(len(text) + 1), draw.randrange(len(lines))
     bomb = "".join(f"a{i}: &a{i} [{','.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 20))
@@ -221,7 +221,7 @@ def _mutate_text(text: str, draw: random.Random) -> str:
 
 
 def _other_value(text: str, draw: random.Random) -> str:
-    """Puts a nasty value in the place of a number or word of a file."""
+    """Replaces a number or word of a file with a nasty value."""
     found = [*re.finditer(r"(?<=: )[\w.\"-]+", text)]
     if not found:
         return text
@@ -230,7 +230,7 @@ def _other_value(text: str, draw: random.Random) -> str:
 
 
 def _mutate_words(words: list[str], cls: type[Section], draw: random.Random) -> list[str]:
-    """Adds a word with a nasty value, or damages one that is there."""
+    """Adds a word with a nasty value, or damages an existing one."""
     keys = [*section.keys(cls), *files.defaults(cls.command)]
     at = draw.randrange(len(words)) if words else 0
     nasty, key = draw.choice(_NASTY), draw.choice(keys)
@@ -253,23 +253,23 @@ def _mutate_words(words: list[str], cls: type[Section], draw: random.Random) -> 
 
 
 def _command_line(name: str, draw: random.Random) -> list[str]:
-    """Makes the words of a command, some of them sound."""
+    """Makes the words of a command; some of them are valid."""
     words = draw.choice(_SOUND[name]).split()
     for _ in range(draw.choice((0, 1, 1, 2, 4))):
         words = _mutate_words(words, LOADERS[name][1], draw)
     return words
 
 
-# What comes of it
+# Outcomes
 
 
 class _Hang(BaseException):
-    """More time has passed than a refusal may take."""
+    """A refusal takes too long."""
 
 
 @contextlib.contextmanager
 def _limited(folder: Path) -> Iterator[None]:
-    """Works in a folder, for some seconds and with some memory, and puts everything back."""
+    """Changes to a folder and limits time and memory; restores everything afterwards."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         raise _Hang
@@ -290,7 +290,7 @@ def _limited(folder: Path) -> Iterator[None]:
 
 
 def _in_process(name: str, words: list[str], folder: Path) -> tuple[str, str]:
-    """Makes the settings of a command; returns the outcome and what was said."""
+    """Makes the settings of a command; returns the outcome and the message."""
     try:
         with _limited(folder):
             LOADERS[name][0](words)
@@ -302,14 +302,14 @@ def _in_process(name: str, words: list[str], folder: Path) -> tuple[str, str]:
         return "HANG", ""
     except MemoryError:
         return "TOO MUCH MEMORY", ""
-    except OSError as error:  # which `command.run` puts in a sentence if it is of a file
+    except OSError as error:  # `command.run` makes a sentence of it if it names a file
         return ("refused" if error.filename is not None else "TRACEBACK"), repr(error)
     except Exception as error:
         return "TRACEBACK", repr(error)
 
 
 def _process(name: str, words: list[str], folder: Path) -> tuple[str, str]:
-    """Runs a command; returns the outcome and what it said."""
+    """Runs a command; returns the outcome and its message."""
     typed = [_kept_in(word) for word in words]
     try:
         done = subprocess.run(
@@ -336,13 +336,13 @@ def _process(name: str, words: list[str], folder: Path) -> tuple[str, str]:
 
 
 def _spent() -> float:
-    """Says how long this process and those that it waited for have kept a processor."""
+    """Returns the processor time of this process and of its finished children."""
     both = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return sum(each.ru_utime + each.ru_stime for each in both)
 
 
 def _kept_in(word: str) -> str:
-    """Keeps a command from writing outside its folder, and takes out what no process is given."""
+    """Keeps a word from writing outside the folder, and removes characters no process can get."""
     key, equals, value = word.partition("=")
     if value.strip("'\"").startswith(("/", "..")):
         value = "elsewhere"
@@ -354,14 +354,14 @@ def _limit_memory() -> None:
 
 
 def trial(seed: int, folder: Path) -> dict[str, Any]:
-    """Has a command read mutated words and files.
+    """Lets a command read mutated words and files.
 
     Args:
-        seed: of the mutations.
-        folder: for the files.
+        seed: seed of the mutations.
+        folder: folder for the files.
 
     Returns:
-        What its line says.
+        The entries of the line.
     """
     draw = random.Random(seed)
     name = draw.choice(sorted(LOADERS))

@@ -1,9 +1,9 @@
-"""Campaign of `benchmarks.faults`: numbers that are not finite, put into training between calls.
+"""Campaign of `benchmarks.faults` that puts NaN or infinity into training between calls.
 
-A trial trains small, puts NaN or an infinity somewhere before a random update, and trains on. The
-outcome is one of three. Training `went on`. No step was taken any more, so that the run `goes back`
-to its checkpoint. Or it is `WRONG`: a number that is not finite was learned, or an arena changed
-that was not touched.
+A trial trains a small run, puts NaN or an infinity somewhere before a random update, and continues
+training. There are three outcomes. `went on`: training continued. `goes back`: no more steps were
+taken, so the run returns to its checkpoint. `WRONG`: a non-finite number was learned, or an arena
+changed that was not touched.
 """
 
 import functools
@@ -27,11 +27,11 @@ from swarmjax.training.loop import TrainState
 STAGES = ("s1", "s3")
 ARENAS, ROLLOUT, UPDATES = 64, 32, 100
 LAST = 20  # updates over which success is measured
-SEEDS = 4  # of the undisturbed runs, of which each has its trials
+SEEDS = 4  # seeds of the undisturbed runs; the trials are spread over them
 SHARES = (0.01, 0.1, 1.0)  # of the arenas, or of a network's numbers
 VALUES = {"nan": np.nan, "inf": np.inf, "-inf": -np.inf}
-HUGE = 1e30  # m; a reward of it is a number, but its gradient is none
-# What is spoilt in a part of the arenas; a gradient by a reward whose square is infinite.
+HUGE = 1e30  # m; the reward stays finite, but its gradient does not
+# Targets of a fault in some arenas; `gradient` is spoilt by a reward whose square is infinite.
 IN_ARENAS = ("qpos", "qvel", "observation", "distance", "return", "gradient")
 IN_LEARNERS = ("params", "optimizer_state")
 KINDS = (*IN_ARENAS, *IN_LEARNERS)
@@ -41,7 +41,7 @@ class Stand(NamedTuple):
     """A program, compiled once for all trials of a process.
 
     Attributes:
-        train: (state, n) -> (state, metrics) of n updates; the state is kept.
+        train: (state, n) -> (state, metrics) of n updates; it does not change the given state.
         start: seed -> the first state.
     """
 
@@ -68,20 +68,20 @@ def stand(stage: str) -> Stand:
 def _train(
     call: Callable[..., Any], schedule: Schedule, state: TrainState, n: int
 ) -> tuple[TrainState, dict[str, np.ndarray]]:
-    """Trains for n updates; metrics [n]."""
+    """Trains for n updates; returns the state and metrics [n]."""
     state, metrics = call(schedule, state, np.int32(n))
     return state, {name: np.asarray(x)[0, :n] for name, x in metrics.items()}
 
 
 @functools.cache
 def undisturbed(stage: str, seed: int) -> float:
-    """Share of targets reached at the end of an undisturbed run."""
+    """Returns the share of targets reached at the end of an undisturbed run."""
     there = stand(stage)
     return success(there.train(there.start(seed), UPDATES)[1])
 
 
 def success(metrics: dict[str, np.ndarray]) -> float:
-    """Share of targets reached over the last updates."""
+    """Returns the share of targets reached over the last updates."""
     return float(metrics["reached"][-LAST:].sum() / metrics["targets"][-LAST:].sum())
 
 
@@ -89,8 +89,8 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
     """Spoils one run.
 
     Args:
-      seed: Of the trial.
-      folder: Of the trial; nothing is written.
+      seed: Seed of the trial.
+      folder: Folder of the trial; nothing is written.
 
     Returns:
       What was spoilt, the outcome, and the share of targets at the end.
@@ -130,7 +130,7 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
 
 
 def spoil_arenas(state: TrainState, kind: str, value: float, touched: np.ndarray) -> TrainState:
-    """Puts a value into the first robot of the arenas that are touched [A]."""
+    """Puts a value into the first robot of the touched arenas [A]."""
     arenas = state.arenas
 
     def put(x: jax.Array, column: int = 0) -> jax.Array:
@@ -152,7 +152,7 @@ def spoil_arenas(state: TrainState, kind: str, value: float, touched: np.ndarray
 def spoil_learner(
     state: TrainState, kind: str, value: float, share: float, random: np.random.Generator
 ) -> TrainState:
-    """Puts a value into a share of the numbers of one array of the learner."""
+    """Puts a value into a share of the numbers in one array of the learner."""
     leaves, structure = jax.tree.flatten(getattr(state.learners, kind))
     arrays = [i for i, leaf in enumerate(leaves) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     index = int(random.choice(arrays))
@@ -164,7 +164,7 @@ def spoil_learner(
 
 
 def are_equal(one: Any, other: Any, where: np.ndarray) -> bool:
-    """Whether some arenas [A] of two states are the same to the last bit."""
+    """Tells whether two states are bitwise equal in some arenas [A]."""
     pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
     return all(np.array_equal(np.asarray(a)[0, where], np.asarray(b)[0, where]) for a, b in pairs)
 
@@ -172,17 +172,17 @@ def are_equal(one: Any, other: Any, where: np.ndarray) -> bool:
 def judge(
     spoilt: TrainState, last: TrainState, metrics: dict[str, np.ndarray], *, alike: bool
 ) -> str:
-    """Says what came of a trial.
+    """Determines the outcome of a trial.
 
     Args:
-      spoilt: The state with what was put in.
-      last: At the end of the run.
-      metrics: Of all updates since, [U].
-      alike: Whether the arenas that were not touched are those of an undisturbed run.
+      spoilt: The state with the fault.
+      last: The state at the end of the run.
+      metrics: [U] metrics of all updates since the fault.
+      alike: Whether the untouched arenas are equal to those of an undisturbed run.
     """
     if not alike:
         return "WRONG"
-    # A run goes back to its checkpoint after so many updates that taught nothing (`trainer`).
+    # A run returns to its checkpoint after `PATIENCE` updates without learning (`trainer`).
     barren = np.isnan(metrics["policy_loss"]) | (metrics["broken_arenas"] >= ARENAS * ROLLOUT)
     if barren[-trainer.PATIENCE :].all():
         held, kept = spoilt.learners.params, last.learners.params

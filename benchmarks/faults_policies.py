@@ -1,8 +1,8 @@
-"""Damaged policy files, through both readers: what each says, and what it takes.
+"""Damages policy files and lets both readers read them: what does each accept, and at what cost?
 
-A file that a reader takes is read by NumPy as well, and its digest worked out by another function:
-if it is not the one that the file names, the outcome is WRONG. Memory is what Python and NumPy
-allocate at most while a reader is at work, beside what there was.
+NumPy also reads each accepted file, and a separate function computes the file's digest. If this is
+not the digest in the file, the outcome is WRONG. Memory is the peak that Python and NumPy allocate
+while a reader works.
 """
 
 import hashlib
@@ -24,8 +24,8 @@ from swarmjax.policy import PolicyError
 from swarmjax.task import observation
 
 MOST_SECONDS = 1.0
-MOST_TIMES = 4  # the file's size, of memory
-LEAST_LIMIT = 2**24  # bytes of memory that are never too much
+MOST_TIMES = 4  # limit of memory, in sizes of the file
+LEAST_LIMIT = 2**24  # bytes; this much memory is always allowed
 Readers = dict[str, Callable[[Path], Any]]
 READERS: Readers = {"load": policy.load, "read": policy_file.read}
 _SIZES = ((64, 64), (8,), (700, 500))
@@ -36,8 +36,8 @@ def write_sound(path: Path, draw: random.Random) -> None:
     """Writes a policy, shared or independent, small or of a megabyte.
 
     Args:
-        path: of the file.
-        draw: of its size and numbers.
+        path: path of the file.
+        draw: random source for its size and numbers.
     """
     learners, hidden = draw.choice((1, 1, 5)), draw.choice(_SIZES)
     numbers = np.random.default_rng(draw.randrange(2**32))
@@ -55,10 +55,10 @@ def write_sound(path: Path, draw: random.Random) -> None:
 
 
 def meta(learners: int) -> dict[str, Any]:
-    """Says what a policy of so many learners is.
+    """Returns the metadata of a policy.
 
     Args:
-        learners: one of a shared policy.
+        learners: number of learners; 1 for a shared policy.
     """
     return {
         "policy": "shared" if learners == 1 else "independent",
@@ -88,7 +88,7 @@ def meta(learners: int) -> dict[str, Any]:
     }
 
 
-# Damage: from the content of a file to that of another
+# Damage: from the content of a file to a damaged content
 
 
 def _flip(content: bytes, draw: random.Random) -> bytes:
@@ -142,11 +142,11 @@ def _double(content: bytes, draw: random.Random) -> bytes:
 
 
 def npy(dtype: str, shape: str) -> bytes:
-    """Writes the header of an array that is not there.
+    """Writes the header of an array without its data.
 
     Args:
-        dtype: as NumPy writes it.
-        shape: likewise, without brackets.
+        dtype: type of the numbers, as NumPy writes it.
+        shape: shape, as NumPy writes it, without brackets.
     """
     head = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': ({shape}), }}".ljust(117) + "\n"
     return b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head.encode()
@@ -161,13 +161,13 @@ def _forge_header(content: bytes, draw: random.Random) -> bytes:
 
 
 def _bomb(content: bytes, draw: random.Random) -> bytes:
-    """Adds up to 256 MB of zeros, packed, or says of a member that it were as large."""
+    """Adds up to 256 MB of compressed zeros, or claims that a member is this large."""
     size = draw.choice((2**20, 2**24, 2**28))
     if draw.random() < 0.5:
         data = npy("<f4", f"{size // 4},") + bytes(size)
         return _pack([*_members(content).items(), (_BIAS, data)], zipfile.ZIP_DEFLATED)
     found, entry = bytearray(content), content.index(b"PK\x01\x02")
-    for at in draw.choice(((24,), (20, 24))):  # the sizes that the list of members tells
+    for at in draw.choice(((24,), (20, 24))):  # the sizes in the list of members
         found[entry + at : entry + at + 4] = size.to_bytes(4, "little")
     return bytes(found)
 
@@ -185,7 +185,7 @@ def _encrypt(content: bytes, draw: random.Random) -> bytes:
 
 
 def _say(content: bytes, draw: random.Random) -> bytes:
-    """Lets the file say something else of itself, under a digest that is sound, or is not."""
+    """Changes the file's metadata, with a correct or an incorrect digest."""
     arrays = _arrays(content)
     said = json.loads(str(arrays["meta"]))
     key = draw.choice(sorted(said))
@@ -213,7 +213,7 @@ def _foreign_digest(content: bytes, draw: random.Random) -> bytes:
 
 
 def _other_array(content: bytes, draw: random.Random) -> bytes:
-    """Puts another array in the place of one, under a sound digest."""
+    """Replaces an array with another one, with a correct digest."""
     arrays = _arrays(content)
     name = draw.choice(sorted(arrays.keys() - {"digest", "meta"}))
     array = arrays[name]
@@ -257,11 +257,11 @@ DAMAGE: dict[str, Callable[[bytes, random.Random], bytes]] = {
 }
 
 
-# What comes of it
+# Outcomes
 
 
 def _digest(arrays: dict[str, np.ndarray]) -> str:
-    """Works the digest out in the way that docs/policy-format.md says, and no other."""
+    """Computes the digest exactly as docs/policy-format.md describes."""
     found = b""
     for name in sorted(arrays):
         array = arrays[name]
@@ -270,7 +270,7 @@ def _digest(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _is_right(path: Path) -> bool:
-    """Tells whether the digest in a file is that of its arrays, as NumPy reads them."""
+    """Tells whether the digest in a file matches its arrays, as NumPy reads them."""
     arrays = _arrays(path.read_bytes())
     return str(arrays.pop("digest")) == _digest(arrays)
 
@@ -279,13 +279,13 @@ def is_sentence(text: str) -> bool:
     """Tells whether a refusal is one line that a terminal can show.
 
     Args:
-        text: of the refusal.
+        text: text of the refusal.
     """
     return "\n" not in text and text.isprintable() and text[-1:] in (".", "?") and len(text) < 900
 
 
 class _Tried(NamedTuple):
-    """What came of reading a file: what was said, the seconds, and the bytes of memory."""
+    """The result of reading a file: the message, the seconds, and the bytes of memory."""
 
     outcome: str
     said: str
@@ -318,11 +318,11 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
     """Damages a policy file in one way and has both readers read it.
 
     Args:
-        seed: of the damage.
-        folder: for the file.
+        seed: seed of the damage.
+        folder: folder for the file.
 
     Returns:
-        What its line says: `accepted` if either reader took it.
+        The entries of the line; the outcome is `accepted` if either reader accepted the file.
     """
     draw, path = random.Random(seed), folder / "policy.npz"
     write_sound(path, draw)

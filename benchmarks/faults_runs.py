@@ -1,8 +1,8 @@
 """Campaigns of `benchmarks.faults` against whole runs: kills, signals, and damaged checkpoints.
 
-Every trial is a function of its seed and of an empty folder, and returns the fields of its line.
-Runs are small (nine hundred updates of four arenas, a checkpoint after each tenth of the budget)
-and are compared with an undisturbed run.
+Every trial is a function of its seed and an empty folder, and returns the entries of its line. Runs
+are small: nine hundred updates of four arenas, with a checkpoint after each tenth of the budget.
+They are compared with an undisturbed run.
 """
 
 import contextlib
@@ -39,17 +39,17 @@ WORDS = (
     "resume=auto",
 )
 INTERVAL = UPDATES // 10  # updates between two checkpoints
-KILLS = 4  # of a run, before it may end
+KILLS = 4  # per run, before it may end
 _POLL = 0.002  # s
 
 
 def train_command(run: Path) -> list[str]:
-    """Returns the words that start or go on with a run."""
+    """Returns the words that start or resume a run."""
     return [sys.executable, "-m", "swarmjax.train", *WORDS, f"run.dir={run}"]
 
 
 def start(run: Path) -> subprocess.Popen[str]:
-    """Starts or goes on with a run, in a process of its own."""
+    """Starts or resumes a run in its own process."""
     return subprocess.Popen(
         train_command(run), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
@@ -59,9 +59,9 @@ class Undisturbed(NamedTuple):
     """An undisturbed run.
 
     Attributes:
-        digest: Of its last state.
-        begins_s: Seconds from its start until it logs its first update.
-        ends_s: Seconds from its start until its process ends.
+        digest: Digest of the last state.
+        begins_s: Seconds from the start until the run logs its first update.
+        ends_s: Seconds from the start until the process ends.
     """
 
     digest: str
@@ -71,7 +71,7 @@ class Undisturbed(NamedTuple):
 
 @functools.cache
 def undisturbed() -> Undisturbed:
-    """Trains without a disturbance, on this machine and beside its other work."""
+    """Trains without a disturbance, on this machine and next to its other work."""
     with tempfile.TemporaryDirectory() as folder:
         run, began = Path(folder) / "run", time.monotonic()
         process = start(run)
@@ -84,7 +84,7 @@ def undisturbed() -> Undisturbed:
 
 
 def _wait_for_updates(process: subprocess.Popen[str], run: Path) -> None:
-    """Waits until a run logs an update, or has ended. A run that goes on first cuts its log."""
+    """Waits until a run logs an update or ends. A resumed run first cuts its log."""
     before = now = _size(run / directory.METRICS)
     while process.poll() is None and now <= before:
         time.sleep(_POLL)
@@ -92,17 +92,17 @@ def _wait_for_updates(process: subprocess.Popen[str], run: Path) -> None:
 
 
 def _size(file: Path) -> int:
-    """Bytes of a file; 0 if there is none."""
+    """Returns the size of a file in bytes; 0 if there is none."""
     return file.stat().st_size if file.exists() else 0
 
 
 def newest(run: Path) -> int:
-    """Update of the newest checkpoint that is whole; 0 without one."""
+    """Returns the update of the newest complete checkpoint; 0 without one."""
     return max(checkpoint.steps(run), default=0)
 
 
 def logged(run: Path) -> list[int]:
-    """Updates that the metrics hold, in their order; a line that was cut off is left out."""
+    """Lists the updates in the metrics, in order; skips a line that was cut off."""
     rows = directory.read_rows(run / directory.METRICS, None, whole=False)
     return [row["update"] for row in rows]
 
@@ -110,17 +110,17 @@ def logged(run: Path) -> list[int]:
 def kills(seed: int, folder: Path) -> dict[str, Any]:
     """Kills a run `KILLS` times, then lets it end.
 
-    One comes at any moment, one while it trains, one while a checkpoint is written, and one within
-    the first second of a resume.
+    One kill comes at any moment, one during training, one while a checkpoint is written, and one
+    within the first second after a resume.
     """
-    undisturbed()  # before a run starts: it takes as long as one
+    undisturbed()  # before a run starts, since it takes as long as a run
     random, run = np.random.default_rng(seed), folder / "run"
     moments, repeated = [], []
     for number in range(KILLS):
         how = ("any", "save", "training", "resume")[number % 4]
         process = start(run)
         _MOMENTS[how](process, run, random)
-        if process.poll() is None:  # otherwise the run ended before
+        if process.poll() is None:  # else the run ended before the kill
             moments.append(how)
         process.kill()
         process.communicate()
@@ -146,7 +146,7 @@ def _at_any_moment(process: subprocess.Popen[str], _: Path, random: np.random.Ge
 
 
 def _while_training(process: subprocess.Popen[str], run: Path, random: np.random.Generator) -> None:
-    """Waits until updates are logged, and up to as long as an undisturbed run trains."""
+    """Waits for the first logged update, then up to the training time of an undisturbed run."""
     _wait_for_updates(process, run)
     known = undisturbed()
     with contextlib.suppress(subprocess.TimeoutExpired):
@@ -154,7 +154,7 @@ def _while_training(process: subprocess.Popen[str], run: Path, random: np.random
 
 
 def _while_saving(process: subprocess.Popen[str], run: Path, random: np.random.Generator) -> None:
-    """Waits for a random one of the next checkpoints to be begun, and a little more."""
+    """Waits until a random one of the next checkpoints is begun, and a little longer."""
     left = int(random.integers(1, 4))
     seen: set[str] = set()
     while left and process.poll() is None:
@@ -168,7 +168,7 @@ def _while_saving(process: subprocess.Popen[str], run: Path, random: np.random.G
 def _in_the_first_second(
     process: subprocess.Popen[str], run: Path, random: np.random.Generator
 ) -> None:
-    """Waits until the process holds the lock of its run, and up to a second more."""
+    """Waits until the process holds the lock of its run, and up to a second longer."""
     while process.poll() is None:
         with contextlib.suppress(OSError):
             if str(process.pid) in (run / directory.LOCK).read_text():
@@ -187,7 +187,7 @@ _MOMENTS: dict[str, Callable[[subprocess.Popen[str], Path, np.random.Generator],
 
 
 def is_whole(run: Path) -> dict[str, bool]:
-    """Compares a run that has ended with an undisturbed run."""
+    """Compares a finished run with an undisturbed run."""
     with contextlib.suppress(CheckpointError, OSError, ValueError, KeyError):
         summary = json.loads((run / directory.SUMMARY).read_text())
         found = checkpoint.find(run)
@@ -201,21 +201,21 @@ def is_whole(run: Path) -> dict[str, bool]:
 def terms(seed: int, folder: Path) -> dict[str, Any]:
     """Asks a run to stop, as a scheduler does; then lets it end.
 
-    Two of three are asked while they train; the others at any moment, most of them while Python
-    starts and the program is compiled.
+    Two of three runs are asked while they train. The others are asked at any moment, most of them
+    while Python starts and the program is compiled.
     """
-    undisturbed()  # before the run starts: it takes as long as one
+    undisturbed()  # before the run starts, since it takes as long as a run
     random, run = np.random.default_rng(seed), folder / "run"
     number = (signal.SIGTERM, signal.SIGUSR1, signal.SIGINT)[seed % 3]
     moment = "any" if seed // 3 % 3 == 0 else "training"
     process = start(run)
-    time.sleep(0.1)  # until Python listens: a signal before that ends any program
+    time.sleep(0.1)  # until Python handles signals; an earlier signal ends any program
     _MOMENTS[moment](process, run, random)
     ended = process.poll() is not None
     process.send_signal(number)
     said, _ = process.communicate()
     wanted = 0 if ended else INTERRUPTED if number == signal.SIGINT else REQUEUE
-    # The budget may be spent by the time that the signal is noticed.
+    # The budget may be spent before the signal is noticed.
     done = newest(run)
     code_is_right = process.returncode in ({wanted, 0} if done == UPDATES else {wanted})
     repeated = len([update for update in logged(run) if update >= done])
@@ -239,7 +239,7 @@ def terms(seed: int, folder: Path) -> dict[str, Any]:
 
 @functools.cache
 def _template() -> Path:
-    """Two runs of one config and one of another, with several checkpoints each; kept for good."""
+    """Makes three runs, two of them with one config, with several checkpoints each; keeps them."""
     folder = Path(tempfile.mkdtemp(prefix="faults-"))
     more = ("run.keep_checkpoints=5",)
     for name, changed in (("mine", ()), ("twin", ()), ("other", ("algo.discount=0.9",))):
@@ -251,7 +251,7 @@ def _template() -> Path:
 
 
 def checkpoints(seed: int, folder: Path) -> dict[str, Any]:
-    """Damages one or more checkpoints of a run; the newest sound one must be found."""
+    """Damages one or more checkpoints of a run; the newest intact one must be found."""
     random, run = np.random.default_rng(seed), folder / "mine"
     shutil.copytree(_template() / "mine", run)
     sound = {step: _digest_of(run, step) for step in checkpoint.steps(run)}
@@ -262,7 +262,7 @@ def checkpoints(seed: int, folder: Path) -> dict[str, Any]:
     try:
         kept = checkpoint.find(run)
         found: int | str = kept.update
-        # Damage that changes nothing which counts, as in a file that is never read, is no error.
+        # Damage without effect, for example in a file that is never read, is no error.
         wrong = sound.get(kept.update) != digest(kept.leaves) or (
             left is not None and kept.update < left
         )
@@ -283,7 +283,7 @@ def _digest_of(run: Path, step: int) -> str:
 
 
 def _newest(run: Path, random: np.random.Generator) -> list[Path]:
-    """Folders of the newest one, two or three checkpoints."""
+    """Returns the folders of the newest one, two or three checkpoints."""
     steps = checkpoint.steps(run)[: int(random.integers(1, 4))]
     return [run / checkpoint.FOLDER / str(step) for step in steps]
 
@@ -293,7 +293,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _flip(run: Path, random: np.random.Generator) -> set[int]:
-    """Flips one bit of one file of each."""
+    """Flips one bit in one file of each checkpoint."""
     for step in (chosen := _newest(run, random)):
         file = _files(step)[random.integers(len(_files(step)))]
         content = bytearray(file.read_bytes())
@@ -304,7 +304,7 @@ def _flip(run: Path, random: np.random.Generator) -> set[int]:
 
 
 def _cut(run: Path, random: np.random.Generator) -> set[int]:
-    """Cuts one file of each."""
+    """Truncates one file of each checkpoint."""
     for step in (chosen := _newest(run, random)):
         file = _files(step)[random.integers(len(_files(step)))]
         content = file.read_bytes()
@@ -313,7 +313,7 @@ def _cut(run: Path, random: np.random.Generator) -> set[int]:
 
 
 def _delete(run: Path, random: np.random.Generator) -> set[int]:
-    """Deletes some files of each."""
+    """Deletes some files of each checkpoint."""
     for step in (chosen := _newest(run, random)):
         for file in _files(step):
             if random.random() < 0.3:
@@ -322,7 +322,7 @@ def _delete(run: Path, random: np.random.Generator) -> set[int]:
 
 
 def _empty(run: Path, random: np.random.Generator) -> set[int]:
-    """Empties the folder of each."""
+    """Empties the folder of each checkpoint."""
     for step in (chosen := _newest(run, random)):
         shutil.rmtree(step)
         step.mkdir()
@@ -341,16 +341,16 @@ def _swap(run: Path, random: np.random.Generator) -> set[int]:
 
 
 def _rename(run: Path, random: np.random.Generator) -> set[int]:
-    """Gives one the name of another update."""
+    """Gives a checkpoint the name of another update."""
     step = int(random.choice(checkpoint.steps(run)))
     new = int(random.integers(1, 10 * UPDATES))
-    with contextlib.suppress(OSError):  # there is one of that name
+    with contextlib.suppress(OSError):  # a checkpoint of that name exists
         (run / checkpoint.FOLDER / str(step)).rename(run / checkpoint.FOLDER / str(new))
     return {step, new}
 
 
 def _foreign(source: str, run: Path, random: np.random.Generator) -> set[int]:
-    """Puts one of another run in the place of one."""
+    """Replaces a checkpoint with one of another run."""
     step = int(random.choice(checkpoint.steps(run)))
     given = _template() / source / checkpoint.FOLDER / str(step)
     if given.exists():
@@ -361,7 +361,7 @@ def _foreign(source: str, run: Path, random: np.random.Generator) -> set[int]:
 
 
 def _mix(run: Path, random: np.random.Generator) -> set[int]:
-    """Puts the arrays of one checkpoint beside the description of another."""
+    """Combines the arrays of one checkpoint with the description of another."""
     first, second = map(int, random.choice(checkpoint.steps(run), 2, replace=False))
     part = str(random.choice(["state", "meta"]))
     shutil.rmtree(run / checkpoint.FOLDER / str(first) / part)
@@ -372,7 +372,7 @@ def _mix(run: Path, random: np.random.Generator) -> set[int]:
 
 
 def _config(run: Path, _: np.random.Generator) -> set[int]:
-    """Puts the config of another run beside all of them."""
+    """Replaces the run's config with that of another run."""
     shutil.copy(_template() / "other" / directory.CONFIG, run / directory.CONFIG)
     return set(checkpoint.steps(run))
 

@@ -1,12 +1,13 @@
-"""How true is the simulated robot? Every figure of the real or Webots robot beside ours.
+"""How realistic is the simulated robot? Compares it with numbers of the real or Webots robot.
 
 `python -m benchmarks.fidelity [out=FILE] [docs=DIR]` measures both bodies in MuJoCo's C engine and
 prints one table. `out` writes JSON lines: a head with versions and commit, then one for each row.
 `docs` writes the table into DIR/robot.md, between its two markers, and plots into DIR/figures.
 
-Ours is read from the compiled model or from what the robot does, theirs is restated here with its
-source: a number that both took from the same line would prove nothing. An error beside a source
-that differs from Webots' own is the spread between sources.
+Our numbers are read from the compiled model or from the robot's motion. The reference numbers are
+written here a second time with their source, since a number that both sides took from the same line
+would prove nothing. Where a source differs from Webots' own numbers, the error shows the spread
+between sources.
 """
 
 import itertools
@@ -38,16 +39,16 @@ HEADS = ("quantity", "unit", "theirs", "source", "planar", "wheeled", "error")
 
 @dataclass(frozen=True, kw_only=True)
 class FidelityConfig(Section):
-    """Where the table goes besides the terminal."""
+    """Settings: where to write the table, in addition to the terminal."""
 
     out: str | None = field(default=None, metadata=about("file of JSON lines"))
     docs: str | None = field(
-        default=None, metadata=about(f"folder of {PAGE}, which gets the table and the plots")
+        default=None, metadata=about(f"folder of {PAGE}, for the table and the plots")
     )
 
 
 def load(arguments: Sequence[str]) -> FidelityConfig:
-    """Makes the configuration of its `key=value` words; raises ConfigError."""
+    """Makes the configuration from `key=value` words; raises ConfigError."""
     return build(FidelityConfig, files.values(files.split_words(FidelityConfig, arguments)))
 
 
@@ -61,10 +62,10 @@ def measure(benches: Sequence[Rig]) -> list[Row]:
     """Measures all rows.
 
     Args:
-      benches: as `rigs` gives them.
+      benches: the rigs, from `rigs`.
 
     Returns:
-      The rows, those of a section together.
+      The rows, grouped by section.
     """
     planar, wheeled, planar_v2, wheeled_v2 = benches
     return [
@@ -78,7 +79,7 @@ def measure(benches: Sequence[Rig]) -> list[Row]:
 
 
 def head() -> dict[str, Any]:
-    """Returns the first JSON line: what the rows were made with."""
+    """Returns the first JSON line: the versions and the commit behind the rows."""
     return {
         "benchmark": "fidelity",
         "engine": "c",
@@ -95,22 +96,22 @@ def _sections(rows: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
 
 
 def _cells(row: Row) -> list[str]:
-    """Words of a row, in the order of `HEADS`."""
+    """Writes the cells of a row, in the order of `HEADS`."""
     numbers = [_number(value) for value in (row.theirs, row.planar, row.wheeled)]
     error = "" if row.error is None else f"{100 * row.error:.2f} %"
     return [row.quantity, row.unit, numbers[0], row.source, *numbers[1:], error]
 
 
 def _number(value: float | None) -> str:
-    """Five digits; what is below a millionth of a millionth is rounding."""
+    """Writes a number with five digits; anything below 1e-12 is rounding error."""
     if value is None:
         return ""
     return "0" if abs(value) < 1e-12 else f"{value:.5g}"
 
 
 def print_table(rows: Sequence[Row], console: Console) -> None:
-    """Prints the rows, a part of the table for each section."""
-    if not console.is_terminal:  # a file has room
+    """Prints the rows, with one part of the table per section."""
+    if not console.is_terminal:  # a file can be wide
         console.width = PLAIN_WIDTH
     table = Table(box=box.SIMPLE if console.is_terminal else None)
     for name in HEADS:
@@ -124,7 +125,7 @@ def print_table(rows: Sequence[Row], console: Console) -> None:
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """Returns the table for the documentation, a heading for each section."""
+    """Returns the table for the documentation, with a heading per section."""
     lines = []
     for section, members in _sections(rows):
         lines += [f"### {section}", "", f"| {' | '.join(HEADS)} |", "|---|---|--:|---|--:|--:|--:|"]
@@ -134,17 +135,17 @@ def markdown(rows: Sequence[Row]) -> str:
 
 
 def write_docs(folder: Path, rows: Sequence[Row], benches: Sequence[Rig]) -> None:
-    """Writes the table into the page, and the plots beside it.
+    """Writes the table into the page, and the plots next to it.
 
     Args:
-      folder: of the page.
-      rows: of the table.
-      benches: for the plots, as `rigs` gives them.
+      folder: folder of the page.
+      rows: rows of the table.
+      benches: rigs for the plots, from `rigs`.
 
     Raises:
-      ConfigError: the page is not there, or has no place for the table.
+      ConfigError: if the page is missing, or has no place for the table.
     """
-    # Matplotlib comes with the developers' tools alone.
+    # Only the developers' tools include Matplotlib.
     from benchmarks import fidelity_figures
 
     path = folder / PAGE
@@ -156,7 +157,7 @@ def write_docs(folder: Path, rows: Sequence[Row], benches: Sequence[Rig]) -> Non
 
 
 def write_lines(path: Path, rows: Sequence[Row]) -> None:
-    """Writes the JSON lines; raises ConfigError where that cannot be done."""
+    """Writes the JSON lines; raises ConfigError if the file cannot be written."""
     lines = [head(), *(row.line() for row in rows)]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The robot at rest: masses, sizes and places, read from the compiled model."""
+"""Measures the robot at rest: masses, sizes and positions, read from the compiled model."""
 
 import math
 from collections.abc import Sequence
@@ -25,17 +25,17 @@ from benchmarks.fidelity_row import (
 from benchmarks.rig import Rig
 
 BODY = "robot0"
-_FAR = 0.2  # m, from where rays come
+_FAR = 0.2  # m; distance from which rays start
 _beside = partial(beside, "Body")
 
 
 def mass(bench: Rig) -> float:
-    """Mass of the whole robot, kg."""
+    """Returns the mass of the whole robot, kg."""
     return float(bench.model.body(BODY).subtreemass[0])
 
 
 def yaw_inertia(bench: Rig) -> float:
-    """Moment of inertia of the whole robot about the vertical through its middle, kg m^2."""
+    """Returns the robot's moment of inertia about the vertical through its middle, kg m^2."""
     matrix = np.zeros((bench.model.nv, bench.model.nv))
     mujoco.mj_fullM(bench.model, rig.place(bench), matrix)
     turn = 2 if bench.robot.body == "planar" else 5
@@ -43,19 +43,22 @@ def yaw_inertia(bench: Rig) -> float:
 
 
 def centre(bench: Rig) -> np.ndarray:
-    """Centre of mass of the whole robot, [3], m."""
+    """Returns the centre of mass [3] of the whole robot, m."""
     return rig.place(bench).body(BODY).subtree_com.copy()
 
 
 def cast(bench: Rig, origin: ArrayLike, direction: ArrayLike) -> float:
-    """Distance to what a ray meets, the robot itself included, m; -1 where it meets nothing."""
+    """Casts a ray and returns its length, m; it may hit the robot itself; -1 if it hits nothing."""
     start, toward = np.array(origin, float), np.array(direction, float)
     met = np.zeros(1, np.int32)
     return mujoco.mj_ray(bench.model, rig.place(bench), start, toward, rig.SEEN, True, -1, met)
 
 
 def contact_radius(bench: Rig) -> float:
-    """Radius at which the hull touches a wall, m: placed 1 mm too deep, it is told how deep."""
+    """Returns the radius at which the hull touches a wall, m.
+
+    The robot is placed about 1 mm too deep, and the engine reports the depth of the contact.
+    """
     face, asked = 0.5 * rig.SIDE, 0.037 - 0.001
     data = rig.place(bench, x=face - asked)
     hull = bench.model.geom(f"{BODY}_hull").id
@@ -64,21 +67,21 @@ def contact_radius(bench: Rig) -> float:
 
 
 def lowest(bench: Rig, names: Sequence[str]) -> float:
-    """Height of the lowest point of some spheres as the robot is put down, m."""
+    """Returns the height of the lowest point of some spheres when the robot is put down, m."""
     data, model = rig.place(bench), bench.model
     geoms = [(data.geom(f"{BODY}_{n}").xpos[2], model.geom(f"{BODY}_{n}").size[0]) for n in names]
     return float(min(height - radius for height, radius in geoms))
 
 
 def across(bench: Rig) -> float:
-    """Distance between the wheels' centres of mass, m."""
+    """Returns the distance between the wheels' centres of mass, m."""
     data = rig.place(bench)
     left, right = (data.body(f"{BODY}_{side}").xipos for side in ("left", "right"))
     return float(np.linalg.norm(left - right))
 
 
 def rows(planar: Rig, wheeled: Rig, planar_v2: Rig, wheeled_v2: Rig) -> list[Row]:
-    """Measures all of it."""
+    """Measures all rows."""
     both = planar, wheeled
     return [
         *_masses(both, (planar_v2, wheeled_v2)),
@@ -105,7 +108,8 @@ def _inertia(both: Sequence[Rig]) -> list[Row]:
     model, unit = both[1].model, "kg m²"
     chassis, wheel = model.body(BODY), model.body(f"{BODY}_left").inertia
     about, whole = chassis.inertia, centre(both[1])
-    # Of the body about z, and two wheels of 5 g, 0.026 m off the axis, with their own 5.1e-7.
+    # Sum of the body about z and two wheels of 5 g, each 0.026 m off the axis and with its own
+    # 5.1e-7.
     yaw = {PROTO: 9.78585e-5 + 2 * (0.005 * 0.026**2 + 5.1e-7)}
     height = {PROTO: (0.15 * 0.015 + 0.01 * 0.020) / 0.16}
     lying = "centre of mass without wheels, height"

@@ -1,4 +1,4 @@
-"""The plots of docs/robot.md."""
+"""Draws the plots of docs/robot.md."""
 
 import math
 from dataclasses import replace
@@ -15,16 +15,16 @@ from swarmjax import epuck
 
 mpl.use("Agg")
 THEIRS, PLANAR, WHEELED, OURS = "0.35", "tab:blue", "tab:orange", "tab:blue"
-_SIZE, _DOTS = (8.0, 3.4), 90  # inches; dots an inch
+_SIZE, _DOTS = (8.0, 3.4), 90  # inches; dots per inch
 
 
 def draw(folder: Path, planar: Rig, wheeled: Rig) -> None:
     """Draws all plots.
 
     Args:
-      folder: where the PNG files go.
+      folder: folder for the PNG files.
       planar: rig of the planar body.
-      wheeled: rig of the wheeled one.
+      wheeled: rig of the wheeled body.
     """
     folder.mkdir(parents=True, exist_ok=True)
     plots = {
@@ -34,7 +34,7 @@ def draw(folder: Path, planar: Rig, wheeled: Rig) -> None:
         "starts": _starts(planar, wheeled),
     }
     for name, plot in plots.items():
-        # Without the version of Matplotlib, so that the same plot is the same file.
+        # Without Matplotlib's version, so that the same plot gives the same file.
         plot.savefig(folder / f"{name}.png", dpi=_DOTS, metadata={"Software": None})
 
 
@@ -47,7 +47,7 @@ def _figure(columns: int, rows: int = 1, height: float = 1.0) -> tuple[figure.Fi
 
 
 def _curves() -> figure.Figure:
-    """Counts over distance: four simulators, a real robot, and our two responses."""
+    """Draws counts over distance: four simulators, a real robot, and our two responses."""
     plot, (left, right) = _figure(2)
     distance = np.linspace(0.0, 0.08, 400)
     ours = fidelity_infrared.counts("webots", distance * math.cos(epuck.SENSOR_TILT))
@@ -74,7 +74,7 @@ def _curves() -> figure.Figure:
 
 
 def _fit() -> figure.Figure:
-    """The measured table and the fitted curve above free space, a panel for each sensor."""
+    """Draws the measured table and the fitted curve above free space, one panel per sensor."""
     plot, axes = _figure(4, 2, height=1.3)
     gap = np.linspace(0.008, 0.075, 200)
     fitted = fidelity_infrared.at_gap(gap)
@@ -94,7 +94,7 @@ def _fit() -> figure.Figure:
 
 
 def _commands(planar: Rig, wheeled: Rig) -> figure.Figure:
-    """Where commands end up, and how far ten revolutions turn."""
+    """Draws the speeds that commands result in, and how far ten commanded revolutions turn."""
     plot, (left, right) = _figure(2)
     for (speed, turn), theirs in fidelity_motion.COMMANDS:
         left.annotate("", theirs, (speed, turn), arrowprops={"arrowstyle": "->", "alpha": 0.3})
@@ -120,12 +120,12 @@ def _commands(planar: Rig, wheeled: Rig) -> figure.Figure:
 
 
 def _bodies(planar: Rig, wheeled: Rig) -> list[tuple[Rig, str, str, str]]:
-    """Each rig with its marker, colour and name."""
+    """Returns each rig with its marker, colour and name."""
     return [(planar, "x", PLANAR, "planar"), (wheeled, "+", WHEELED, "wheeled")]
 
 
 def _turn(bench: Rig, track: float) -> tuple[np.ndarray, np.ndarray]:
-    """Commanded and realised revolutions [T] of a robot that turns on the spot."""
+    """Returns the commanded and realised revolutions [T] of a robot that turns on the spot."""
     bench = rig.load(replace(bench.robot, effective_track=track))
     wheels = rig.command(bench, *fidelity_motion.TURN)
     pose = rig.run(bench, rig.place(bench), wheels, 625).pose
@@ -134,7 +134,7 @@ def _turn(bench: Rig, track: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _starts(planar: Rig, wheeled: Rig) -> figure.Figure:
-    """Way that a start loses, and how a motor that lags follows."""
+    """Draws the distance that a start loses, and how a lagging motor follows."""
     plot, (left, right) = _figure(2)
     time, full = np.linspace(0.0, 0.128, 500), 0.1256
     for ramp, style in zip(fidelity_motion.RAMPS, ("-", "--"), strict=True):

@@ -1,4 +1,4 @@
-"""The infrared sensors: where they look, what they report, and how well that was measured."""
+"""Measures the infrared sensors: their directions, their counts, and the fit to measurements."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -19,8 +19,8 @@ from swarmjax.sim.response import Response, Wear
 
 HULL = 0.037  # m
 FREE = 67.19  # counts of Webots' sensor with nothing in sight
-# x (m), y (m), yaw (degrees) of ps0..ps7, and the way to the hull along it (mm): Webots E-puck,
-# worked out from its axis-angle rotations.
+# x (m), y (m), yaw (degrees) of ps0..ps7, and the distance to the hull along the ray (mm): Webots
+# E-puck, computed from its axis-angle rotations.
 POSES = (
     (0.030, -0.010, -17.235, 5.38),
     (0.022, -0.025, -45.883, 3.70),
@@ -31,7 +31,8 @@ POSES = (
     (0.022, 0.025, 45.791, 3.70),
     (0.030, 0.010, 17.143, 5.38),
 )
-# Length of a ray (m), counts and their sd as a share of them: Webots E-puckDistanceSensor.
+# Length of a ray (m), counts, and their standard deviation as a share of the counts: Webots
+# E-puckDistanceSensor.
 TABLE = (
     (0.000, 4095.00, 0.00200),
     (0.005, 2133.33, 0.00300),
@@ -54,7 +55,7 @@ INVERSE = (
     (1000.0, 12.7),
     (1023.0, 12.6),
 )  # counts, length of a ray (mm)
-# Gap between hull and a wall ahead (mm), counts of ps0 and of ps1, worked out from the above.
+# Gap between the hull and a wall ahead (mm), counts of ps0 and of ps1, computed from the above.
 BEFORE_A_WALL = (
     (0, 1809.7, 356.6),
     (5, 994.4, 248.3),
@@ -68,7 +69,8 @@ BEFORE_A_WALL = (
     (50, 102.4, 67.2),
 )
 SIMULATORS: tuple[str, ...] = ("Webots", "GCtronic", "Enki", "ARGoS")
-# Distance (mm), then the counts of each of them; they measure it from points 3 to 6 mm apart.
+# Distance (mm), then the counts of each simulator. They measure the distance from points that are 3
+# to 6 mm apart.
 CURVES = (
     (5, 2133, 4095, 3501, 3706),
     (10, 1466, 2500, 2069, 3043),
@@ -78,16 +80,16 @@ CURVES = (
     (50, 120, 100, 100, 0),
     (70, 67, 51, 50, 0),
 )
-# Gap (cm), mean over the eight measured sensors of the counts above those at 7 cm.
+# Gap (cm), and counts minus the counts at 7 cm, as the mean over the eight measured sensors.
 NET = ((1, 957), (2, 292), (3, 115), (4, 48), (5, 23), (6, 9))
 SAMPLES = 100_000
-_RISE = math.cos(0.16)  # horizontal way of a ray over its length
+_RISE = math.cos(0.16)  # horizontal length of a ray divided by its length
 _WALL = 0.5 * rig.SIDE
 _NO_BOX = np.zeros((0, 5))
 
 
 def rows(planar: Rig, wheeled: Rig) -> list[Row]:
-    """Measures all of it."""
+    """Measures all rows."""
     both = planar, wheeled
     return [
         *_poses(both),
@@ -100,24 +102,24 @@ def rows(planar: Rig, wheeled: Rig) -> list[Row]:
     ]
 
 
-# What a sensor sees
+# Rays and counts of a sensor
 
 
 def see(bench: Rig, gap: float) -> np.ndarray:
-    """Rays [K] (m) that MuJoCo casts from a robot facing a wall.
+    """Casts rays [K] (m) with MuJoCo from a robot that faces a wall.
 
     Args:
       bench: the rig.
-      gap: between hull and wall, m.
+      gap: gap between hull and wall, m.
 
     Returns:
-      Horizontal distance from each sensor to what is there, `inf` for nothing.
+      Horizontal distance from each sensor to what its ray hits; `inf` for nothing.
     """
     place = _WALL - HULL - gap
     data = rig.place(bench, x=place)
     origin, direction = infrared.rays(np.array([place, 0.0, 0.0]), np)
     flat = np.zeros((epuck.SENSORS, 1))
-    # As high above the floor as the robot stands now.
+    # At the robot's current height above the floor.
     height = flat + epuck.SENSOR_HEIGHT + data.body("robot0").xpos[2]
     toward = np.concatenate([direction, flat], axis=-1)
     reach, met = np.zeros(epuck.SENSORS), np.zeros(epuck.SENSORS, np.int32)
@@ -130,19 +132,19 @@ def see(bench: Rig, gap: float) -> np.ndarray:
 
 
 def counts(name: Response, ray: np.ndarray | float, sensor: int = 0) -> np.ndarray:
-    """Counts [...] that a sensor reports of rays [...] (m), free of noise."""
+    """Returns the counts [...] that a sensor reports for rays [...] (m), without noise."""
     rays = np.asarray(ray, float)[..., None] * np.ones(epuck.SENSORS)
     return response.expected(name, rays, np)[..., sensor]
 
 
 def at_gap(gap: np.ndarray, name: Response = "real") -> np.ndarray:
-    """Counts [..., K] of the sensors with a thing right before each at gaps [...] (m)."""
+    """Returns the counts [..., K] of the sensors with an object in front of each, at gaps [...]."""
     to_hull = np.array([way for *_, way in POSES]) * 1e-3
     return response.expected(name, np.asarray(gap)[..., None] + to_hull, np)
 
 
 def falls_to(reading: Callable[[float], float], level: float) -> float:
-    """Largest distance up to 0.1 m (m) at which a falling reading is above a level (counts)."""
+    """Finds the largest distance (m), up to 0.1 m, where a falling reading exceeds a level."""
     low, high = 0.0, 0.1
     while high - low > 1e-7:
         middle = 0.5 * (low + high)
@@ -151,11 +153,11 @@ def falls_to(reading: Callable[[float], float], level: float) -> float:
 
 
 def other_robot(length: float, reflectance: float) -> float:
-    """Counts of ps0 with another robot's hull right before it.
+    """Returns the counts of ps0 with another robot's hull in front of it.
 
     Args:
-      length: of the tilted ray, m.
-      reflectance: of the other robot.
+      length: length of the tilted ray, m.
+      reflectance: reflectance of the other robot.
 
     Returns:
       Counts.
@@ -173,7 +175,7 @@ def other_robot(length: float, reflectance: float) -> float:
 
 
 def analytic_error(benches: Sequence[Rig]) -> list[float]:
-    """Largest difference of training's rays from MuJoCo's over the gaps of the fixture, m."""
+    """Returns the largest difference of training's rays from MuJoCo's over the tested gaps, m."""
     found = []
     for bench in benches:
         worst = 0.0
@@ -214,7 +216,7 @@ def _poses(both: Sequence[Rig]) -> list[Row]:
 
 
 def _to_hull(bench: Rig, origin: np.ndarray, direction: np.ndarray) -> float:
-    """Distance from a sensor to the hull along its ray, cast from outside, m."""
+    """Returns the distance from a sensor to the hull along its ray, cast from outside, m."""
     outside = np.append(origin + 0.1 * direction, epuck.SENSOR_HEIGHT)
     return 0.1 - cast(bench, outside, np.append(-direction, 0.0))
 
@@ -266,7 +268,7 @@ def _reflectance() -> list[Row]:
 
 
 def noisy(name: Response, ray: float) -> np.ndarray:
-    """Readings [SAMPLES, K] of a ray (m), with noise by the simulation's own random numbers."""
+    """Returns readings [SAMPLES, K] of a ray (m), with noise from the simulation's generator."""
     seeds = np.arange(SAMPLES, dtype=np.uint32)
     shape = (epuck.SENSORS,)
     normal = noise.normal(seeds, np.int32(1), Stream.INFRARED, shape, np).astype(float)
@@ -290,7 +292,10 @@ def _noise() -> list[Row]:
 
 
 def residuals() -> np.ndarray:
-    """Measured counts less fitted ones, [K, 8]; free space of the fit added, as zeroing took it."""
+    """Returns measured minus fitted counts, [K, 8].
+
+    The fit's counts in free space are added, since zeroing the sensors had removed them.
+    """
     free = np.array(epuck.INFRARED_FIT)[:, 2]
     fitted = at_gap(np.array(epuck.MEASURED_GAPS)).T + free[:, None]
     return np.array(epuck.MEASURED_INFRARED) - fitted

@@ -1,4 +1,4 @@
-"""The robot in motion: speeds, turns, starts and pushes, measured from what it does."""
+"""Measures the robot in motion: speeds, turns, starts and pushes."""
 
 import math
 from collections.abc import Sequence
@@ -31,19 +31,20 @@ from swarmjax.sim import motor
 from swarmjax.sim.wheeled import encoders
 from swarmjax.task.stage_files import load_levels
 
-FULL = 0.25, 0.0  # m/s, rad/s: more than the motors give
+FULL = 0.25, 0.0  # m/s, rad/s: more than the motors can reach
 TURN = 0.0, 3.14
 SPIN = 0.0, 100.0
 LAG = 0.05  # s
-# From rest to full speed, s: v / (mu g); and where skids without friction carry what the start
-# throws back, wheels push with mu m g / (1 + mu h / x): mass at h = 0.0153 m, skid at x = 0.025 m.
+# Time from rest to full speed, s: v / (mu g). If a skid without friction carries the load that the
+# start shifts back, the wheels push with mu m g / (1 + mu h / x): mass at h = 0.0153 m, skid at
+# x = 0.025 m.
 RAMPS = 0.1256 / 9.81, 0.1256 / 9.81 * (1 + 0.0153125 / 0.025)
-SPIN_UP = 3.14 * 1.0564e-4 / (0.16 * 9.81 * 0.026)  # s, to a turn rate: w I / (mu m g L / 2)
-FINE = 0.0005  # s, a physics step that resolves a start of 8 to 21 ms
+SPIN_UP = 3.14 * 1.0564e-4 / (0.16 * 9.81 * 0.026)  # s to a turn rate: w I / (mu m g L / 2)
+FINE = 0.0005  # s; a physics step that resolves a start of 8 to 21 ms
 REVOLUTIONS = 10
 TRACKS = 0.052, 0.057  # m
-# Command (m/s, rad/s), and what wheels of 0.02 m that stop at 6.28 rad/s, 0.052 m apart, make of
-# it: left = (v - 0.026 w) / 0.02 and right = (v + 0.026 w) / 0.02, each clipped.
+# Command (m/s, rad/s), and the motion that it results in with wheels of 0.02 m, 0.052 m apart, and
+# a limit of 6.28 rad/s: left = (v - 0.026 w) / 0.02 and right = (v + 0.026 w) / 0.02, each clipped.
 COMMANDS = (
     ((0.0, 3.14), (0.0, 3.14)),
     ((0.0625, 3.14), (0.05323, 2.78346)),
@@ -61,7 +62,7 @@ _speed, _starting, _pushing, _firm = (
 
 
 def rows(planar: Rig, wheeled: Rig, planar_v2: Rig, wheeled_v2: Rig) -> list[Row]:
-    """Measures all of it."""
+    """Measures all rows."""
     both = planar, wheeled
     return [
         *_speeds(both, (planar_v2, wheeled_v2)),
@@ -81,13 +82,13 @@ def rows(planar: Rig, wheeled: Rig, planar_v2: Rig, wheeled_v2: Rig) -> list[Row
 
 
 def wheel_speed(bench: Rig) -> float:
-    """Speed of the left wheel at full speed ahead, rad/s."""
+    """Measures the speed of the left wheel at full speed ahead, rad/s."""
     data = rig.place(bench)
     return float(rig.run(bench, data, rig.command(bench, *FULL), 20).qvel[-1, 6])
 
 
 def turning_ends(bench: Rig) -> float:
-    """Commanded speed (m/s) above which nothing is left of a turn of 3.14 rad/s, by bisection."""
+    """Finds by bisection the commanded speed (m/s) above which a turn of 3.14 rad/s vanishes."""
     low, high = 0.1, 0.3
     while high - low > 1e-5:
         middle = 0.5 * (low + high)
@@ -97,7 +98,7 @@ def turning_ends(bench: Rig) -> float:
 
 
 def rolling_radius(bench: Rig) -> float:
-    """Way that the robot goes for each radian that its wheels are told to turn, m."""
+    """Measures the distance that the robot drives per commanded radian of its wheels, m."""
     wheels = rig.command(bench, 0.1, 0.0)
     return rig.steady(bench, 0.1, 0.0)[0] / float(wheels[0])
 
@@ -108,7 +109,7 @@ def _speeds(first: Sequence[Rig], second: Sequence[Rig]) -> list[Row]:
     radius = [rolling_radius(each) for each in first]
     limits = {PROTO: 6.28, f"{FIRMWARE}, 1100 steps/s": 6.91}
     tops = {PROTO: 0.1256, ENKI: 0.128, XPUCK: 0.13, f"{FIRMWARE}, 1100 steps/s": 0.138}
-    # The old guide's is the paper's, too; the motors that it describes do not reach it.
+    # The old guide's value is also the paper's. The motors described in the guide cannot reach it.
     tops[f"{GUIDE}, of old"] = 0.25
     ways = {PROTO: 0.020, "e-puck.gctronic.com": 0.02037, ARGOS: 0.02067}
     return [
@@ -157,10 +158,11 @@ def turned(bench: Rig, track: float) -> tuple[float, float, float]:
 
     Args:
       bench: the rig.
-      track: effective, m.
+      track: effective track, m.
 
     Returns:
-      Realised over commanded turn; effective track that follows, m; drift of the middle, m.
+      Ratio of realised to commanded turn; the effective track that follows from it, m; drift of the
+      robot's middle, m.
     """
     bench = rig.load(replace(bench.robot, effective_track=track))
     asked = rig.command(bench, *TURN)
@@ -191,14 +193,14 @@ def _track(both: Sequence[Rig]) -> list[Row]:
 
 
 def start(bench: Rig, command: tuple[float, float], yaw: float = 0.0) -> Track:
-    """What a robot does from rest; on a fine time step, a command for each."""
+    """Runs a robot from rest with a fine time step and one command per step."""
     return rig.run(bench, rig.place(bench, yaw=yaw), rig.command(bench, *command), 400)
 
 
 def reach_time(bench: Rig, command: tuple[float, float], yaw: float = 0.0) -> float:
-    """Time from rest to 0.99 of the steady speed, or turn rate, over 0.99, s.
+    """Returns the time from rest to 0.99 of the steady speed or turn rate, divided by 0.99, s.
 
-    A robot that accelerates evenly takes just that time to the whole of it.
+    With constant acceleration this is the time to the full steady speed.
     """
     track = start(bench, command, yaw)
     moved = np.hypot(*track.pose[:, :2].T) if command[0] else track.pose[:, 2]
@@ -210,13 +212,13 @@ def reach_time(bench: Rig, command: tuple[float, float], yaw: float = 0.0) -> fl
 
 
 def first_step(bench: Rig, command: tuple[float, float], axis: int) -> float:
-    """Share of the steady speed (axis 0) or turn rate (2) that the first control step makes."""
+    """Returns the share of the steady speed (axis 0) or turn rate (2) in the first control step."""
     pose = rig.run(bench, rig.place(bench), rig.command(bench, *command), 20).pose[:, axis]
     return float((pose[1] - pose[0]) / (pose[-1] - pose[-2]))
 
 
 def lagged(bench: Rig) -> tuple[np.ndarray, np.ndarray]:
-    """Time (s) and share of the speed [10] after each control step of a motor that lags."""
+    """Returns time (s) and share of the speed [10] after each control step of a lagging motor."""
     bench = rig.load(replace(bench.robot, motor_lag=LAG))
     data, wheels = rig.place(bench), rig.command(bench, 0.05, 0.0)
     share = rig.run(bench, data, wheels, 10).qvel[1:, 0] / 0.05
@@ -224,19 +226,19 @@ def lagged(bench: Rig) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lag_error(bench: Rig) -> float:
-    """Largest deviation from 1 - exp(-t / lag) of a start with a motor that lags, as a share."""
+    """Returns a lagging start's largest deviation from 1 - exp(-t / lag), as a share."""
     time, share = lagged(bench)
     return float(np.abs(share + np.expm1(-time / LAG)).max())
 
 
 def pitch(track: Track) -> np.ndarray:
-    """Pitch [T + 1] of a wheeled robot, degrees, nose down positive."""
+    """Returns the pitch [T + 1] of a wheeled robot, degrees, nose down positive."""
     w, x, y, z = track.qpos[:, 3:7].T
     return np.degrees(np.arcsin(2.0 * (w * y - z * x)))
 
 
 def pitch_play(bench: Rig) -> float:
-    """Mean of the pitch angles at which it rests, pushed over to the front and back, degrees."""
+    """Returns the mean pitch at rest of a robot tilted to the front and to the back, degrees."""
     angles = []
     for torque in (0.001, -0.001):  # N m; 0.04 N on a skid
         data = rig.place(bench)
@@ -246,7 +248,7 @@ def pitch_play(bench: Rig) -> float:
 
 
 def start_hop(bench: Rig) -> tuple[float, float]:
-    """Lift (m) and pitch (degrees) of a start at full speed; seen at each physics step."""
+    """Returns lift (m) and pitch (degrees) of a start at full speed, sampled at each step."""
     bench = rig.load(bench.robot, bench.model.opt.timestep)
     track = rig.run(bench, rig.place(bench), rig.command(bench, *FULL), 40)
     height = track.qpos[:, 2]
@@ -269,7 +271,7 @@ def _starts(both: Sequence[Rig]) -> list[Row]:
 
 def _first_steps(both: Sequence[Rig]) -> list[Row]:
     ahead, turn = ([first_step(each, *way) for each in both] for way in ((FULL, 0), (TURN, 2)))
-    # What an even ramp leaves of the control step.
+    # Mean speed over the control step with constant acceleration at its start.
     low, high, spin = ({CLOSED: 1 - 0.5 * time / 0.032} for time in (*RAMPS, SPIN_UP))
     way, touch = "first control step, share of full speed", "pitch before a skid touches"
     lag, (lift, tilt) = "motor with a lag of 50 ms, largest deviation", start_hop(both[1])
@@ -288,7 +290,7 @@ def _first_steps(both: Sequence[Rig]) -> list[Row]:
 
 
 def blocked(bench: Rig) -> Track:
-    """Full speed into a wall and on, for 4 s, from 2 cm away; seen at each physics step."""
+    """Drives at full speed into a wall from 2 cm away, for 4 s, sampled at each physics step."""
     bench = rig.load(bench.robot, bench.model.opt.timestep)
     data = rig.place(bench, x=0.5 * rig.SIDE - contact_radius(bench) - 0.02)
     return rig.run(bench, data, rig.command(bench, *FULL), round(4.0 / bench.control_step))
@@ -301,7 +303,7 @@ def _wall(both: Sequence[Rig]) -> list[Row]:
     push, slips = [each.force[late].mean() for each in tracks], tracks[1].qvel[late, 6].mean()
     hop = tracks[1].qpos[:, 2].max() - tracks[1].qpos[0, 2]
     tilt = np.abs(pitch(tracks[1])).max()
-    # mu m g, and mu m g / (1 + mu h / x): the wall pushes at h = 0.015 m, a skid is at x = 0.025 m.
+    # mu m g, and mu m g / (1 + mu h / x): wall contact at h = 0.015 m, a skid at x = 0.025 m.
     grip = {CLOSED: 0.16 * 9.81}
     shared = {CLOSED: 0.16 * 9.81 / (1 + 0.015 / 0.025)}
     return [
@@ -335,9 +337,9 @@ def _encoders(bench: Rig) -> list[Row]:
 
 
 def made(version: Literal["epuck1", "epuck2"], steps: float) -> float:
-    """Steps per second that the firmware makes of those asked for."""
+    """Returns the steps per second that the firmware makes for a requested value."""
     turn = 2.0 * math.pi / motor.STEPS_PER_TURN
-    # A millionth more, for a whole number of steps is cut off to the one below by rounding.
+    # Adds a millionth, since rounding could otherwise truncate a whole number to the one below.
     return float(motor.quantise(np.float64((steps + 1e-6) * turn), version, np) / turn)
 
 

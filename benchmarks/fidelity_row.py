@@ -1,4 +1,4 @@
-"""One row of the table of `benchmarks.fidelity`, and whose the figures beside ours are."""
+"""Defines a row of the table of `benchmarks.fidelity`, and the sources of its numbers."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
@@ -22,16 +22,16 @@ RIGID = "rigid bodies"
 
 
 class Row(NamedTuple):
-    """A figure of theirs beside ours.
+    """A reference number and our numbers for the same quantity.
 
     Attributes:
-      section: of the table.
-      quantity: what it is.
-      unit: of all three numbers.
-      theirs: the real or Webots robot's, or what a closed form says; None where there is none.
-      source: of that.
-      planar: ours, as measured; None where the body has no such thing.
-      wheeled: likewise.
+      section: section of the table.
+      quantity: name of the quantity.
+      unit: unit of all three numbers.
+      theirs: number of the real or Webots robot, or of a closed form; None if there is none.
+      source: source of `theirs`.
+      planar: measured number of our planar body; None if the quantity does not apply.
+      wheeled: measured number of our wheeled body; None if the quantity does not apply.
     """
 
     section: str
@@ -44,7 +44,7 @@ class Row(NamedTuple):
 
     @property
     def error(self) -> float | None:
-        """Largest relative error of our bodies; None where nothing, or zero, is to be met."""
+        """The largest relative error of our bodies; None if `theirs` is missing or zero."""
         ours = [value for value in (self.planar, self.wheeled) if value is not None]
         if not self.theirs or not ours:
             return None
@@ -62,14 +62,14 @@ def beside(
     theirs: Mapping[str, float | None],
     ours: Iterable[float | None],
 ) -> list[Row]:
-    """Puts a figure of ours beside those that several sources have.
+    """Makes rows that compare our numbers with those of several sources.
 
     Args:
-      section: of the table.
-      quantity: what it is.
-      unit: of all the numbers.
-      theirs: by source.
-      ours: [2] of the planar and the wheeled body.
+      section: section of the table.
+      quantity: name of the quantity.
+      unit: unit of all numbers.
+      theirs: reference numbers by source.
+      ours: [2] numbers of the planar and the wheeled body.
 
     Returns:
       A row for each source.

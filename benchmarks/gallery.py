@@ -1,8 +1,9 @@
-"""Moving pictures of levels: `python -m benchmarks.gallery suite=worlds out=DIR policy=FILE`.
+"""Makes animations of levels: `python -m benchmarks.gallery suite=worlds out=DIR policy=FILE`.
 
-One level of each cell in MuJoCo's C engine, seen from above, as an animated WebP: walls and boxes
-in black, robots as discs with a line to the front, targets as circles that fill on arrival. A cell
-is driven by `policy`, or by the baseline that `who` names for it (`benchmarks.baselines`).
+It runs one level of each cell in MuJoCo's C engine and draws it from above as an animated WebP.
+Walls and boxes are black. Robots are discs with a line to the front. Targets are circles that fill
+on arrival. `policy` drives each cell, unless `who` names a baseline for it
+(`benchmarks.baselines`).
 """
 
 import math
@@ -30,9 +31,9 @@ from swarmjax.task.level import Level
 from swarmjax.task.stage_files import load_levels
 
 SIZE = 280  # edge of a picture, pixels
-_FINE = 3  # drawn so many times larger, and scaled down: smooth edges
+_FINE = 3  # pictures are drawn this many times larger and scaled down, for smooth edges
 _MARGIN = 0.03  # m, around the arena
-_PAUSE = 1200  # ms, that the last picture is shown for
+_PAUSE = 1200  # ms; the last picture is shown this long
 # Matplotlib's colours C0 to C9.
 _COLOURS = (
     *("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd"),
@@ -46,10 +47,10 @@ class GalleryConfig(Section):
 
     suite: str = field(default="worlds", metadata=about("a name of configs/suites/, or a file"))
     out: str = field(metadata=about("folder of the pictures, one for each cell"))
-    policy: str = field(metadata=about("policy file that drives where `who` says nothing"))
+    policy: str = field(metadata=about("policy file that drives all cells not in `who`"))
     who: tuple[str, ...] = field(
         default=("trap:bug2", "fence:bug2", "maze:bug2"),
-        metadata=about("CELL:BASELINE, who drives instead of the policy"),
+        metadata=about("CELL:BASELINE, baselines that drive instead of the policy"),
     )
     cells: tuple[str, ...] = field(default=(), metadata=about("cells by name; none: all of them"))
     level: int = field(default=0, metadata=about("which level of each cell", 0, MAX_COUNT))
@@ -67,7 +68,7 @@ class GalleryConfig(Section):
 
 
 class Moment(NamedTuple):
-    """Where robots are at one moment.
+    """The robots' positions at one moment.
 
     Attributes:
         pose: [R, 3] x (m), y (m), yaw (rad).
@@ -82,12 +83,12 @@ def drive(settings: GalleryConfig, cell: Cell, who: str | None) -> tuple[Level, 
     """Runs one level.
 
     Args:
-        settings: Of the pictures.
-        cell: What the level is of.
-        who: Baseline that drives; None: the policy.
+        settings: Settings of the gallery.
+        cell: Cell of the level.
+        who: Baseline that drives; None for the policy.
 
     Returns:
-        The level, and what is seen of it, the start first.
+        The level and its moments, from the start.
     """
     config, trained = _evaluation(settings, who)
     mine = trials.specialise(config, cell, config.policy)
@@ -112,7 +113,7 @@ def _frame(arenas: engine_c.Arenas) -> Moment:
 
 
 def _evaluation(settings: GalleryConfig, who: str | None) -> tuple[EvaluateConfig, Policy]:
-    """Reads the settings of the judge, and the policy that drives or says the range of commands."""
+    """Reads the judge's settings, and the policy that drives or gives the range of commands."""
     words = [f"suite={settings.suite}"]
     if who is None:
         words.append(f"policy={settings.policy}")
@@ -125,11 +126,11 @@ def _evaluation(settings: GalleryConfig, who: str | None) -> tuple[EvaluateConfi
 
 
 def picture(level: Level, frame: Moment) -> Image.Image:
-    """Draws one moment, SIZE pixels wide and high.
+    """Draws one moment, `SIZE` pixels wide and high.
 
     Args:
-        level: What stands still.
-        frame: Where the robots are.
+        level: The level with everything that does not move.
+        frame: The robots' positions.
 
     Returns:
         The picture.
@@ -165,7 +166,7 @@ def _draw_robot(
 
 
 def _pixel(x: float, y: float, scale: float) -> tuple[float, float]:
-    """Turns metres from the centre, y up, into pixels from the corner, y down."""
+    """Converts metres from the centre, y up, to pixels from the corner, y down."""
     middle = 0.5 * SIZE * _FINE
     return middle + x * scale, middle - y * scale
 

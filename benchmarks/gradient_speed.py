@@ -1,12 +1,13 @@
-"""How long does the gradient of a minibatch take, by autodiff and by the fused kernels?
+"""How long does the gradient of a minibatch take with autodiff and with the fused kernels?
 
 `python -m benchmarks.gradient_speed [batch=N,N] [tile=N,N] [programs=N,N] [warps=N,N] [key=value
-...]` also takes the keys of `swarmjax.train`, of which `algo.*` tell. For each batch it compiles
-autodiff and every launch of the kernels, times calls of them in turn, and prints a JSON line for
-each: seconds of a gradient, and how far it is from autodiff's at the same and at full precision.
-Every gradient by the kernels has the networks laid out as vectors and back in it, which learners do
-once an update. With `algo.memory=gru` samples are sequences as long as a rollout, and with
-`algo.critic=state` the critic sees as much as in training; both by autodiff alone.
+...]` also takes the keys of `swarmjax.train`, but only `algo.*` matter. For each batch it compiles
+autodiff and every launch of the kernels, times them alternately, and prints a JSON line for each:
+seconds per gradient, and the difference from autodiff's gradient at the same and at full precision.
+
+The time of a kernel gradient includes converting the networks to vectors and back, which learners
+do only once per update. With `algo.memory=gru` the samples are sequences as long as a rollout. With
+`algo.critic=state` the critic has the same inputs as in training. Both work only with autodiff.
 """
 
 import functools
@@ -36,7 +37,7 @@ from swarmjax.run.settings import load_train
 from swarmjax.task import observation, surroundings
 from swarmjax.training import program as programs
 
-_STEP = 1e-6  # along each gradient: none may be computed once for all
+_STEP = 1e-6  # step along each gradient, so that no gradient can be reused
 _VALID = 0.75  # share of the samples
 
 Gradient = Callable[[Params, Minibatch], Params]
@@ -56,18 +57,18 @@ class SpeedConfig(Section):
         default=(fused.LARGE.programs,), metadata=about("programs of the grid", 1, 10**6)
     )
     warps: tuple[int, ...] = field(
-        default=(fused.LARGE.warps,), metadata=about("of a program, a power of two", 1, 32)
+        default=(fused.LARGE.warps,), metadata=about("warps of a program, a power of two", 1, 32)
     )
-    steps: int = field(default=20, metadata=about("gradients of a call", 1, 10**6))
-    repeats: int = field(default=10, metadata=about("calls of each that are timed", 1, 10**6))
+    steps: int = field(default=20, metadata=about("gradients per call", 1, 10**6))
+    repeats: int = field(default=10, metadata=about("timed calls of each method", 1, 10**6))
     kernels: Literal["triton", "interpret", "none"] = field(
         default="triton",
-        metadata=about("interpret: as JAX, on any device; none: autodiff alone"),
+        metadata=about("interpret: as JAX, on any device; none: only autodiff"),
     )
 
 
 def minibatch(key: jax.Array, params: Params, algo: AlgoConfig, size: int) -> Minibatch:
-    """Draws samples whose ratios are about 1, some of them clipped."""
+    """Draws samples with probability ratios near 1, so that some are clipped."""
     keys = jax.random.split(key, 7)
     memory = networks.begin_memory(algo, (size // algo.rollout_length,))
     state = jax.random.normal(keys[6], (size, surroundings.SIZE))
@@ -87,7 +88,7 @@ def minibatch(key: jax.Array, params: Params, algo: AlgoConfig, size: int) -> Mi
 
 
 def methods(given: SpeedConfig, algo: AlgoConfig) -> dict[Launch | None, Gradient]:
-    """Makes what is timed: autodiff, without a launch, and the kernels with each."""
+    """Makes the timed methods: autodiff without a launch, and the kernels with each launch."""
     autodiff = jax.grad(losses.ppo_loss, has_aux=True)
     made: dict[Launch | None, Gradient] = {None: _of_samples(autodiff, algo)}
     if given.kernels != "none" and algo.memory == "none" and algo.critic == "observation":
@@ -111,7 +112,7 @@ def _of_samples(gradient: Callable[..., Any], algo: AlgoConfig) -> Gradient:
 def _compile(
     gradient: Gradient, steps: int, params: Params, samples: Minibatch
 ) -> timing.TimedProgram | str:
-    """Compiles as many steps along the gradient; what is said where that cannot be done."""
+    """Compiles `steps` steps along the gradient; returns the error's first line on failure."""
 
     def descend(params: Params, samples: Minibatch) -> tuple[Params, None]:
         def step(_: jax.Array, params: Params) -> Params:
@@ -122,14 +123,14 @@ def _compile(
 
     try:
         return timing.compile_program(descend, params, samples)
-    except JaxRuntimeError as error:  # more registers or memory of the chip than there is
+    except JaxRuntimeError as error:  # too few registers or too little memory on the chip
         return str(error).splitlines()[0]
 
 
 def _time(
     programs: Sequence[timing.TimedProgram], repeats: int, params: Params, samples: Any
 ) -> Any:
-    """Seconds of the calls of each program, which take their turns; the first is not counted."""
+    """Times the programs' calls alternately, s; the first call of each is a warm-up."""
     taken: list[list[float]] = [[] for _ in programs]
     for _ in range(1 + repeats):
         for program, seconds in zip(programs, taken, strict=True):
@@ -141,13 +142,13 @@ def _time(
 
 
 def _difference(one: Params, other: Params) -> float:
-    """Norm of the difference, of that of the other."""
+    """Returns the norm of the difference, divided by the norm of the second argument."""
     apart = jax.tree.map(jnp.subtract, one, other)
     return float(optax.tree.norm(apart) / optax.tree.norm(other))
 
 
 def lines(given: SpeedConfig, algo: AlgoConfig, size: int) -> Iterator[dict[str, Any]]:
-    """Measures one size of the minibatch; yields a line for each method."""
+    """Measures one size of the minibatch; yields one line per method."""
     init_key, key = jax.random.split(jax.random.key(0))
     sizes = observation.SIZE, programs.ACTION_SIZE
     more = surroundings.SIZE if algo.critic == "state" else 0

@@ -1,4 +1,4 @@
-"""A benchmark's own words of the command line, among those of `swarmjax.train`."""
+"""Parses a benchmark's own words of the command line, among those of `swarmjax.train`."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,17 +8,17 @@ from swarmjax.config.section import keys
 
 
 def load(cls: type[Section], words: Sequence[str]) -> Any:
-    """Makes a config of `key=value` words; lists have commas between their values.
+    """Makes a config from `key=value` words; commas separate the values of a list.
 
     Args:
-      cls: of the config.
-      words: of the command line.
+      cls: class of the config.
+      words: words of the command line.
 
     Returns:
       An instance of `cls`.
 
     Raises:
-      ConfigError: if a word is unsound.
+      ConfigError: if a word is invalid.
     """
     lists = {name for name, item in keys(cls).items() if "tuple" in str(item.type)}
     given = {}
@@ -31,17 +31,17 @@ def load(cls: type[Section], words: Sequence[str]) -> Any:
 
 
 def parse(cls: type[Section], words: Sequence[str]) -> tuple[Any, list[str]]:
-    """Makes a config of the words that are its keys.
+    """Makes a config from the words with its keys.
 
     Args:
-      cls: of the config.
-      words: of the command line.
+      cls: class of the config.
+      words: words of the command line.
 
     Returns:
       An instance of `cls`, and the other words.
 
     Raises:
-      ConfigError: if a word of `cls` is unsound.
+      ConfigError: if a word of `cls` is invalid.
     """
     known = section.names(cls)
     mine = [word for word in words if word.partition("=")[0] in known]

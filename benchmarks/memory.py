@@ -1,10 +1,12 @@
-"""How many bytes does an arena take on the card, and where?
+"""How many bytes does an arena take on the GPU, and where?
 
 `python -m benchmarks.memory arenas=65536 [key=value ...]` takes the keys of `swarmjax.train`,
-trains for two updates and prints a JSON line: the bytes that XLA's analysis of the compiled program
-gives, the peak of XLA's allocator, the peak of Warp's own, which XLA does not see, and by how much
-the card's free memory fell. A peak is one of a whole process, so one process measures one size;
-give XLA_PYTHON_CLIENT_PREALLOCATE=false, without which the last figure is XLA's share of the card.
+trains for two updates and prints a JSON line with four numbers: the bytes in XLA's analysis of the
+compiled program, the peak of XLA's allocator, the peak of Warp's own allocator, which XLA does not
+see, and the drop in the GPU's free memory.
+
+A peak covers a whole process, so measure one size per process. Set
+XLA_PYTHON_CLIENT_PREALLOCATE=false; otherwise the last number is the memory that XLA preallocates.
 On a CPU only the analysis is known.
 """
 
@@ -55,13 +57,13 @@ def result(settings: TrainConfig) -> dict[str, Any]:
 
 
 def free_bytes() -> int | None:
-    """Free memory of the first NVIDIA card, by Warp; None without either."""
+    """Returns the free memory of the first NVIDIA GPU from Warp; None without GPU or Warp."""
     card = _card()
     return None if card is None else int(card.free_memory)
 
 
 def warp_bytes(settings: TrainConfig) -> int | None:
-    """The most that Warp's allocator held at once; None where it is not used."""
+    """Returns the peak memory of Warp's allocator; None if it is not used."""
     card = _card()
     if card is None or dispatch.resolve_impl(settings.sim.impl) != "warp":
         return None
@@ -71,7 +73,7 @@ def warp_bytes(settings: TrainConfig) -> int | None:
 
 
 def _card() -> Any:
-    """Warp's first CUDA device; None if there is none, or no Warp."""
+    """Returns Warp's first CUDA device; None without CUDA or Warp."""
     if importlib.util.find_spec("warp") is None:
         return None
     import warp

@@ -1,8 +1,8 @@
-"""One arena of MuJoCo's C engine as an environment for trainers that know nothing of JAX.
+"""Provides one arena of MuJoCo's C engine as an environment for trainers without JAX.
 
-The arena is the judge's (`swarmjax.evaluate.engine_c`), with the reward of `task.reward` in
-NumPy. The judge asks a policy for actions; here that is one of a learner for each robot, of weight
-0, whose bias is the action.
+The arena is the judge's (`swarmjax.evaluate.engine_c`), with the reward of `task.reward` in NumPy.
+The judge takes its actions from a policy. Here the policy has one learner per robot with zero
+weights, and its bias is the action.
 """
 
 from dataclasses import replace
@@ -24,13 +24,13 @@ ACTION_SIZE = 2
 
 
 class Moved(NamedTuple):
-    """What a control step came to.
+    """The result of a control step.
 
     Attributes:
-      observation: [R, O].
-      reward: [R]; 0 for a robot that had arrived before.
+      observation: [R, O] observations.
+      reward: [R] rewards; 0 for a robot that had arrived before.
       arrived: [R] whether the robot has arrived.
-      over: whether all robots have, or the time is out.
+      over: whether all robots have arrived, or the time is up.
     """
 
     observation: np.ndarray
@@ -40,23 +40,23 @@ class Moved(NamedTuple):
 
 
 class MujocoArena:
-    """One arena; `reset` begins the next level, `step` moves it on.
+    """One arena; `reset` begins the next level, `step` takes a control step.
 
     Attributes:
-      judge: what holds for all of its levels.
-      arenas: [A=1] the arena as it stands; None before the first level.
+      judge: everything that all levels share.
+      arenas: [A=1] current state of the arena; None before the first level.
     """
 
     def __init__(self, settings: EvaluateConfig, first: int = 0) -> None:
-        """Compiles it.
+        """Compiles the arena.
 
         Args:
-          settings: of an evaluation: stage, robot, task, realism, substeps and seed of the levels.
+          settings: stage, robot, task, realism, substeps and seed of the levels.
           first: number of the first level.
 
         Raises:
-          ConfigError: if the reward has a term that `rewards` does not know, or robots go on after
-            arrival.
+          ConfigError: if `rewards` does not support a term of the reward, or robots keep driving
+            after arrival.
         """
         if settings.task.arrival != "latch":
             raise ConfigError(f"task.arrival is {settings.task.arrival}: give latch.")
@@ -65,13 +65,13 @@ class MujocoArena:
             if weight:
                 raise ConfigError(f"task.reward.{name} is {weight}: give 0.")
         robots = settings.stage.robots
-        told = replace(settings, action="mean")  # what it is told, and nothing drawn beside it
+        told = replace(settings, action="mean")  # exactly the given action, without sampling
         self.judge = engine_c.load(told, _puppet(told, np.zeros((robots, ACTION_SIZE))))
         self._number = first
         self.arenas: Arenas | None = None
 
     def reset(self) -> np.ndarray:
-        """Begins the next level; returns what its robots observe, [R, O]."""
+        """Begins the next level; returns its robots' observations [R, O]."""
         level = engine_c.draw_level(
             self.judge.stage, self.judge.spacing, self.judge.config.seed, self._number
         )
@@ -80,16 +80,16 @@ class MujocoArena:
         return self.arenas.observation[0]
 
     def step(self, action: np.ndarray) -> Moved:
-        """Moves the arena on by one control step.
+        """Advances the arena by one control step.
 
         Args:
-          action: [R, 2], -1..1 spans the command's range, what is beyond is clipped.
+          action: [R, 2] actions; -1..1 spans the command's range, larger values are clipped.
 
         Returns:
-          What it came to. The arena must be reset where it is over.
+          The result. The arena must be reset if `over` is true.
         """
         before = self.arenas
-        assert before is not None  # reset comes first
+        assert before is not None  # `reset` must be called first
         puppet = _puppet(self.judge.config, action)
         after = engine_c.step(replace(self.judge, policy=puppet), before)
         self.arenas = after
@@ -104,7 +104,7 @@ class MujocoArena:
 
 
 def _puppet(settings: EvaluateConfig, action: np.ndarray) -> Policy:
-    """A policy that does what it is told, [R, 2]."""
+    """Makes a policy that always takes the given actions [R, 2]."""
     robots, none = len(action), np.zeros((len(action), observation.SIZE), np.float32)
     encoding = resolve_encoding(settings.task, settings.realism)
     return Policy(
@@ -125,15 +125,15 @@ def _puppet(settings: EvaluateConfig, action: np.ndarray) -> Policy:
 
 
 def rewards(judge: Judge, before: Arenas, after: Arenas) -> np.ndarray:
-    """The reward of a control step, as `task.reward` adds it up in JAX.
+    """Computes the reward of a control step, as `task.reward` does in JAX.
 
     Args:
-      judge: what the arenas share.
-      before: [A].
-      after: [A], a control step later.
+      judge: everything that the arenas share.
+      before: [A] arenas before the control step.
+      after: [A] arenas after it.
 
     Returns:
-      [A, R]; 0 for robots that had arrived before.
+      [A, R] rewards; 0 for robots that had arrived before.
     """
     weights, active = judge.config.task.reward, ~before.outcome.arrived
     way = [observation.to_target(each.pose, each.target, np)[0] for each in (before, after)]
@@ -144,5 +144,5 @@ def rewards(judge: Judge, before: Arenas, after: Arenas) -> np.ndarray:
 
 
 def load_settings(words: list[str]) -> EvaluateConfig:
-    """Makes the settings of an arena of `key=value` words of `swarmjax.evaluate`."""
+    """Makes the settings of an arena from `key=value` words of `swarmjax.evaluate`."""
     return load_levels(EvaluateConfig, ["policy=none", *words])

@@ -1,4 +1,4 @@
-"""Pages of docs/ that a command writes a part of, between two markers."""
+"""Inserts generated parts into pages of docs/, between two markers."""
 
 from swarmjax.config import ConfigError
 
@@ -7,16 +7,16 @@ def insert(text: str, page: str, marker: str, part: str) -> str:
     """Puts a part between `<!-- marker -->` and `<!-- /marker -->`.
 
     Args:
-      text: of the whole page.
-      page: its name, for an error.
-      marker: the word in its markers.
-      part: what comes between.
+      text: text of the whole page.
+      page: name of the page, for an error.
+      marker: the word in the markers.
+      part: text to put between the markers.
 
     Returns:
       The new text.
 
     Raises:
-      ConfigError: the page has not both markers, in order.
+      ConfigError: if the page does not have both markers in order.
     """
     begin, end = f"<!-- {marker} -->", f"<!-- /{marker} -->"
     before, begun, rest = text.partition(begin)

@@ -1,4 +1,4 @@
-"""Two programs timed in turn, and what can be said of the ratio of their times."""
+"""Times two programs alternately, and gives intervals for the ratio of their times."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -15,12 +15,12 @@ from swarmjax.training import program as programs
 
 
 class Arm:
-    """One program with its state, that trains on with every call.
+    """One program with its state; every call continues training.
 
     Attributes:
-      settings: its config.
-      compile_s: seconds that compiling took.
-      transitions: robot steps that all seeds were trained on by the last call.
+      settings: the program's config.
+      compile_s: seconds of compiling.
+      transitions: robot steps of the last call, over all seeds.
     """
 
     def __init__(self, settings: TrainConfig) -> None:
@@ -43,16 +43,16 @@ class Arm:
 
 
 def time_in_turn(one: Arm, other: Arm, updates: int, pairs: int) -> list[tuple[float, float]]:
-    """Times calls of two arms in turn, after one of each that is not counted.
+    """Times calls of two arms alternately, after one warm-up call of each.
 
     Args:
       one: an arm.
-      other: another.
-      updates: of each call.
-      pairs: of calls; which arm comes first changes from pair to pair.
+      other: another arm.
+      updates: number of updates per call.
+      pairs: number of pairs of calls; the arm that comes first alternates.
 
     Returns:
-      Seconds of `one` and of `other`, a pair each.
+      Seconds of `one` and `other` for each pair.
     """
     for each in (one, other):
         each.time(updates)
@@ -60,15 +60,15 @@ def time_in_turn(one: Arm, other: Arm, updates: int, pairs: int) -> list[tuple[f
 
 
 def in_turn[T](one: Callable[[], T], other: Callable[[], T], pairs: int) -> list[tuple[T, T]]:
-    """Calls two functions in turn; which comes first changes from pair to pair.
+    """Calls two functions alternately; the one that comes first changes from pair to pair.
 
     Args:
       one: a function.
-      other: another.
-      pairs: of calls.
+      other: another function.
+      pairs: number of pairs of calls.
 
     Returns:
-      What `one` and `other` returned, a pair each.
+      Results of `one` and `other` for each pair.
     """
     found = []
     for i in range(pairs):
@@ -79,14 +79,14 @@ def in_turn[T](one: Callable[[], T], other: Callable[[], T], pairs: int) -> list
 
 
 def median(values: Sequence[float]) -> tuple[float, float, float]:
-    """The median, and an interval that holds the true one with at least 95 %.
+    """Returns the median and an interval that contains the true median with at least 95 %.
 
-    Of n independent values as many lie below the true median as heads fall in n throws of a coin,
-    whatever their distribution: the interval runs from the k-th smallest to the k-th largest, with
-    the largest k that leaves at most 2.5 % on either side.
+    For any distribution, the number of n independent values below the true median is distributed
+    like the number of heads in n coin tosses. The interval runs from the k-th smallest to the k-th
+    largest value, with the largest k that leaves at most 2.5 % on each side.
 
     Args:
-      values: at least 6.
+      values: at least 6 values.
 
     Returns:
       Median, lower and upper end.

@@ -1,9 +1,9 @@
-"""How fast does BenchMARL train: its IPPO on VMAS's navigation, in PyTorch?
+"""How fast does BenchMARL train with IPPO on VMAS's navigation, in PyTorch?
 
-`python -m benchmarks.peer_benchmarl [arenas=4096] [device=cuda] ...` needs `torch-peers.txt`
-and prints a JSON line for each number of arenas: seconds of whole iterations (collecting and
-learning, nothing logged or evaluated), the first two left out. Its own numbers are kept but for
-the task's, and for networks, rollout, epochs and minibatches, which are ours.
+`python -m benchmarks.peer_benchmarl [arenas=4096] [device=cuda] ...` needs `torch-peers.txt` and
+prints a JSON line for each number of arenas: seconds of whole iterations (collecting and learning,
+without logging or evaluation), except the first two. The task, networks, rollout, epochs and
+minibatches have our settings. All other settings are BenchMARL's own.
 """
 
 import contextlib
@@ -20,19 +20,19 @@ from benchmarks.peers import PeerConfig
 from swarmjax import provenance
 from swarmjax.config import about, to_dict
 
-_WARM = 2  # iterations that are not counted
+_WARM = 2  # warm-up iterations
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarlConfig(PeerConfig):
-    """How BenchMARL is measured; `steps` is not read."""
+    """Settings for measuring BenchMARL; `steps` is not used."""
 
     device: Literal["auto", "cuda", "cpu"] = field(
-        default="auto", metadata=about("of PyTorch; auto: cuda where there is one")
+        default="auto", metadata=about("device of PyTorch; auto: cuda if there is one")
     )
-    rollout: int = field(default=32, metadata=about("control steps of an iteration", 1, 10**4))
+    rollout: int = field(default=32, metadata=about("control steps per iteration", 1, 10**4))
     epochs: int = field(default=4, metadata=about("passes over a rollout", 1, 100))
-    minibatches: int = field(default=8, metadata=about("gradient steps of a pass", 1, 1000))
+    minibatches: int = field(default=8, metadata=about("gradient steps per pass", 1, 1000))
 
 
 def experiment(
@@ -41,14 +41,14 @@ def experiment(
     """Makes BenchMARL's experiment.
 
     Args:
-      config: the numbers.
-      arenas: how many.
-      device: of PyTorch.
-      folder: for what it insists to write.
-      callback: of BenchMARL's kind.
+      config: the settings.
+      arenas: number of arenas.
+      device: device of PyTorch.
+      folder: folder for the files that BenchMARL always writes.
+      callback: a BenchMARL callback.
 
     Returns:
-      It, ready to run.
+      The experiment, ready to run.
     """
     algorithms = peers.find("benchmarl.algorithms", peers.TORCH)
     environments = peers.find("benchmarl.environments", peers.TORCH)
@@ -79,7 +79,7 @@ def experiment(
 
 
 def changes(config: BenchmarlConfig, arenas: int, device: str, folder: str) -> dict[str, Any]:
-    """What is not as BenchMARL has it: batch, device, and nothing that is written or evaluated."""
+    """Returns changes to BenchMARL's settings: batch, device, no files and no evaluation."""
     frames = arenas * config.rollout
     return {
         "sampling_device": device,
@@ -102,7 +102,7 @@ def changes(config: BenchmarlConfig, arenas: int, device: str, folder: str) -> d
 
 
 def clock(torch: Any, ends: list[float]) -> Any:
-    """Makes what BenchMARL calls when the learning of an iteration is over."""
+    """Makes the callback for the end of an iteration's learning."""
 
     def note(self: Any, training_td: Any, group: str) -> None:
         if torch.cuda.is_available():
@@ -110,13 +110,13 @@ def clock(torch: Any, ends: list[float]) -> Any:
         ends.append(time.perf_counter())
 
     base = peers.find("benchmarl.experiment.callback", peers.TORCH).Callback
-    # It pickles its callbacks, and finds no class that was made here.
+    # BenchMARL pickles its callbacks, and cannot find a class defined in a function.
     members = {"on_train_end": note, "__reduce__": lambda self: (object, ())}
     return type("Clock", (base,), members)()
 
 
 def results(config: BenchmarlConfig) -> Iterator[dict[str, Any]]:
-    """Trains with every number of arenas; yields a line each."""
+    """Trains with every number of arenas; yields one line each."""
     torch = peers.find("torch", peers.TORCH)
     device = peers.torch_device(torch, config.device)
     for arenas in config.arenas:

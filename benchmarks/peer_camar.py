@@ -1,9 +1,9 @@
-"""How fast is CAMAR with differential drives, the nearest of JAX's continuous path finders?
+"""How fast is CAMAR with differential drives, the most similar continuous path finder in JAX?
 
 `python -m benchmarks.peer_camar [arenas=4096,65536] ...` needs the extra `camar` and prints a JSON
-line for each number of arenas: random actions, `steps` control steps a call in one compiled scan.
-Resets are CAMAR's own optimistic ones: one fresh map is drawn for every `reset_ratio` arenas and
-step, and all of those that end in it share it.
+line for each number of arenas. It times calls of `steps` control steps with random actions, each
+call one compiled scan. Resets are CAMAR's own optimistic ones: each step draws one fresh map per
+`reset_ratio` arenas, and the arenas that end in this step share these maps.
 """
 
 import sys
@@ -22,7 +22,7 @@ from swarmjax.config import about
 
 FRAMESKIP = 2  # CAMAR's own default: three substeps
 DT = 0.032 / (FRAMESKIP + 1)  # s
-CELLS = 6  # on a side; with 0.2 m each the arena is 1.2 m
+CELLS = 6  # per side; with 0.2 m each the arena is 1.2 m wide
 COUNTED = {
     "step": "control step: three substeps of penalty contacts between discs in the plane, the "
     "vectors to the nearest objects instead of rays, reward",
@@ -33,13 +33,13 @@ COUNTED = {
 
 @dataclass(frozen=True, kw_only=True)
 class CamarConfig(PeerConfig):
-    """How CAMAR is measured."""
+    """Settings for measuring CAMAR."""
 
     reset_ratio: int = field(default=64, metadata=about("arenas that share a reset", 1, 2**20))
 
 
 def task(config: PeerConfig) -> dict[str, Any]:
-    """The task's numbers as `camar_v0` takes them; lengths in m."""
+    """Returns the task's settings for `camar_v0`, with lengths in m."""
     return {
         "map_generator": "random_grid",
         "dynamic": "DiffDriveDynamic",
@@ -66,7 +66,7 @@ def task(config: PeerConfig) -> dict[str, Any]:
 
 
 def results(config: CamarConfig) -> Iterator[dict[str, Any]]:
-    """Measures every number of arenas; yields a line each."""
+    """Measures every number of arenas; yields one line each."""
     camar = peers.find("camar", "the extra camar")
     wrappers = peers.find("camar.wrappers", "the extra camar")
     for arenas in config.arenas:
@@ -95,7 +95,7 @@ def results(config: CamarConfig) -> Iterator[dict[str, Any]]:
 
 
 def _steps(world: Any, config: PeerConfig, carry: Any, _: None) -> tuple[Any, jax.Array]:
-    """Steps all arenas with random actions; returns what depends on all of it."""
+    """Steps all arenas with random actions; returns a value that depends on every result."""
 
     def body(carry: Any, _: None) -> tuple[Any, jax.Array]:
         state, key = carry

@@ -1,12 +1,14 @@
-"""How fast does JaxMARL train: its IPPO on JaxNav, rollout and update in one program?
+"""How fast does JaxMARL train JaxNav with IPPO, with rollout and update in one program?
 
 `python -m benchmarks.peer_jaxmarl_ippo [arenas=4096,16384] ...` needs the extra `jaxmarl` and
-prints a JSON line for each number of arenas. JaxMARL's scripts are not in its package and have no
-configuration for JaxNav; this does what `baselines/IPPO/ippo_ff_mabrax.py` does (commit c793d09),
-written anew: networks of two layers of 64, one policy for all robots, a clipped value loss,
-advantages normalised in each minibatch, samples shuffled one by one. Learning rate, costs and clip
-are those of its configuration; rollout, epochs and minibatches are ours, so that a batch is as
-large. Episodes begin anew from a pool of states, the best case of `benchmarks.peer_jaxnav`.
+prints a JSON line for each number of arenas.
+
+JaxMARL's scripts are not in its package and have no configuration for JaxNav. This file is a
+rewrite of `baselines/IPPO/ippo_ff_mabrax.py` (commit c793d09): networks with two layers of 64, one
+policy for all robots, a clipped value loss, advantages normalised in each minibatch, and samples
+shuffled individually. Learning rate, costs and clip are from its configuration. Rollout, epochs and
+minibatches are ours, so batches have the same size. Episodes start from a pool of states, the best
+case of `benchmarks.peer_jaxnav`.
 """
 
 import sys
@@ -37,17 +39,17 @@ Pool = tuple[Any, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class IppoConfig(PeerConfig):
-    """How JaxMARL's trainer is measured; `steps` is not read."""
+    """Settings for measuring JaxMARL's trainer; `steps` is not used."""
 
-    rollout: int = field(default=32, metadata=about("control steps of an update", 1, 10**4))
+    rollout: int = field(default=32, metadata=about("control steps per update", 1, 10**4))
     epochs: int = field(default=4, metadata=about("passes over a rollout", 1, 100))
-    minibatches: int = field(default=8, metadata=about("gradient steps of a pass", 1, 1000))
-    updates: int = field(default=4, metadata=about("updates of a call", 1, 1000))
-    pool: int = field(default=1024, metadata=about("states that episodes begin from", 1, 2**20))
+    minibatches: int = field(default=8, metadata=about("gradient steps per pass", 1, 1000))
+    updates: int = field(default=4, metadata=about("updates per call", 1, 1000))
+    pool: int = field(default=1024, metadata=about("number of start states in the pool", 1, 2**20))
 
 
 class ActorCritic(nn.Module):
-    """Mean of the action, logarithm of its deviation, and value: [B, O] -> [B, U], [U], [B]."""
+    """Mean action, logarithm of its standard deviation, and value: [B, O] -> [B, U], [U], [B]."""
 
     @nn.compact
     def __call__(self, seen: Array) -> tuple[Array, Array, Array]:
@@ -68,7 +70,7 @@ def _torso(seen: Array) -> Array:
 
 
 class Transition(NamedTuple):
-    """[T, B, ...], or [B, ...]: what was seen and done, and what came of it."""
+    """Observations, actions and their results, [T, B, ...] or [B, ...]."""
 
     seen: Array
     action: Array
@@ -79,7 +81,7 @@ class Transition(NamedTuple):
 
 
 class Carry(NamedTuple):
-    """What changes: parameters, optimiser, states of the arenas, what is seen [A R, O], a key."""
+    """The changing state: parameters, optimiser, arenas, observations [A R, O], a random key."""
 
     params: Any
     optimizer: Any
@@ -90,7 +92,7 @@ class Carry(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Ippo:
-    """What fixes the program."""
+    """The fixed parts of the program."""
 
     world: Any
     config: IppoConfig
@@ -100,7 +102,7 @@ class Ippo:
 
 
 def load(world: Any, config: IppoConfig, arenas: int) -> Ippo:
-    """Makes the trainer for so many arenas."""
+    """Makes the trainer for a number of arenas."""
     optimizer = optax.chain(
         optax.clip_by_global_norm(MAX_GRAD_NORM), optax.adam(LEARNING_RATE, eps=1e-5)
     )
@@ -117,7 +119,7 @@ def init(ippo: Ippo, pool: Pool) -> Carry:
 
 
 def _flat(ippo: Ippo, by_robot: dict[str, Array]) -> Array:
-    """Puts [A, ...] of each robot, by name, into [R A, ...]."""
+    """Joins arrays [A, ...] of each robot, by name, to one array [R A, ...]."""
     return jnp.concatenate([by_robot[name] for name in ippo.world.agents])
 
 
@@ -130,7 +132,7 @@ def _log_prob(mean: Array, log_std: Array, action: Array) -> Array:
 
 
 def _step(ippo: Ippo, pool: Pool, carry: Carry, _: None) -> tuple[Carry, Transition]:
-    """One control step of all arenas."""
+    """Takes one control step in all arenas."""
     key, action_key, step_key = jax.random.split(carry.key, 3)
     mean, log_std, value = _apply(ippo.network, carry.params, carry.seen)
     action = mean + jnp.exp(log_std) * jax.random.normal(action_key, mean.shape)
@@ -152,7 +154,7 @@ def _step(ippo: Ippo, pool: Pool, carry: Carry, _: None) -> tuple[Carry, Transit
 
 
 def _advantages(path: Transition, last: Array) -> Array:
-    """Generalised advantages [T, B], back from the value [B] behind the last step."""
+    """Computes generalised advantages [T, B], backwards from the value [B] after the last step."""
 
     def back(carry: tuple[Array, Array], step: Transition) -> tuple[tuple[Array, Array], Array]:
         gae, following = carry
@@ -169,7 +171,7 @@ Sample = tuple[Transition, Array, Array]  # with advantage and return
 
 
 def _loss(network: ActorCritic, params: Any, sample: Sample) -> Array:
-    """The loss of a minibatch [B]."""
+    """Computes the loss of a minibatch [B]."""
     path, advantage, target = sample
     mean, log_std, value = _apply(network, params, path.seen)
     near = path.value + jnp.clip(value - path.value, -CLIP, CLIP)
@@ -182,7 +184,7 @@ def _loss(network: ActorCritic, params: Any, sample: Sample) -> Array:
 
 
 def _epoch(ippo: Ippo, batch: Sample, progress: tuple[Any, Any], key: Array) -> tuple[Any, Array]:
-    """One pass over all samples [B], shuffled one by one."""
+    """Trains one pass over all samples [B], shuffled individually."""
     order = jax.random.permutation(key, len(batch[1]))
     parts = jax.tree.map(
         lambda x: x[order].reshape(ippo.config.minibatches, -1, *x.shape[1:]), batch
@@ -199,7 +201,7 @@ def _epoch(ippo: Ippo, batch: Sample, progress: tuple[Any, Any], key: Array) -> 
 
 
 def update(ippo: Ippo, pool: Pool, carry: Carry, _: None) -> tuple[Carry, Array]:
-    """One update: a rollout of all arenas, then the epochs; returns the mean loss too."""
+    """Runs one update, a rollout of all arenas and then the epochs; also returns the mean loss."""
     carry, path = jax.lax.scan(partial(_step, ippo, pool), carry, length=ippo.config.rollout)
     last = _apply(ippo.network, carry.params, carry.seen)[2]
     advantage = _advantages(path, last)
@@ -214,7 +216,7 @@ def update(ippo: Ippo, pool: Pool, carry: Carry, _: None) -> tuple[Carry, Array]
 
 
 def results(config: IppoConfig) -> Iterator[dict[str, Any]]:
-    """Trains with every number of arenas; yields a line each."""
+    """Trains with every number of arenas; yields one line each."""
     world = peer_jaxnav.make(config)
     pool = peer_jaxnav.draw_pool(world, config.pool, config.seed)
     for arenas in config.arenas:

@@ -1,10 +1,10 @@
 """How fast is JaxNav, JaxMARL's navigation of differential drives with range sensors?
 
 `python -m benchmarks.peer_jaxnav [arenas=4096,65536] [step=pool] ...` needs the extra `jaxmarl` and
-prints a JSON line for each number of arenas and each way to step: `step_env` with a pool of
-`pool` states that were drawn beforehand (its best case), and `step` as it is, which draws a whole
-map for every arena and step and throws nearly all of them away. Random actions, `steps` control
-steps a call in one compiled scan.
+prints a JSON line for each number of arenas and each way to step. `pool` uses `step_env` with a
+pool of `pool` states that were drawn beforehand (JaxNav's best case). `default` uses `step`
+unchanged, which draws a whole map for every arena and step and discards nearly all of them. It
+times calls of `steps` control steps with random actions, each call one compiled scan.
 """
 
 import sys
@@ -22,11 +22,11 @@ from benchmarks.peers import PeerConfig
 from swarmjax import epuck, provenance
 from swarmjax.config import about
 
-# JaxNav's cells are 1 m and its robots have a radius of 0.3 m: all lengths of ours are put in
-# radii of 0.037 m. Rays of 0.04 m are 0.32 m; samples along them are as far apart as by default.
+# JaxNav's cells are 1 m wide and its robots have a radius of 0.3 m, so our lengths are scaled by
+# 0.3 / 0.037. Our rays of 0.04 m become 0.32 m. Samples along them have the default spacing.
 RADIUS = 0.3
 BEAMS, RANGE, RESOLUTION = 8, 0.3, 0.05
-CELLS = 7  # of which the outer ones are wall
+CELLS = 7  # per side; the outer ones are wall
 RESETS = {
     "pool": "one of a pool of states that were drawn beforehand, at random: its best case",
     "default": "a new map for every arena and step, used where an episode ends: its default",
@@ -40,16 +40,16 @@ COUNTED = {
 
 @dataclass(frozen=True, kw_only=True)
 class JaxNavConfig(PeerConfig):
-    """How JaxNav is measured."""
+    """Settings for measuring JaxNav."""
 
     step: tuple[Literal["pool", "default"], ...] = field(
-        default=("pool", "default"), metadata=about("where an ended episode begins anew")
+        default=("pool", "default"), metadata=about("how an ended episode starts again")
     )
     pool: int = field(default=1024, metadata=about("states in the pool", 1, 2**20))
 
 
 def task(config: PeerConfig) -> dict[str, Any]:
-    """The task's numbers as `jaxmarl.make` takes them."""
+    """Returns the task's settings for `jaxmarl.make`."""
     return {
         "num_agents": config.robots,
         "act_type": "Continuous",
@@ -68,12 +68,12 @@ def task(config: PeerConfig) -> dict[str, Any]:
 
 
 def make(config: PeerConfig) -> Any:
-    """Makes the environment; raises MissingPeerError where JaxMARL is not installed."""
+    """Makes the environment; raises MissingPeerError if JaxMARL is not installed."""
     return peers.find("jaxmarl", "the extra jaxmarl").make("jaxnav", **task(config))
 
 
 def results(config: JaxNavConfig) -> Iterator[dict[str, Any]]:
-    """Measures every number of arenas and way to step; yields a line each."""
+    """Measures every number of arenas and way to step; yields one line each."""
     world = make(config)
     pool = draw_pool(world, config.pool, config.seed)
     for arenas in config.arenas:
@@ -100,13 +100,13 @@ def results(config: JaxNavConfig) -> Iterator[dict[str, Any]]:
 
 
 def draw_pool(world: Any, size: int, seed: int) -> tuple[Any, Any]:
-    """Draws observations and states [P] with which episodes begin."""
+    """Draws observations and states [P] for the start of episodes."""
     keys = jax.random.split(jax.random.key(seed), size)
     return jax.jit(jax.vmap(world.reset))(keys)
 
 
 def begin(pool: tuple[Any, Any], arenas: int) -> tuple[Any, Any]:
-    """First observations and states [A], of the pool in turn."""
+    """Takes the first observations and states [A] from the pool, in order."""
     index = jnp.arange(arenas) % len(jax.tree.leaves(pool)[0])
     return jax.tree.map(lambda x: x[index], pool)
 
@@ -114,18 +114,18 @@ def begin(pool: tuple[Any, Any], arenas: int) -> tuple[Any, Any]:
 def step(
     world: Any, how: str, pool: tuple[Any, Any], keys: Array, states: Any, actions: Any
 ) -> tuple[Any, Any, Any, Any, Any]:
-    """Steps all arenas as `how` says; ended ones begin anew.
+    """Steps all arenas in the way `how`, and resets ended ones.
 
     Args:
-      world: JaxNav.
+      world: the environment, JaxNav.
       how: a key of `RESETS`.
-      pool: of `draw_pool`.
-      keys: [A].
-      states: [A].
-      actions: [A, 2] of each robot, by name.
+      pool: start states from `draw_pool`.
+      keys: [A] random keys.
+      states: [A] states.
+      actions: [A, 2] actions of each robot, by name.
 
     Returns:
-      What JaxMARL's `step` returns, for all arenas: observations, states, rewards, dones, infos.
+      Results of JaxMARL's `step` for all arenas: observations, states, rewards, dones, infos.
     """
     if how == "default":
         return jax.vmap(world.step)(keys, states, actions)
@@ -144,7 +144,7 @@ def step(
 def _steps(
     world: Any, config: PeerConfig, how: str, carry: tuple[Any, Array], pool: Any
 ) -> tuple[tuple[Any, Array], Array]:
-    """Steps all arenas with random actions; returns what depends on all of it."""
+    """Steps all arenas with random actions; returns a value that depends on every result."""
     arenas = len(jax.tree.leaves(carry[0])[0])
     low, high = jnp.array([0.0, -epuck.MAX_TURN_RATE]), jnp.array([1.0, epuck.MAX_TURN_RATE])
 

@@ -1,9 +1,9 @@
-"""How fast is VMAS's navigation scenario, the nearest of PyTorch's swarm environments?
+"""How fast is VMAS's navigation scenario, the most similar swarm environment in PyTorch?
 
 `python -m benchmarks.peer_vmas [arenas=4096,65536] [device=cuda] ...` needs `torch-peers.txt` and
-prints a JSON line for each number of arenas: random actions drawn on the device, `steps` control
-steps a call. VMAS leaves resets to the caller, so none falls into a timed call, which is its best
-case; how long a reset of all arenas takes stands beside.
+prints a JSON line for each number of arenas. It times calls of `steps` control steps with random
+actions drawn on the device. VMAS leaves resets to the caller, so timed calls have no resets, which
+is its best case. The line also has the time of a reset of all arenas.
 """
 
 import sys
@@ -28,15 +28,15 @@ COUNTED = {
 
 @dataclass(frozen=True, kw_only=True)
 class VmasConfig(PeerConfig):
-    """How VMAS is measured."""
+    """Settings for measuring VMAS."""
 
     device: Literal["auto", "cuda", "cpu"] = field(
-        default="auto", metadata=about("of PyTorch; auto: cuda where there is one")
+        default="auto", metadata=about("device of PyTorch; auto: cuda if there is one")
     )
 
 
 def scenario(config: PeerConfig) -> dict[str, Any]:
-    """The task's numbers as VMAS's navigation takes them; in m, the arena is 1.2 m wide."""
+    """Returns the task's settings for VMAS's navigation, in m; the arena is 1.2 m wide."""
     return {
         "scenario": "navigation",
         "n_agents": config.robots,
@@ -54,7 +54,7 @@ def scenario(config: PeerConfig) -> dict[str, Any]:
 
 
 def results(config: VmasConfig) -> Iterator[dict[str, Any]]:
-    """Measures every number of arenas; yields a line each."""
+    """Measures every number of arenas; yields one line each."""
     torch, vmas = peers.find("torch", peers.TORCH), peers.find("vmas", peers.TORCH)
     device = peers.torch_device(torch, config.device)
     for arenas in config.arenas:
@@ -77,7 +77,7 @@ def results(config: VmasConfig) -> Iterator[dict[str, Any]]:
 
 
 def _steps(torch: Any, world: Any, steps: int) -> None:
-    """Steps all arenas with random actions, and waits for the end."""
+    """Steps all arenas with random actions, and waits for the device."""
     actions = torch.rand(steps, world.n_agents, world.num_envs, 2, device=world.device) * 2 - 1
     for step in actions:
         world.step(list(step))

@@ -1,7 +1,7 @@
-"""What benchmarks of other projects share: what they are asked, and what their lines say.
+"""Shares code between benchmarks of other projects: their settings, and the entries of their lines.
 
-A peer is an optional extra, or stands in `torch-peers.txt`. Where one is missing, its benchmark
-prints one line with the reason as `skipped`, and ends well.
+A peer is an optional extra, or is listed in `torch-peers.txt`. If a peer is missing, its benchmark
+prints one line with the reason as `skipped`, and exits with code 0.
 """
 
 import importlib
@@ -22,20 +22,20 @@ TORCH = "benchmarks/torch-peers.txt"
 
 
 class MissingPeerError(Exception):
-    """A peer that is not installed, or does not import, in one sentence."""
+    """A peer is not installed or cannot be imported, explained in one sentence."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PeerConfig(Section):
-    """How a peer's environment is measured: as ours, where it can be."""
+    """Settings for measuring a peer's environment, equal to ours where possible."""
 
     arenas: tuple[int, ...] = field(
         default=(65536,), metadata=about("numbers of arenas, one after the other", 1, 2**20)
     )
-    robots: int = field(default=5, metadata=about("robots of an arena", 1, 100))
-    steps: int = field(default=64, metadata=about("control steps of a call", 1, 10**6))
-    repeats: int = field(default=5, metadata=about("calls that are timed", 1, 1000))
-    step_limit: int = field(default=500, metadata=about("control steps of an episode", 1, 10**6))
+    robots: int = field(default=5, metadata=about("robots per arena", 1, 100))
+    steps: int = field(default=64, metadata=about("control steps per call", 1, 10**6))
+    repeats: int = field(default=5, metadata=about("number of timed calls", 1, 1000))
+    step_limit: int = field(default=500, metadata=about("control steps per episode", 1, 10**6))
     seed: int = field(default=0, metadata=about("random seed", 0, 2**31 - 1))
 
 
@@ -43,18 +43,18 @@ def find(module: str, source: str) -> Any:
     """Imports a module of a peer.
 
     Args:
-      module: its name.
-      source: what brings it, an extra of pyproject.toml or a file of requirements.
+      module: name of the module.
+      source: where it comes from, an extra of pyproject.toml or a requirements file.
 
     Returns:
       The module.
 
     Raises:
-      MissingPeerError: if it cannot be imported.
+      MissingPeerError: if the module cannot be imported.
     """
     try:
         return importlib.import_module(module)
-    except Exception as error:  # whatever a half-installed library raises as it is imported
+    except Exception as error:  # a half-installed library may raise anything
         reason = str(error).strip().partition("\n")[0].rstrip(".")
         raise MissingPeerError(
             f"{module} cannot be imported ({reason}): install {source}."
@@ -62,7 +62,7 @@ def find(module: str, source: str) -> Any:
 
 
 def run(name: str, main: Callable[[Sequence[str]], int], cls: type[Section]) -> int:
-    """Runs a peer's benchmark as `command.run` does; without the peer it says so in a line."""
+    """Runs a peer's benchmark as `command.run` does; prints a `skipped` line without the peer."""
 
     def run_or_skip(words: Sequence[str]) -> int:
         try:
@@ -75,30 +75,30 @@ def run(name: str, main: Callable[[Sequence[str]], int], cls: type[Section]) -> 
 
 
 def write(lines: Iterator[dict[str, Any]] | Sequence[dict[str, Any]]) -> None:
-    """Prints JSON lines, each as soon as it is there."""
+    """Prints each JSON line as soon as it is ready."""
     for line in lines:
         sys.stdout.write(json.dumps(line) + "\n")
         sys.stdout.flush()
 
 
 def versions(*packages: str) -> dict[str, str]:
-    """Versions of these packages, besides those of `provenance.versions`."""
+    """Returns the versions of these packages in addition to `provenance.versions`."""
     return provenance.versions() | {name: importlib.metadata.version(name) for name in packages}
 
 
 def speed(
     config: PeerConfig, arenas: int, substeps: int | None, calls_s: list[float]
 ) -> dict[str, Any]:
-    """The fields of a line that say how fast an environment was.
+    """Returns the entries of a line about an environment's speed.
 
     Args:
-      config: what was measured.
-      arenas: how many.
-      substeps: physics steps of a control step; None where there is no such thing.
+      config: settings of the measurement.
+      arenas: number of arenas.
+      substeps: physics steps per control step; None if there are none.
       calls_s: seconds of each call.
 
     Returns:
-      Fields under the names of docs/interface.md.
+      Entries with the names in docs/interface.md.
     """
     rate = config.steps * arenas / statistics.median(calls_s)
     return {
@@ -115,14 +115,14 @@ def speed(
 
 
 def torch_device(torch: Any, wanted: str) -> str:
-    """The device that PyTorch is to use, where `auto` leaves it open."""
+    """Returns PyTorch's device; chooses one for `auto`."""
     if wanted != "auto":
         return wanted
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
 def torch_device_name(torch: Any, device: str) -> str:
-    """Names a device of PyTorch's as `provenance.device` does one of JAX's."""
+    """Names a PyTorch device as `provenance.device` names a JAX device."""
     if device == "cuda":
         return f"{torch.cuda.device_count()} x {torch.cuda.get_device_name(0)}"
     return f"CPU {platform.machine()}, {provenance.cores()} cores"

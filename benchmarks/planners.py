@@ -1,9 +1,9 @@
-"""Local planners of the package `navground`, for robots that know all positions and the map.
+"""Drives robots that know all positions and the map with local planners of `navground`.
 
-`orca` (van den Berg et al. 2011, reciprocal collision avoidance), `hrvo` (Snape et al. 2011, hybrid
-reciprocal velocity obstacles), `hl` (Guzzi et al. 2013, human-like navigation) and `social_force`
-(Helbing & Molnar 1995) drive along the way-points of `benchmarks.way_points`, with the limits of
-the robot's wheels. Robots that have arrived stand still and are obstacles like any other.
+The planners are `orca` (van den Berg et al. 2011, reciprocal collision avoidance), `hrvo` (Snape et
+al. 2011, hybrid reciprocal velocity obstacles), `hl` (Guzzi et al. 2013, human-like navigation) and
+`social_force` (Helbing & Molnar 1995). They follow the way-points of `benchmarks.way_points` within
+the limits of the robot's wheels. Arrived robots stand still and are obstacles for the others.
 """
 
 import importlib
@@ -19,25 +19,25 @@ from swarmjax.evaluate.engine_c import Arenas
 from swarmjax.evaluate.judge import Judge
 from swarmjax.sim.drive import Drive
 
-# What differs from the package's defaults, which are those of pedestrians or of robots some times
-# as large and fast; m and s. Chosen on levels of s6 and crowd_dense with seed 7.
+# Settings that differ from the package's defaults, in m and s. The defaults are for pedestrians or
+# for robots several times as large and fast. Chosen on levels of s6 and crowd_dense with seed 7.
 SETTINGS: dict[str, tuple[str, dict[str, Any]]] = {
     "orca": ("ORCA", {"time_horizon": 2.0, "static_time_horizon": 0.5}),
     "hrvo": ("HRVO", {}),
     "hl": ("HL", {}),
     "social_force": ("SocialForce", {"u_a": 0.1, "u_r": 0.012, "v_a": 0.3, "v_r": 0.02}),
 }
-SAFETY = 0.004  # m that a planner adds to the hull
-ROTATION = 0.2  # s in which it turns to where it wants to go
-SIGHT = 0.4  # m within which robots and obstacles are told; driven in 3.2 s at full speed
+SAFETY = 0.004  # m; safety margin that a planner adds to the hull
+ROTATION = 0.2  # s; time in which a robot turns to its desired direction
+SIGHT = 0.4  # m; planners see robots and obstacles this far, 3.2 s of driving at full speed
 
 
 class PlannersMemory(NamedTuple):
-    """What is known of arenas.
+    """The planners' knowledge of arenas.
 
     Attributes:
-      scene: [A] of `Scene`.
-      pose: [A, R, 3] a control step ago, m and rad.
+      scene: [A] scenes.
+      pose: [A, R, 3] poses one control step ago, m and rad.
     """
 
     scene: np.ndarray
@@ -45,14 +45,14 @@ class PlannersMemory(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What does not change in an arena.
+    """The fixed parts of an arena.
 
     Attributes:
-      plan: the ways.
-      behavior: [R] of the package's.
-      segment: [4, M] of the package's: the outlines.
-      centre: [M, 2] of the obstacles, m; the walls come last.
-      radius: [M] of circles about them, m.
+      plan: the paths to the targets.
+      behavior: [R] planners of the package.
+      segment: [4, M] line segments of the package, the outlines.
+      centre: [M, 2] centres of the obstacles, m; the walls come last.
+      radius: [M] radii of circles around the obstacles, m.
     """
 
     plan: Plan
@@ -67,11 +67,11 @@ class Planners:
     """The controller of `engine_c.simulate`.
 
     Attributes:
-      name: of `SETTINGS`.
-      drive: of the robots.
-      hull_radius: m.
-      target_radius: m.
-      control_step: s.
+      name: a key of `SETTINGS`.
+      drive: the robots' drive.
+      hull_radius: radius of the hull, m.
+      target_radius: radius of a target, m.
+      control_step: time per control step, s.
     """
 
     name: str
@@ -81,7 +81,7 @@ class Planners:
     control_step: float
 
     def init(self, arenas: Arenas) -> PlannersMemory:
-        """Returns the memory of arenas that start."""
+        """Returns the memory of arenas at their start."""
         scene = np.empty(len(arenas.pose), object)
         for i in range(len(scene)):
             parts = arenas.level.side[i], arenas.target[i], arenas.obstacle[i]
@@ -140,7 +140,7 @@ class Planners:
         target: np.ndarray,
         there: np.ndarray,
     ) -> np.ndarray:
-        """Twists [R, 2] of one arena, m/s and rad/s; those that are there stand."""
+        """Computes the twists [R, 2] of one arena, m/s and rad/s; arrived robots stand still."""
         core, place = navground(), pose[:, :2]
         goal = way_points.way_points(scene.plan, place, target)
         apart = np.linalg.norm(place[:, None] - place, axis=-1) + np.where(
@@ -169,7 +169,7 @@ class Planners:
 
 
 def navground() -> Any:
-    """Imports the package.
+    """Imports `navground`.
 
     Raises:
       ConfigError: if it is not installed.
@@ -181,10 +181,10 @@ def navground() -> Any:
 
 
 def check_packages() -> None:
-    """Imports what the extra brings.
+    """Imports the packages of the extra.
 
     Raises:
-      ConfigError: if a package of it is missing.
+      ConfigError: if one of them is missing.
     """
     navground()
     way_points.scipy()
@@ -197,7 +197,7 @@ def load(name: str, judge: Judge) -> Planners:
 
 
 def _walls(side: float) -> np.ndarray:
-    """The walls [4, 5] of an arena as boxes without thickness."""
+    """Returns the walls [4, 5] of an arena as boxes without thickness."""
     half = 0.5 * side
     return np.array([[x * half, y * half, 0.0, abs(y) * half, abs(x) * half] for x, y in _SIDES])
 
@@ -207,7 +207,7 @@ _CORNERS = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 
 
 def _segments(core: Any, box: np.ndarray) -> list[Any]:
-    """The outline of a box [5]; a wall has one side."""
+    """Returns the outline of a box [5]; a wall has one side."""
     cos, sin = np.cos(box[2]), np.sin(box[2])
     corner = box[:2] + (_CORNERS * box[3:]) @ np.array([[cos, sin], [-sin, cos]])
     if not box[3:].all():

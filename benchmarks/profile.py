@@ -1,11 +1,11 @@
 """Where does the time of an update go: physics, sensors, policy, learning?
 
-`python -m benchmarks.profile [top=40] [key=value ...]` takes the keys of `swarmjax.train`, traces
-one call of physics alone, of the environment with it and of training with both, and prints a JSON
-line for each of the `top` kernels of each: microseconds a control step of all arenas, and the share
-of all kernels' time. On a GPU kernels are those of its streams; on a CPU they are XLA's operations
-on all its threads together. `busy` is the time of all kernels over that of the call: more than 1
-where several threads or streams ran at once.
+`python -m benchmarks.profile [top=40] [key=value ...]` takes the keys of `swarmjax.train`. It
+traces one call each of physics alone, of the environment including physics, and of training
+including both. For each call it prints a JSON line for each of the `top` kernels: microseconds per
+control step of all arenas, and the share of all kernels' time. On a GPU these are the kernels of
+its streams. On a CPU they are XLA's operations, summed over all threads. `busy` is the time of all
+kernels divided by the time of the call. It is above 1 if several threads or streams ran at once.
 """
 
 import json
@@ -28,10 +28,10 @@ from swarmjax import command
 from swarmjax.run.settings import TrainConfig, load_train
 
 TOP = 40
-UPDATES = 2  # of the call of training
-# What stands in the names of the threads and streams that carry kernels, by platform.
+UPDATES = 2  # in the call of training
+# Parts of the names of threads and streams with kernels, by platform.
 LINES = {"gpu": "Stream", "cpu": "tf_XLA"}
-# Events that only mark where a region begins or ends, and loops, whose insides are told one by one.
+# Events that only mark the ends of a region, and loops, whose contents are counted separately.
 MARKERS = ("ThreadpoolListener", "ThunkExecutor", "end: ", "while")
 KINDS = {
     "warp": ("_cuda_kernel", "wp_"),
@@ -42,7 +42,7 @@ KINDS = {
 
 
 def kind(name: str) -> str:
-    """Tells what a kernel does, as far as its name says it: a key of `KINDS`, or `fusion`."""
+    """Guesses from its name what a kernel does: a key of `KINDS`, or `fusion`."""
     return next((k for k, marks in KINDS.items() if any(m in name for m in marks)), "fusion")
 
 
@@ -50,10 +50,10 @@ def kernels(call: Callable[[], Any]) -> tuple[dict[str, float], Counter[str], fl
     """Traces a call that has been compiled and run before.
 
     Args:
-      call: returns arrays.
+      call: the call; it returns arrays.
 
     Returns:
-      Seconds by kernel, how often each ran, and the seconds that the call took.
+      Seconds by kernel, how often each ran, and the seconds of the call.
     """
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):
@@ -86,13 +86,13 @@ def lines(about: dict[str, Any], call: Callable[[], Any], steps: int, top: int) 
     """Profiles a call.
 
     Args:
-      about: the fields of every line.
-      call: returns arrays; has run before.
-      steps: control steps of one call.
-      top: how many kernels to tell.
+      about: entries of every line.
+      call: the call, which has run before; it returns arrays.
+      steps: control steps per call.
+      top: number of kernels to list.
 
     Returns:
-      A line for all kernels together, by kind, and one for each of those that took most.
+      A line for all kernels together, by kind, and one for each of the slowest kernels.
     """
     spent, count, seconds = kernels(call)
     total = sum(spent.values())
@@ -120,7 +120,7 @@ def lines(about: dict[str, Any], call: Callable[[], Any], steps: int, top: int) 
 
 
 def _most(seconds: dict[str, float]) -> list[tuple[str, float]]:
-    """Sorts by what took most."""
+    """Sorts by time, the longest first."""
     return sorted(seconds.items(), key=operator.itemgetter(1), reverse=True)
 
 

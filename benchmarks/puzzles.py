@@ -1,11 +1,12 @@
-"""The 16 puzzles of POGEMA's benchmark as arenas: `python -m benchmarks.puzzles out=FILE.npz`.
+"""Makes arenas of POGEMA's 16 puzzles: `python -m benchmarks.puzzles out=FILE.npz`.
 
-Writes a suite of three cells, `r2`, `r3` and `r4` by the number of robots, with ten draws of starts
-and targets for each puzzle, and prints a JSON line for each cell: how many of its levels can be
-solved on the grid. `python -m swarmjax.evaluate suite=FILE.npz task.arrival=hold policy=...` and
-`python -m benchmarks.baselines suite=FILE.npz task.arrival=hold` take the file.
+It writes a suite with three cells `r2`, `r3` and `r4`, named by the number of robots, with ten
+draws of starts and targets for each puzzle. It prints a JSON line for each cell with the number of
+levels that can be solved on the grid. `python -m swarmjax.evaluate suite=FILE.npz
+task.arrival=hold policy=...` and `python -m benchmarks.baselines suite=FILE.npz task.arrival=hold`
+read the file.
 
-Layouts, numbers of robots and of draws are POGEMA's; the draws are not.
+The layouts, the numbers of robots and the number of draws are POGEMA's. The draws are our own.
 """
 
 import json
@@ -28,13 +29,13 @@ from swarmjax.task.level import Level
 from swarmjax.task.stage_config import StageConfig, complete
 
 LAYOUTS = Path(__file__).parent / "maps" / "puzzles.yaml"
-ROBOTS, DRAWS = (2, 3, 4), 10  # of their file 05-puzzles.yaml
-# m, of a cell: less than the 0.148 m of two hulls side by side. In a bend, one in the outer corner,
-# two do get past each other with 6 mm to spare; cells below 0.1155 m would not let them.
+ROBOTS, DRAWS = (2, 3, 4), 10  # from their file 05-puzzles.yaml
+# Edge of a cell, m; less than the 0.148 m of two hulls side by side. In a bend two robots can pass
+# with 6 mm to spare if one is in the outer corner. Cells below 0.1155 m would prevent this.
 EDGE = 0.12
-# Theirs are 128 steps of the grid. At 0.1256 m/s these are 122.3 s, or 3,822 control steps of
-# 0.032 s. Turning comes on top, but the fastest solution of any level here takes 24 steps of the
-# 128: a robot has five times as long as full speed would take.
+# POGEMA allows 128 steps on the grid. At 0.1256 m/s this takes 122.3 s, or 3,822 control steps of
+# 0.032 s. Turning takes extra time. But no level here needs more than 24 of the 128 steps, so a
+# robot has five times as long as it would need at full speed.
 STEPS = 4000
 SEED = SUITE_SEED + 400
 _SHIFTS = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
@@ -46,10 +47,10 @@ class Draw(NamedTuple):
     """A puzzle with starts and targets.
 
     Attributes:
-      number: of the level in its cell.
-      rows: of the layout, `#` blocked and `.` free.
-      start: [R] places of the robots, no two alike.
-      target: [R] of their targets, no two alike.
+      number: number of the level in its cell.
+      rows: rows of the layout, with `#` for blocked and `.` for free.
+      start: [R] places of the robots, all different.
+      target: [R] places of their targets, all different.
     """
 
     number: int
@@ -60,15 +61,15 @@ class Draw(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class PuzzlesConfig(Section):
-    """Where the puzzles go."""
+    """Settings: which puzzles to make, and where to write them."""
 
     out: str = field(metadata=about("file .npz for the levels"))
     cell: float = field(default=EDGE, metadata=about("edge of a cell of a puzzle, m", 0.08, 0.3))
     robots: tuple[int, ...] = field(
-        default=ROBOTS, metadata=about("numbers of robots, a cell of the suite each", 1, 4)
+        default=ROBOTS, metadata=about("numbers of robots, one cell of the suite for each", 1, 4)
     )
     draws: int = field(
-        default=DRAWS, metadata=about("of starts and targets, for each puzzle", 1, 1000)
+        default=DRAWS, metadata=about("draws of starts and targets for each puzzle", 1, 1000)
     )
 
     def _check(self) -> None:
@@ -79,7 +80,7 @@ class PuzzlesConfig(Section):
 
 
 def layouts() -> dict[str, tuple[str, ...]]:
-    """Reads the puzzles: rows by name."""
+    """Reads the rows of the puzzles, by name."""
     return {name: tuple(text.split()) for name, text in files.read_yaml(LAYOUTS).items()}
 
 
@@ -87,14 +88,14 @@ def layouts() -> dict[str, tuple[str, ...]]:
 
 
 def near(rows: Sequence[str]) -> tuple[list[Place], np.ndarray]:
-    """Lists where a robot can be, and where it can be a step later.
+    """Lists the places where a robot can be, and those it can reach in one step.
 
     Args:
-      rows: of a layout.
+      rows: rows of a layout.
 
     Returns:
-      The N free places, row by row; [N, 5] the numbers of the same place and of its neighbours
-      below, above, right and left, -1 where there is none.
+      The N free places, row by row, and [N, 5] numbers of the same place and of its neighbours
+      below, above, right and left, with -1 for a missing neighbour.
     """
     place = [(r, c) for r, row in enumerate(rows) for c, x in enumerate(row) if x != maps.WALL]
     number = {each: i for i, each in enumerate(place)}
@@ -103,11 +104,12 @@ def near(rows: Sequence[str]) -> tuple[list[Place], np.ndarray]:
 
 
 def fewest_steps(draw: Draw) -> int | None:
-    """Solves a puzzle on the grid by breadth-first search over the places of all robots together.
+    """Solves a puzzle on the grid with breadth-first search over the joint places of all robots.
 
-    The rules are those of multi-agent path finding (Stern et al. 2019, section 2.2): in each step a
-    robot stays or moves to a neighbour; no two are in one place, and no two change places. A robot
-    may move to a place that another leaves. All must be at their targets at once.
+    The rules are those of multi-agent path finding (Stern et al. 2019, section 2.2). In each step a
+    robot stays or moves to a neighbouring place. No two robots may be in one place or swap places.
+    A robot may move to a place that another one leaves. All must be at their targets at the same
+    time.
 
     Args:
       draw: the puzzle.
@@ -134,7 +136,7 @@ def fewest_steps(draw: Draw) -> int | None:
 
 
 def _successors(state: np.ndarray, beside: np.ndarray) -> Any:
-    """Numbers [K] of the states that may follow states [F, R]; robots move one after the other."""
+    """Returns numbers [K] of the states that can follow states [F, R], robot by robot."""
     before, after = state, state[:, :0]
     for robot in range(state.shape[1]):
         row, option = np.nonzero(beside[before[:, robot]] >= 0)
@@ -148,15 +150,15 @@ def _successors(state: np.ndarray, beside: np.ndarray) -> Any:
 
 
 def draw_puzzle(number: int, rows: Sequence[str], robots: int) -> Draw:
-    """Draws starts and targets: each target can be reached from its start, and is another place.
+    """Draws starts and targets; each target is reachable from its start and differs from it.
 
     Args:
-      number: of the level.
-      rows: of the layout.
-      robots: how many.
+      number: number of the level.
+      rows: rows of the layout.
+      robots: number of robots.
 
     Returns:
-      The puzzle, of all that are so each as likely.
+      The puzzle, drawn uniformly from all valid ones.
     """
     place, beside = near(rows)
     part, random = _parts(beside), _random(robots, number)
@@ -172,7 +174,7 @@ def _random(*key: int) -> np.random.Generator:
 
 
 def _parts(beside: np.ndarray) -> np.ndarray:
-    """Numbers the parts of a layout that are connected: for each place the least place of its."""
+    """Numbers the connected parts of a layout: each place gets the lowest place of its part."""
     part = np.arange(len(beside))
     for _ in beside:
         part = np.where(beside >= 0, part[beside], len(beside)).min(axis=-1)
@@ -183,12 +185,12 @@ def _parts(beside: np.ndarray) -> np.ndarray:
 
 
 def to_level(draw: Draw, edge: float, boxes: int) -> Level:
-    """Makes a puzzle's arena: a map of the task, robots in the middle of cells, any way round.
+    """Makes a puzzle's arena from a map, with robots in the middle of cells at random headings.
 
     Args:
       draw: the puzzle.
-      edge: of a cell, m.
-      boxes: of the level; those that the walls do not need are absent.
+      edge: edge of a cell, m.
+      boxes: number of boxes in the level; those that the walls do not need are absent.
 
     Returns:
       The level of one arena.
@@ -212,7 +214,7 @@ def to_level(draw: Draw, edge: float, boxes: int) -> Level:
 
 
 def _read(rows: Sequence[str], start: Place, target: Place, edge: float) -> maps.Map:
-    """Reads a layout as a map of one robot, as a place may be a start and another's target."""
+    """Reads a layout as a map for one robot, since a place may be a start and another's target."""
     letters = [list(row) for row in rows]
     for (r, c), letter in ((start, "a"), (target, "A")):
         letters[r][c] = letter
@@ -220,11 +222,11 @@ def _read(rows: Sequence[str], start: Place, target: Place, edge: float) -> maps
 
 
 def draw_puzzles(robots: int, draws: int) -> list[Draw]:
-    """Draws the puzzles of a cell, those of one layout after the other.
+    """Draws the puzzles of a cell, layout by layout.
 
     Args:
-      robots: how many.
-      draws: for each layout; fewer are the first of more, up to `DRAWS`.
+      robots: number of robots.
+      draws: draws per layout; a smaller number gives the first of a larger one, up to `DRAWS`.
 
     Returns:
       The puzzles.
@@ -237,14 +239,14 @@ def draw_puzzles(robots: int, draws: int) -> list[Draw]:
 
 
 def make_cell(puzzles: Sequence[Draw], edge: float) -> Cell:
-    """Makes a cell of puzzles with equally many robots.
+    """Makes a cell of puzzles with the same number of robots.
 
     Args:
-      puzzles: of the cell.
-      edge: of a cell of the grid, m.
+      puzzles: puzzles of the cell.
+      edge: edge of a cell of the grid, m.
 
     Returns:
-      The cell; its stage is the layout of the most walls, each level has its own.
+      The cell. Its stage is the layout with the most walls; each level has its own layout.
     """
     robots = len(puzzles[0].start)
     stage = max((_stage(each.rows, robots, edge) for each in puzzles), key=lambda x: x.obstacles)
@@ -278,7 +280,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _line(cell: Cell, puzzles: Sequence[Draw]) -> dict[str, object]:
-    """Says how many levels of a cell can be solved on the grid, and in how many steps."""
+    """Counts the levels of a cell that can be solved on the grid, and their steps."""
     steps = [fewest_steps(each) for each in puzzles]
     solved = [each for each in steps if each is not None]
     return {

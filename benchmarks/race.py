@@ -1,23 +1,28 @@
-"""Who brings the same swarm to its targets sooner, our trainer or Brax's PPO?
+"""Which one brings the same swarm to its targets sooner, our trainer or Brax's PPO?
 
-`python -m benchmarks.race trainer=swarmjax|brax [seed=0,1,2] [points=30] [key=value ...]`
-takes the keys of `swarmjax.train` and prints a JSON line for each seed. Both train on the same
-compiled environment, with the same networks, initial weights but for the critic's last layer,
-batch, minibatches, epochs, discount, clip, costs and clipped gradients; both are judged by the same
-policy's mean on the same levels, at `points` evenly spaced over the budget. What differs is what is
-Brax's own: one learning rate for actor and critic, which does not fall (`learning_rate`, that of
-our actor unless given), Adam's epsilon, a critic whose last layer begins as large as the others
-(Brax takes one initialisation for all), minibatches of robots instead of arenas or tiles of
-samples, no bound on normalised observations, no options of XLA's (`loop.compiler_options`), and no
-mask, so that robots that have arrived stay in its batch (docs/adapters.md). All of its robot
-steps are counted as transitions, of ours those that were learned from.
+`python -m benchmarks.race trainer=swarmjax|brax [seed=0,1,2] [points=30] [key=value ...]` takes the
+keys of `swarmjax.train` and prints a JSON line for each seed. Both train on the same compiled
+environment, with the same networks, batch, minibatches, epochs, discount, clip, costs and gradient
+clipping. Initial weights are also equal, except for the critic's last layer. Both are judged with
+the policy's mean action on the same levels, at `points` points evenly spaced over the budget.
 
-`settings=playground` gives Brax what MuJoCo Playground sets for its walking robots (`PLAYGROUND`)
-instead of our numbers; the networks stay.
+Brax differs in these points:
 
-Seconds are of training alone. Brax compiles within its first two calls: these are taken to be as
-long as the median of the others, and the rest is its compile time. Judging is outside the clock of
-both.
+- one constant learning rate for actor and critic (`learning_rate`, by default our actor's);
+- Adam's epsilon;
+- a critic whose last layer starts as large as the others (Brax has one initialisation for all);
+- minibatches of robots instead of arenas or tiles of samples;
+- no bound on normalised observations;
+- no compiler options for XLA (`loop.compiler_options`);
+- no mask, so arrived robots stay in its batch (docs/adapters.md).
+
+All of Brax's robot steps count as transitions. Of ours only those used for learning count.
+
+`settings=playground` gives Brax the settings of MuJoCo Playground for its walking robots
+(`PLAYGROUND`) instead of ours. The networks stay the same.
+
+Seconds are training time alone. Brax compiles within its first two calls. These are counted with
+the median time of the others, and the rest of their time is the compile time. Judging is not timed.
 """
 
 import math
@@ -42,8 +47,8 @@ from swarmjax.ppo.learner import LearnerState
 from swarmjax.run.settings import TrainConfig, load_train
 
 SHARES = (0.90, 0.95)
-# MuJoCo Playground 0.2.0, `config/locomotion_params.py`, `brax_ppo_config`, of whose 8,192 robots a
-# minibatch holds 256; what it leaves open is the default of Brax 0.14.2.
+# From MuJoCo Playground 0.2.0, `config/locomotion_params.py`, `brax_ppo_config`. Its minibatches
+# hold 256 of 8,192 robots. Other settings are the defaults of Brax 0.14.2.
 PLAYGROUND: dict[str, Any] = {
     "unroll_length": 20,
     "num_minibatches": 32,
@@ -56,18 +61,18 @@ PLAYGROUND: dict[str, Any] = {
     "learning_rate": 3e-4,
     "max_grad_norm": 1.0,
 }
-# Brax's names in tables, by its settings.
+# Names of Brax in tables, by `settings`.
 BRAX = {
     "ours": "Brax PPO, this environment",
     "playground": "Brax PPO as MuJoCo Playground sets it, this environment",
 }
-_COMPILING = 2  # calls of Brax that may compile: the second finds its own results as arguments
+_COMPILING = 2  # calls of Brax that may compile; the second gets the first one's results
 _ACTIVATIONS = {"tanh": linen.tanh, "relu": linen.relu, "swish": linen.swish}
 
 
 @dataclass(frozen=True, kw_only=True)
 class RaceConfig(Section):
-    """Who trains, and how it is judged."""
+    """Settings: which trainer, and how to judge it."""
 
     trainer: Literal["swarmjax", "brax"] = field(
         default="swarmjax", metadata=about("whose PPO trains")
@@ -75,26 +80,26 @@ class RaceConfig(Section):
     seed: tuple[int, ...] = field(
         default=(0,), metadata=about("random seeds, one after the other", 0, MAX_COUNT)
     )
-    points: int = field(default=30, metadata=about("points at which it is judged", 4, 1000))
-    levels: int = field(default=256, metadata=about("that it is judged on", 1, 2**20))
+    points: int = field(default=30, metadata=about("points at which to judge", 4, 1000))
+    levels: int = field(default=256, metadata=about("levels to judge on", 1, 2**20))
     level_seed: int = field(default=2, metadata=about("of these", 0, MAX_COUNT))
     settings: Literal["ours", "playground"] = field(
-        default="ours", metadata=about("of Brax: ours, or those of MuJoCo Playground")
+        default="ours", metadata=about("settings of Brax: ours, or those of MuJoCo Playground")
     )
     learning_rate: float | None = field(
-        default=None, metadata=about("of Brax; null: that of its settings", above=0.0, high=1.0)
+        default=None, metadata=about("Brax's rate; null: from settings", above=0.0, high=1.0)
     )
 
 
 class Course(NamedTuple):
-    """What came of a trainer.
+    """The results of a trainer.
 
     Attributes:
-      train_s: [P] seconds of training until each point.
-      share: [P] of targets reached there.
-      transitions: [P] that were trained on until then.
-      arena_steps: [P] until then.
-      compile_s: seconds.
+      train_s: [P] seconds of training up to each point.
+      share: [P] share of targets reached there.
+      transitions: [P] transitions trained on up to the point.
+      arena_steps: [P] arena steps up to the point.
+      compile_s: compile time, s.
     """
 
     train_s: np.ndarray
@@ -108,19 +113,19 @@ Judge = Callable[[LearnerState], float]
 
 
 def load_judge(race: RaceConfig, trained: TrainConfig) -> Judge:
-    """Makes the judge of either trainer: from learners [N=1, L=1] to the share of targets."""
+    """Makes the judge of both trainers: from learners [N=1, L=1] to the share of targets."""
     study = StudyConfig(levels=race.levels, level_seed=race.level_seed)
     judge = curriculum.load_judge(study, trained, {"goal": trained.stage[-1]})
     return lambda learners: float(judge(learners)["goal"]["targets_reached"][0])
 
 
 def points(race: RaceConfig, trained: TrainConfig) -> np.ndarray:
-    """Updates [P] after which ours is judged: whole numbers, evenly apart."""
+    """Returns the evenly spaced updates [P] after which our trainer is judged."""
     return _evenly(race, trained.updates)
 
 
 def _evenly(race: RaceConfig, updates: int) -> np.ndarray:
-    """Updates [P], of so many at most."""
+    """Returns evenly spaced updates [P], up to `updates`."""
     return max(1, updates // race.points) * np.arange(1, race.points + 1)
 
 
@@ -146,11 +151,11 @@ def run_ours(race: RaceConfig, trained: TrainConfig) -> Course:
 
 
 def brax_settings(race: RaceConfig, trained: TrainConfig) -> dict[str, Any]:
-    """What Brax's `ppo.train` is given.
+    """Returns the arguments of Brax's `ppo.train`.
 
     Args:
-      race: how often it is judged, whose settings it has, and its learning rate.
-      trained: our config; its advantages are bootstrapped, its gradients clipped.
+      race: the race, with the number of points, the settings and the learning rate.
+      trained: our config, with bootstrapped advantages and clipped gradients.
 
     Returns:
       Plain data.
@@ -172,12 +177,12 @@ def brax_settings(race: RaceConfig, trained: TrainConfig) -> dict[str, Any]:
 
 
 def _brax_updates(trained: TrainConfig, given: dict[str, Any]) -> int:
-    """Rollouts of Brax's that our budget has room for."""
+    """Returns the number of Brax's rollouts that fit our budget."""
     return trained.updates * trained.algo.rollout_length // given["unroll_length"]
 
 
 def _our_settings(trained: TrainConfig) -> dict[str, Any]:
-    """Our numbers under the names that Brax has for them."""
+    """Returns our settings under Brax's names."""
     algo = trained.algo
     return {
         "unroll_length": algo.rollout_length,
@@ -194,7 +199,7 @@ def _our_settings(trained: TrainConfig) -> dict[str, Any]:
 
 
 def network_factory(trained: TrainConfig) -> Callable[..., Any]:
-    """Makes Brax's networks like ours: layers, activation, Gaussian, and how they begin."""
+    """Makes Brax's networks like ours: layers, activation, Gaussian, and initialisation."""
     networks = peers.find("brax.training.agents.ppo.networks", "the extra brax")
     algo, orthogonal = trained.algo, jax.nn.initializers.orthogonal
     return partial(
@@ -215,15 +220,15 @@ def network_factory(trained: TrainConfig) -> Callable[..., Any]:
 
 
 def as_learners(trained: TrainConfig, params: Any) -> LearnerState:
-    """Puts the policy that Brax trained into learners [N=1, L=1] of ours, for the judge.
+    """Converts Brax's policy to learners [N=1, L=1] of ours, for the judge.
 
     Args:
-      trained: our config, whose networks have the shapes of Brax's.
-      params: its moments, and its policy's and critic's parameters.
+      trained: our config; its networks have the shapes of Brax's.
+      params: Brax's observation moments, and the parameters of its policy and critic.
 
     Returns:
-      Learners that act as Brax's policy does where no observation is beyond our limit; their
-      critic is not Brax's.
+      Learners that act like Brax's policy unless an observation exceeds our limit. Their critic is
+      not Brax's.
     """
     moments, policy, _ = params
     mine = ppo.init(jax.random.key(0), trained.algo, moments.mean.shape[-1], 2, 1)
@@ -243,7 +248,7 @@ def as_learners(trained: TrainConfig, params: Any) -> LearnerState:
 
 
 def run_brax(race: RaceConfig, trained: TrainConfig) -> Course:
-    """Trains with Brax's PPO; raises MissingPeerError where Brax is not installed."""
+    """Trains with Brax's PPO; raises MissingPeerError if Brax is not installed."""
     brax_ppo = peers.find("brax.training.agents.ppo.train", "the extra brax")
     adapter = peers.find("swarmjax.adapters.brax_env", "the extra brax")
     judge, given = load_judge(race, trained), brax_settings(race, trained)
@@ -251,7 +256,7 @@ def run_brax(race: RaceConfig, trained: TrainConfig) -> Course:
     seconds: list[float] = []
 
     def look(step: int, _: Any, params: Any) -> None:
-        """Judges; the first time, before training, is for compiling the judge."""
+        """Judges the policy; the first call comes before training and compiles the judge."""
         shares.append(judge(as_learners(trained, params)))
 
     with adapter.mended_jax():
@@ -284,15 +289,15 @@ def run_brax(race: RaceConfig, trained: TrainConfig) -> Course:
 
 
 def line(race: RaceConfig, trained: TrainConfig, course: Course) -> dict[str, Any]:
-    """Sums a course up.
+    """Summarises a course.
 
     Args:
-      race: who trained.
-      trained: on what.
-      course: how it went.
+      race: settings of the race.
+      trained: our config.
+      course: results of the trainer.
 
     Returns:
-      The JSON line; speeds are medians over the calls but the first.
+      The JSON line. Speeds are medians over all calls except the first.
     """
     calls_s = np.diff(course.train_s)
     speed = np.median(np.diff(course.transitions) / calls_s)
@@ -317,7 +322,7 @@ def line(race: RaceConfig, trained: TrainConfig, course: Course) -> dict[str, An
 
 
 def seconds_to(course: Course) -> dict[str, float | None]:
-    """Seconds of training until each of `SHARES` was first judged; None if it never was."""
+    """Returns the seconds of training until each of `SHARES` was first reached, or None."""
     found = {}
     for share in SHARES:
         there = course.train_s[course.share >= share]
@@ -326,7 +331,7 @@ def seconds_to(course: Course) -> dict[str, float | None]:
 
 
 def parse(words: Sequence[str]) -> tuple[RaceConfig, TrainConfig]:
-    """Tells the words of the race from those of training; raises ConfigError."""
+    """Separates the words of the race from those of training; raises ConfigError."""
     race, rest = key_value.parse(RaceConfig, words)
     trained = load_train(["stage=s6", *rest])
     _check(race, trained)
@@ -340,7 +345,7 @@ def _check(race: RaceConfig, trained: TrainConfig) -> None:
     if stage.robots < trained.sim.robots:
         raise ConfigError(
             f"sim.max_robots is {trained.sim.robots}, but stage {stage.name} has "
-            f"{stage.robots} robots, and Brax has no place for absent ones: give "
+            f"{stage.robots} robots, and Brax does not support absent ones: give "
             f"sim.max_robots={stage.robots}."
         )
     updates = trained.updates
@@ -349,7 +354,7 @@ def _check(race: RaceConfig, trained: TrainConfig) -> None:
         updates = _brax_updates(trained, PLAYGROUND)
     if updates < race.points:
         raise ConfigError(
-            f"points is {race.points}, but the budget is {updates} updates: give at most as many."
+            f"points is {race.points}, but the budget is {updates} updates: give at most {updates}."
         )
 
 
@@ -357,8 +362,8 @@ def _check_playground(trained: TrainConfig) -> None:
     robots, parts = trained.arenas * trained.sim.robots, PLAYGROUND["num_minibatches"]
     if robots % parts:
         raise ConfigError(
-            f"arenas is {trained.arenas}: settings=playground takes a number of robots, {robots} "
-            f"of which there are, that {parts} divides."
+            f"arenas is {trained.arenas}, which makes {robots} robots: settings=playground needs a "
+            f"multiple of {parts} robots."
         )
 
 

@@ -1,10 +1,10 @@
-"""What does realism cost in training speed, all of it and each factor alone?
+"""How much training speed does realism cost, as a whole and for each factor alone?
 
 `python -m benchmarks.realism_cost [arms=real,webots,...] [key=value ...]` takes the keys of
-`swarmjax.train` and trains pairs of programs in turn, one of them ideal: a call of each, `PAIRS`
-times, after one that is not counted. It prints a JSON line for each factor: the median ratio of
-its time to the ideal one's, with an interval that holds it whatever its distribution (at 10 pairs
-from the second smallest to the second largest, which does so with 97.9 %).
+`swarmjax.train` and compares each program with the ideal one. It calls both alternately, `PAIRS`
+times, after a warm-up pair. It prints a JSON line for each factor: the median ratio of its time to
+the ideal one's, with an interval that assumes no distribution. With 10 pairs the interval runs from
+the second smallest to the second largest ratio and contains the true median with 97.9 %.
 """
 
 import dataclasses
@@ -23,28 +23,28 @@ from swarmjax.sim import dispatch
 from swarmjax.sim.realism_config import COUNTED, RealismConfig
 
 PAIRS = 10
-CALL_SECONDS = 0.5  # of the ideal program, about
-THREADS = 8  # programs that are compiled side by side
+CALL_SECONDS = 0.5  # approximate time per call of the ideal program
+THREADS = 8  # programs compiled in parallel
 PRESETS = ("real", "webots")
-# `real` leaves hulls smooth: friction is another program, not a number that is drawn.
+# `real` has hulls without friction, since friction is another program, not a random number.
 _NO_FACTOR = ("name", "infrared", "stall_time", "hull_friction")
 
 
 def arms() -> dict[str, RealismConfig]:
-    """The realism of each arm: the presets, the response alone, and each factor of `real` alone."""
+    """Returns each arm's realism: the presets, the response alone, and single factors of `real`."""
     presets = {name: load_train([f"realism={name}"]).realism for name in PRESETS}
     real = presets["real"]
     alone = {"infrared": RealismConfig(infrared=real.infrared)}
     for item in dataclasses.fields(RealismConfig):
         if item.name not in _NO_FACTOR:
-            # What acts on counts costs what it does on top of a response that has any.
+            # Factors of the counts need a response with counts, so they are added to one.
             base = alone["infrared"] if item.name in COUNTED else RealismConfig()
             alone[item.name] = replace(base, **{item.name: getattr(real, item.name)})
     return presets | alone
 
 
 def compare(ideal: Arm, arm: Arm, updates: int) -> dict[str, Any]:
-    """Times two arms in turn.
+    """Times two arms alternately.
 
     Returns:
       The median ratio of the arm's seconds to the ideal one's, its interval, and both medians.
@@ -64,7 +64,7 @@ def compare(ideal: Arm, arm: Arm, updates: int) -> dict[str, Any]:
 
 
 def results(settings: TrainConfig, chosen: dict[str, RealismConfig]) -> Iterator[dict[str, Any]]:
-    """Compiles all arms, then compares each with the ideal one; yields a line each."""
+    """Compiles all arms, then compares each with the ideal one; yields one line per arm."""
     ideal = Arm(replace(settings, realism=RealismConfig()))
     ideal.time(1)
     updates = max(1, round(CALL_SECONDS / ideal.time(1)))
@@ -89,7 +89,7 @@ def results(settings: TrainConfig, chosen: dict[str, RealismConfig]) -> Iterator
 
 
 def _choose(words: Sequence[str]) -> tuple[dict[str, RealismConfig], list[str]]:
-    """Takes `arms=...` out of the words of the command line."""
+    """Separates `arms=...` from the other words of the command line."""
     every = arms()
     given = [word.partition("=")[2] for word in words if word.startswith("arms=")]
     names = given[-1].split(",") if given else list(every)

@@ -1,9 +1,9 @@
-"""Trains recipes with several seeds and judges each on its way: what more training does.
+"""What does more training achieve? Trains a recipe with several seeds and judges it on the way.
 
 `python -m benchmarks.recipes label=NAME [judged=s6,crowd_dense] [key=value ...]` takes the keys of
-`RecipeConfig` and of `swarmjax.train`. It trains all seeds in one program, stops at points that are
-evenly spread over the logarithm of the updates, and judges every seed there on the device that
-trains, with drawn and with mean actions, on levels that no suite has. It prints one JSON line.
+`RecipeConfig` and of `swarmjax.train`. It trains all seeds in one program and stops at points that
+are evenly spaced over the logarithm of the updates. There it judges every seed on the training
+device, with drawn and with mean actions, on levels that are in no suite. It prints one JSON line.
 """
 
 import json
@@ -35,32 +35,32 @@ from swarmjax.training import seeds
 from swarmjax.training.loop import TrainState
 
 Judge = Callable[[LearnerState], dict[str, dict[str, dict[str, np.ndarray]]]]
-# Of the updates before a point, what is kept of the training's own figures, as means.
+# Metrics of training that are kept, as means over the updates before a point.
 _LOGGED = ("std", "approx_kl", "clip_fraction", "value_loss", "grad_norm", "success_by_stage")
-_KEPT = 20  # updates before a point that these are means of, at most
+_KEPT = 20  # maximum number of updates in these means
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecipeConfig(Section):
-    """How a recipe is called and judged."""
+    """Settings: the name of a recipe, and how to judge it."""
 
-    label: str = field(default="default", metadata=about("what the recipe is called"))
+    label: str = field(default="default", metadata=about("name of the recipe"))
     judged: tuple[str, ...] = field(
         default=("s6", "crowd_dense"), metadata=about("stages of the levels")
     )
     body: str = field(default="planar", metadata=about("robot of the judge: planar or wheeled"))
-    points: int = field(default=8, metadata=about("points at which it is judged", 1, 1000))
-    first: int = field(default=50, metadata=about("updates until the first one", 1, 10**9))
+    points: int = field(default=8, metadata=about("points at which to judge", 1, 1000))
+    first: int = field(default=50, metadata=about("updates until the first point", 1, 10**9))
     levels: int = field(default=1000, metadata=about("of each stage", 1, 2**20))
     level_seed: int = field(default=2200, metadata=about("of their levels", 0, MAX_COUNT))
-    steps: int = field(default=1500, metadata=about("control steps of an episode", 1, 10**6))
+    steps: int = field(default=1500, metadata=about("control steps per episode", 1, 10**6))
 
 
 def parse(words: Sequence[str]) -> tuple[RecipeConfig, TrainConfig]:
-    """Takes the benchmark's own words out of those of training.
+    """Separates the benchmark's own words from those of training.
 
     Raises:
-      ConfigError: a word is unsound.
+      ConfigError: if a word is invalid.
     """
     recipe, rest = key_value.parse(RecipeConfig, words)
     return recipe, load_train(["seeds=5", *rest])
@@ -70,7 +70,8 @@ def load_judge(recipe: RecipeConfig, trained: TrainConfig) -> Judge:
     """Makes the judge of all points.
 
     Returns:
-      From learners [N, L] to the means [N] over the levels, by stage, kind of action and measure.
+      A function from learners [N, L] to means [N] over levels, by stage, kind of action and
+      measure.
     """
     stages = [build(StageConfig, stage_files.read_stage(name)) for name in recipe.judged]
     robot = trained.robot
@@ -108,14 +109,14 @@ def load_judge(recipe: RecipeConfig, trained: TrainConfig) -> Judge:
 
 
 def points(recipe: RecipeConfig, trained: TrainConfig) -> np.ndarray:
-    """Updates after which the recipe is judged, the last one the whole budget."""
+    """Returns the updates after which the recipe is judged, up to the whole budget."""
     first = min(recipe.first, trained.updates)
     spread = np.geomspace(first, trained.updates, recipe.points)
     return np.unique(np.round(spread).astype(int))
 
 
 def measure(recipe: RecipeConfig, trained: TrainConfig) -> Iterator[dict[str, Any]]:
-    """Trains a recipe; yields what came at each point."""
+    """Trains a recipe; yields the results at each point."""
     program, schedule = programs.load(trained)
     state = jax.jit(partial(seeds.init, program))(schedule)
     compiled = trainer.compile_chunk(program, schedule, state)
@@ -139,7 +140,7 @@ def measure(recipe: RecipeConfig, trained: TrainConfig) -> Iterator[dict[str, An
 def _train(
     call: Callable[..., Any], state: TrainState, updates: int, rows: int
 ) -> tuple[TrainState, dict[str, Any]]:
-    """Trains all seeds for some updates, in calls no longer than the program reports."""
+    """Trains all seeds for some updates, in calls of at most the program's report interval."""
     metrics, last = {}, 0
     for done in range(0, updates, rows):
         last = min(rows, updates - done)

@@ -1,7 +1,7 @@
-"""One robot on a test rig: alone in a square arena of MuJoCo's C engine, told how its wheels turn.
+"""A test rig for one robot: alone in a square arena of MuJoCo's C engine, with given wheel speeds.
 
-What a figure of the robot is measured with. The model is the one that training and the judge
-share; nothing here knows what it ought to do.
+It measures numbers of the robot. Its model is the one that training and the judge share. Nothing
+here uses the expected behaviour.
 """
 
 from dataclasses import dataclass
@@ -17,22 +17,22 @@ from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.geometry import FLOOR_GROUP, HULL_GROUP
 
 CONTROL_STEP = 0.032  # s; Webots basicTimeStep
-# Physics steps of a control step, as swarmjax.evaluate has them.
+# Physics steps per control step, as in swarmjax.evaluate.
 SUBSTEPS = {"planar": 1, "wheeled": 4}
-SIDE = 2.0  # m, of the arena: nothing is near unless the robot is placed there
-# What a ray may meet: not contact spheres, wheels, skids and floor.
+SIDE = 2.0  # m; side of the arena, so large that walls are far unless a test needs them
+# What rays can hit; they ignore contact spheres, wheels, skids and the floor.
 SEEN = np.array([group not in (HULL_GROUP, FLOOR_GROUP) for group in range(6)], np.uint8)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rig:
-    """A robot to be measured.
+    """A robot to measure.
 
     Attributes:
-      robot: its numbers.
-      model: compiled.
-      control_step: for how long a command holds, s.
-      substeps: physics steps of a control step.
+      robot: the robot's settings.
+      model: the compiled model.
+      control_step: how long a command holds, s.
+      substeps: physics steps per control step.
     """
 
     robot: RobotConfig
@@ -42,18 +42,18 @@ class Rig:
 
     @property
     def body(self) -> Body:
-        """Which kind of body it has."""
+        """The kind of the robot's body."""
         return sim_model.BODIES[self.robot.body]
 
 
 class Track(NamedTuple):
-    """What a robot did, before the first control step and after each.
+    """The motion of a robot, before the first control step and after each.
 
     Attributes:
       pose: [T + 1, 3] x (m), y (m), yaw (rad, unwrapped).
-      qpos: [T + 1, Q].
-      qvel: [T + 1, V].
-      force: [T + 1] of the walls on it, N; mean over the physics steps of the control step.
+      qpos: [T + 1, Q] positions of MuJoCo.
+      qvel: [T + 1, V] velocities of MuJoCo.
+      force: [T + 1] force of the walls on the robot, N, mean over the control step's physics steps.
     """
 
     pose: np.ndarray
@@ -66,8 +66,8 @@ def load(robot: RobotConfig, timestep: float | None = None) -> Rig:
     """Builds a rig.
 
     Args:
-      robot: which one.
-      timestep: one physics step, s, with a command for each; None is as the judge has it.
+      robot: settings of the robot.
+      timestep: physics step, s, with one command per physics step; None for the judge's steps.
 
     Returns:
       The rig.
@@ -84,11 +84,11 @@ def place(rig: Rig, x: float = 0.0, yaw: float = 0.0) -> mujoco.MjData:
 
     Args:
       rig: the rig.
-      x: m; y is 0.
-      yaw: rad.
+      x: position, m; y is 0.
+      yaw: heading, rad.
 
     Returns:
-      The arena, its positions up to date.
+      The arena with up-to-date positions.
     """
     data = mujoco.MjData(rig.model)
     ids = sim_model.ids(rig.model, sim_model.ArenaSize(1, 0, 0.05))
@@ -104,12 +104,12 @@ def run(rig: Rig, data: mujoco.MjData, wheels: np.ndarray, steps: int) -> Track:
 
     Args:
       rig: the rig.
-      data: the arena, which is moved on.
-      wheels: [2] speeds that the motors hold, left and right, rad/s.
-      steps: control steps.
+      data: the arena; it is changed.
+      wheels: [2] constant speeds of the left and the right wheel, rad/s.
+      steps: number of control steps.
 
     Returns:
-      What the robot did.
+      The robot's motion.
     """
     data.ctrl = rig.body.ctrl(np.asarray(wheels, np.float64)[None], AS_BUILT, rig.robot, np)
     qpos, qvel, force = [data.qpos.copy()], [data.qvel.copy()], [0.0]
@@ -127,13 +127,13 @@ def run(rig: Rig, data: mujoco.MjData, wheels: np.ndarray, steps: int) -> Track:
 
 
 def command(rig: Rig, speed: float, turn_rate: float) -> np.ndarray:
-    """Wheel speeds [2] (rad/s) of a command (m/s, rad/s), as the robot's drive makes them."""
+    """Converts a command (m/s, rad/s) to wheel speeds [2] (rad/s) with the robot's drive."""
     drive = sim_drive.from_config(rig.robot)
     return sim_drive.wheel_speeds(np.array([speed, turn_rate]), drive, np)
 
 
 def velocity(rig: Rig, track: Track) -> tuple[float, float]:
-    """Mean forward speed (m/s) along the arc and turn rate (rad/s) over a track."""
+    """Returns the mean forward speed (m/s) along the arc and turn rate (rad/s) over a track."""
     start, end = track.pose[:-1], track.pose[1:]
     half = 0.5 * (end[:, 2] - start[:, 2])
     middle = start[:, 2] + half
@@ -143,14 +143,14 @@ def velocity(rig: Rig, track: Track) -> tuple[float, float]:
 
 
 def steady(rig: Rig, speed: float, turn_rate: float, steps: int = 50) -> tuple[float, float]:
-    """Speed (m/s) and turn rate (rad/s) that a command comes to, once it is reached."""
+    """Returns the steady speed (m/s) and turn rate (rad/s) of a command."""
     data, wheels = place(rig), command(rig, speed, turn_rate)
     run(rig, data, wheels, 10)
     return velocity(rig, run(rig, data, wheels, steps))
 
 
 def _push(rig: Rig, data: mujoco.MjData) -> float:
-    """Sum of the normal forces of walls on the hull, N."""
+    """Sums the normal forces of walls on the hull, N."""
     hull, total, force = rig.model.geom("robot0_hull").id, 0.0, np.zeros(6)
     for i, pair in enumerate(data.contact.geom):
         if hull in pair:

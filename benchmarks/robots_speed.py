@@ -1,10 +1,10 @@
-"""What does a larger swarm cost? The environment and training with 1 to 50 robots in each arena.
+"""What does a larger swarm cost? Times the environment and training with 1 to 50 robots per arena.
 
 `python -m benchmarks.robots_speed robots=1,5,50 [total=327680] [key=value ...]` takes the keys of
-`swarmjax.train` but `arenas`, and prints the lines of `benchmarks.steps_per_second` for each size,
-as `robots_speed.*`. There are about as many robots in all whatever the size: the arenas are the
-power of two that comes nearest. Each robot has the floor that it has on s6, in an arena of at least
-0.8 m, with three obstacles; as many robots are compiled in as there are.
+`swarmjax.train` except `arenas`, and prints the lines of `benchmarks.steps_per_second` for each
+size, as `robots_speed.*`. The total number of robots is about the same for all sizes: the number of
+arenas is the nearest power of two. Each robot has the same floor area as on s6, in an arena of at
+least 0.8 m with three obstacles. Each program is compiled for exactly its number of robots.
 """
 
 import json
@@ -19,29 +19,32 @@ from swarmjax.config import Section, about
 from swarmjax.run.settings import TrainConfig, load_train
 
 _ROBOTS, _SIDE = 5, 1.2  # of s6; m
-_LEAST = 0.8  # m; the three obstacles need as much
+_LEAST = 0.8  # m; the three obstacles need this side
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotsConfig(Section):
-    """Which swarms are measured."""
+    """Settings: which swarms to measure."""
 
     robots: tuple[int, ...] = field(
-        default=(1, 2, 3, 5, 10, 20, 50), metadata=about("robots of an arena", 1, 50)
+        default=(1, 2, 3, 5, 10, 20, 50), metadata=about("robots per arena", 1, 50)
     )
-    total: int = field(default=327_680, metadata=about("robots in all, about", 8, 10**8))
+    total: int = field(default=327_680, metadata=about("approximate total of robots", 8, 10**8))
 
 
 def load(robots: int, total: int, words: Sequence[str]) -> TrainConfig:
     """Makes the config of one size.
 
     Args:
-      robots: of an arena.
-      total: robots in all, about.
-      words: of training, `key=value`.
+      robots: robots per arena.
+      total: approximate total of robots.
+      words: `key=value` words for training.
 
     Returns:
-      The config; raises ConfigError if a word is unsound.
+      The config.
+
+    Raises:
+      ConfigError: if a word is invalid.
     """
     side = max(_LEAST, round(_SIDE * math.sqrt(robots / _ROBOTS), 2))
     arenas = max(8, 2 ** round(math.log2(total / robots)))

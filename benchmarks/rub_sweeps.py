@@ -1,13 +1,14 @@
-"""How many sweeps do contacts of hulls that rub take, and how many by other ways to sweep?
+"""How many sweeps do contacts of hulls with friction need, and how many with other ways to sweep?
 
 `python -m benchmarks.rub_sweeps [stages=A,...] [designs=A,...] [driver=random] [key=value ...]`
-takes the keys of `swarmjax.train` besides.
-It drives many arenas of each stage straight for the targets with noise, or at random, keeps their
-states at every `EVERY`-th control step, and solves the contacts of each by every design: `built`,
-which is `sim/fast/rubbing_jax.py`, and those of `DESIGNS` in NumPy, on the same contacts and in
-float32 as well. It prints a JSON line for each stage and design: sweeps, of which a warp of a GPU
-takes as many as the slowest of its 32 arenas, and how far accelerations are off those of
-`CONVERGED` plain sweeps in float64.
+also takes the keys of `swarmjax.train`. It drives many arenas of each stage, either straight to the
+targets with noise or at random, and keeps their states at every `EVERY`-th control step. It then
+solves the contacts of each state with every design: `built`, which is `sim/fast/rubbing_jax.py`,
+and those of `DESIGNS` in NumPy, on the same contacts and also in float32.
+
+It prints a JSON line for each stage and design: the sweeps, and the error of the accelerations
+relative to `CONVERGED` plain sweeps in float64. A warp of a GPU needs as many sweeps as the slowest
+of its 32 arenas.
 """
 
 import json
@@ -33,32 +34,32 @@ from swarmjax.sim.fast.discs import TOLERANCE, DiscRobots, Discs
 
 STAGES = "s6", "fence", "world_fence", "world_door", "crowd", "world_crowd"
 DEFAULTS = ("robot.hull_friction=1", "arenas=512")
-STEPS, EVERY = 480, 24  # control steps of an arena, of which every so many is kept
-CONVERGED, EXACT = 2000, 1e-13  # sweeps, in float64, that end where forces change by less
-NOISE = 0.5  # standard deviation of an action of a robot that heads for its target
+STEPS, EVERY = 480, 24  # control steps per arena, and between two kept states
+CONVERGED, EXACT = 2000, 1e-13  # maximum of sweeps in float64, which end when forces change by less
+NOISE = 0.5  # standard deviation of the actions of robots that head for their targets
 WARP = 32  # threads of a GPU that wait for each other
 
 
 @dataclass(frozen=True, kw_only=True)
 class RubSweepsConfig(Section):
-    """What is solved, and how."""
+    """Settings: which contacts to solve, and how."""
 
-    stages: tuple[str, ...] = field(default=STAGES, metadata=about("that arenas are taken from"))
+    stages: tuple[str, ...] = field(default=STAGES, metadata=about("stages of the arenas"))
     driver: Literal["target", "random"] = field(
         default="target", metadata=about("robots head for their targets, or drive at random")
     )
-    designs: tuple[str, ...] = field(default=(), metadata=about("that are tried; none: all"))
+    designs: tuple[str, ...] = field(default=(), metadata=about("designs to try; none: all"))
 
 
 class States(NamedTuple):
-    """What contacts are solved in: S states, those of one control step beside each other.
+    """States to solve contacts in: S states, with those of one control step next to each other.
 
     Attributes:
-      discs: what is fixed.
-      robots: [S] of arenas.
-      side: [S], m.
+      discs: the fixed numbers of the discs.
+      robots: [S] robots of the arenas.
+      side: [S] side of the arena, m.
       obstacle: [S, M, 5] x (m), y (m), yaw (rad), half edges (m).
-      arenas: how many states are of one control step.
+      arenas: number of states per control step.
     """
 
     discs: Discs
@@ -69,22 +70,22 @@ class States(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """The contacts of states, K at most; those that a state lacks ask for nothing.
+    """The contacts of states, at most K per state; entries of missing contacts have no effect.
 
     Attributes:
-      x: [K, S] of the unit vector along which the first robot is pushed.
-      y: likewise.
-      arm: [K, S] m.
-      give: [K, S] R, 1 / kg.
-      demand: [K, S, 2] aref of the push and of the rub, m/s^2.
-      stiffness: [K, S, 2] J M^-1 J' + R of both, 1 / kg.
-      first: [K, S] robot.
-      second: [K, S] robot; R, which has no motion, if it is a fixture.
-      there: [K, S] whether it is a contact.
-      kick: [R + 1, S, 3] 1 / mass twice, and 1 / moment of inertia; 0 for robot R.
+      x: [K, S] x of the unit vector along which the first robot is pushed.
+      y: [K, S] y of the same vector.
+      arm: [K, S] lever arm, m.
+      give: [K, S] regularisation R, 1 / kg.
+      demand: [K, S, 2] aref of the normal and of the friction force, m/s^2.
+      stiffness: [K, S, 2] J M^-1 J' + R of both forces, 1 / kg.
+      first: [K, S] index of the first robot.
+      second: [K, S] index of the second robot; R for a fixture, which does not move.
+      there: [K, S] whether the contact exists.
+      kick: [R + 1, S, 3] 1 / mass twice, and 1 / moment of inertia; 0 for index R.
       free: [R + 1, S, 3] acceleration without contacts.
-      before: [R + 1, S, 3] acceleration in the step before.
-      friction: [S].
+      before: [R + 1, S, 3] acceleration in the previous step.
+      friction: [S] coefficient of friction.
     """
 
     x: np.ndarray
@@ -106,12 +107,11 @@ class Design(NamedTuple):
     """How to sweep, and what to do between sweeps.
 
     Attributes:
-      over: how far a force goes, as a share of the way to its best.
-      since: sweeps after which that is so, or after which forces leap.
-      turns: whether every other sweep goes from the last contact to the first.
-      momentum: whether forces go on as they went, as Nesterov's method has it, and stop to when
-        that is uphill.
-      memory: sweeps that Anderson's acceleration looks back on.
+      over: relaxation: how far a force moves, as a share of the distance to its best value.
+      since: number of sweeps before relaxation or acceleration starts.
+      turns: whether every second sweep goes from the last contact to the first.
+      momentum: whether forces have Nesterov's momentum, which is reset when it leads uphill.
+      memory: number of past sweeps that Anderson acceleration uses.
     """
 
     over: float = 1.0
@@ -138,13 +138,13 @@ BUILT = "built"
 
 
 class Trail(NamedTuple):
-    """What sweeps came to so far, for states that are not at rest yet.
+    """The results of the sweeps so far, for states that have not converged.
 
     Attributes:
-      row: [S] of each state among all.
-      contacts: of these states.
+      row: [S] index of each state among all states.
+      contacts: contacts of these states.
       motion: [R + 1, S, 3] accelerations.
-      force: [K, S, 2] to go on from.
+      force: [K, S, 2] current forces.
       past: forces after the last sweeps and their changes, the newest first.
       pace: [S] Nesterov's t.
     """
@@ -158,16 +158,16 @@ class Trail(NamedTuple):
 
 
 def record(settings: TrainConfig, driver: str, steps: int = STEPS, every: int = EVERY) -> States:
-    """Drives arenas and keeps what their contacts are solved from.
+    """Drives arenas and keeps states to solve contacts in.
 
     Args:
-      settings: of training; hulls rub, and a control step is one physics step.
+      settings: settings of training; hulls have friction, and a control step is one physics step.
       driver: `target` or `random`.
-      steps: control steps.
-      every: how many of them from one that is kept to the next.
+      steps: number of control steps.
+      every: number of control steps between two kept states.
 
     Returns:
-      The states, `steps // every` of each arena.
+      The states, `steps // every` per arena.
     """
     swarm = environment.load(settings)
     assert swarm.world.physics.substeps == 1
@@ -197,7 +197,7 @@ def _discs(loaded: physics.Physics, solve: sim_discs.Solve) -> Discs:
 
 
 def _robots(swarm: environment.Swarm, sim: Any, side: Any, obstacle: Any, action: Any) -> Any:
-    """What the solver of one arena's next physics step is given as robots."""
+    """Returns the `robots` argument of the solver for one arena's next physics step."""
     given = []
 
     def take(_discs: Discs, robots: DiscRobots, _side: Any, _obstacle: Any) -> Any:
@@ -215,7 +215,7 @@ def _robots(swarm: environment.Swarm, sim: Any, side: Any, obstacle: Any, action
 
 
 def _act(swarm: environment.Swarm, state: Any, key: Any, driver: str) -> Any:
-    """Actions [A, R, 2]."""
+    """Draws actions [A, R, 2]."""
     shape = (swarm.num_arenas, swarm.num_robots, 2)
     if driver == "random":
         return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
@@ -228,7 +228,7 @@ def _act(swarm: environment.Swarm, state: Any, key: Any, driver: str) -> Any:
 
 
 def contacts_of(states: States) -> Contacts:
-    """Lists the contacts that there are, in the order in which the solver by JAX has them."""
+    """Lists the contacts of all states, in the order of the JAX solver."""
 
     def one(robots: DiscRobots, side: Any, obstacle: Any) -> rubbing_jax.Touch:
         fixture = sim_model.fixture_rectangles(side, obstacle, jnp)
@@ -264,7 +264,7 @@ def contacts_of(states: States) -> Contacts:
 
 
 def _with_nobody(of_robots: np.ndarray) -> np.ndarray:
-    """Numbers [S, R, 3] as [R + 1, S, 3], of the last robot 0."""
+    """Rearranges [S, R, 3] to [R + 1, S, 3], with zeros for index R."""
     return np.pad(of_robots.transpose(1, 0, 2), ((0, 1), (0, 0), (0, 0)))
 
 
@@ -278,11 +278,11 @@ def search(
     """Sweeps until no force changes.
 
     Args:
-      contacts: of states.
-      design: how.
-      most: sweeps, at most.
-      dtype: of all that is computed.
-      tolerance: share of the largest push that no force changes by at the end.
+      contacts: contacts of states.
+      design: the way to sweep.
+      most: maximum number of sweeps.
+      dtype: type of all numbers.
+      tolerance: largest allowed change of a force at the end, as a share of the largest push.
 
     Returns:
       Accelerations [S, R, 3] of x, y (m/s^2) and yaw (rad/s^2), and sweeps [S].
@@ -305,7 +305,7 @@ def search(
 
 
 def _keep(trail: Trail, which: np.ndarray) -> Trail:
-    """The states [S] of a trail that go on."""
+    """Keeps the states [S] of a trail that have not converged."""
     if which.all():
         return trail
     along_second = Contacts(*(a if a.ndim == 1 else a[:, which] for a in trail.contacts))
@@ -320,7 +320,7 @@ def _keep(trail: Trail, which: np.ndarray) -> Trail:
 
 
 def _go_on(trail: Trail, design: Design, done: int) -> tuple[Trail, np.ndarray]:
-    """Takes sweep number `done`; returns by how much the forces of states [S] lacked their best."""
+    """Takes sweep number `done`; returns the largest distance [S] of a force to its best value."""
     over = design.over if done > design.since else 1.0
     order = range(len(trail.force))
     ordered = order[::-1] if design.turns and done % 2 == 0 else order
@@ -340,7 +340,7 @@ def _go_on(trail: Trail, design: Design, done: int) -> tuple[Trail, np.ndarray]:
 def _sweep(
     trail: Trail, order: Sequence[int], over: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Forces [K, S, 2] and motion after a sweep, and the largest step [S] to a best force."""
+    """Returns forces [K, S, 2] and motion after a sweep, and the largest step [S] to a best one."""
     contacts, motion, force = trail.contacts, trail.motion.copy(), trail.force.copy()
     largest = np.zeros(len(trail.row), force.dtype)
     for k in order:
@@ -357,9 +357,9 @@ def _sweep(
 
 
 def _leap(contacts: Contacts, past: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """The mix of past forces whose changes, mixed likewise, are least: Anderson's acceleration.
+    """Applies Anderson acceleration: the mix of past forces with the smallest mix of changes.
 
-    Where the last change is larger than the one before, forces stay.
+    Forces stay unchanged in states where the last change is larger than the one before.
     """
     forces, changes = (np.stack(each) for each in zip(*past, strict=True))
     steps, turns = forces[:-1] - forces[1:], changes[:-1] - changes[1:]
@@ -378,7 +378,7 @@ def _leap(contacts: Contacts, past: list[tuple[np.ndarray, np.ndarray]]) -> np.n
 def _coast(
     trail: Trail, past: list[tuple[np.ndarray, np.ndarray]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Forces that go on as they went in the last sweep (Nesterov), and the pace after."""
+    """Continues the forces' last change (Nesterov's momentum); also returns the new pace."""
     (force, change), (before, _) = past
     uphill = np.einsum("ksc,ksc->s", change, force - before) < 0.0
     pace = np.where(uphill, 1.0, trail.pace)
@@ -389,7 +389,7 @@ def _coast(
 
 
 def project(force: np.ndarray, cost: np.ndarray, friction: np.ndarray) -> np.ndarray:
-    """The nearest forces [..., 2] with |rub| <= friction * push; `rubbing_jax.project` says how."""
+    """Projects forces [..., 2] to |rub| <= friction * push, as `rubbing_jax.project` does."""
     push, rub, size = force[..., 0], force[..., 1], np.abs(force[..., 1])
     edge = cost[..., 0] * push + friction * cost[..., 1] * size
     edge = np.maximum(edge / (cost[..., 0] + friction * friction * cost[..., 1]), 0.0)
@@ -399,7 +399,7 @@ def project(force: np.ndarray, cost: np.ndarray, friction: np.ndarray) -> np.nda
 
 
 def _first_force(contacts: Contacts) -> np.ndarray:
-    """The forces [K, S, 2] of contacts if robots moved as in the step before."""
+    """Returns the contact forces [K, S, 2] if robots moved as in the previous step."""
     found = np.zeros_like(contacts.demand)
     for k in range(len(found)):
         one = _contact(contacts, k)
@@ -410,14 +410,14 @@ def _first_force(contacts: Contacts) -> np.ndarray:
 
 
 def _contact(contacts: Contacts, k: int) -> Contacts:
-    """One contact of each state."""
+    """Selects contact `k` of each state."""
     rest = dict.fromkeys(("kick", "free", "before", "friction"))
     named = contacts._asdict()
     return Contacts(**{name: a if name in rest else a[k] for name, a in named.items()})
 
 
 def _moved(contacts: Contacts, motion: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """Adds what forces [K, S, 2] bring about."""
+    """Adds the accelerations caused by forces [K, S, 2]."""
     moved = motion.copy()
     for k in range(len(force)):
         _push(_contact(contacts, k), moved, force[k])
@@ -425,7 +425,7 @@ def _moved(contacts: Contacts, motion: np.ndarray, force: np.ndarray) -> np.ndar
 
 
 def _slide(one: Contacts, motion: np.ndarray) -> np.ndarray:
-    """J a [S, 2] of one contact of each state."""
+    """Computes J a [S, 2] for one contact of each state."""
     state = np.arange(len(one.friction))
     a, b = motion[one.first, state], motion[one.second, state]
     x, y, turn = a[:, 0] - b[:, 0], a[:, 1] - b[:, 1], a[:, 2] + b[:, 2]
@@ -433,7 +433,7 @@ def _slide(one: Contacts, motion: np.ndarray) -> np.ndarray:
 
 
 def _push(one: Contacts, motion: np.ndarray, force: np.ndarray) -> None:
-    """Adds what forces [S, 2] of one contact of each state bring about, in place."""
+    """Adds the accelerations caused by forces [S, 2] of one contact of each state, in place."""
     state, (push, rub) = np.arange(len(one.friction)), force.T
     x, y, turn = one.x * push - one.y * rub, one.y * push + one.x * rub, -one.arm * rub
     pulls = np.stack([x, y, turn], axis=-1)
@@ -443,7 +443,7 @@ def _push(one: Contacts, motion: np.ndarray, force: np.ndarray) -> None:
 
 
 def built(states: States) -> tuple[np.ndarray, np.ndarray]:
-    """Accelerations [S, R, 3] and sweeps [S] of the solver that is built in."""
+    """Returns accelerations [S, R, 3] and sweeps [S] of the built-in solver."""
     solve = jax.jit(jax.vmap(partial(rubbing_jax.solve, states.discs)))
     found, sweeps = solve(states.robots, states.side, states.obstacle)
     return np.asarray(found), np.asarray(sweeps)
@@ -452,18 +452,18 @@ def built(states: States) -> tuple[np.ndarray, np.ndarray]:
 def figures(
     sweeps: np.ndarray, found: np.ndarray, expected: np.ndarray, touching: np.ndarray, arenas: int
 ) -> dict[str, Any]:
-    """Says what a design came to.
+    """Summarises the results of a design.
 
     Args:
-      sweeps: [S].
+      sweeps: [S] sweeps.
       found: [S, R, 3] accelerations.
-      expected: likewise, converged.
+      expected: [S, R, 3] converged accelerations.
       touching: [S] whether there is a contact.
-      arenas: how many states are of one control step; whole warps.
+      arenas: number of states per control step, a multiple of a warp.
 
     Returns:
-      Sweeps of all states; and of those with contacts by how much the worst number is off, as a
-      share of the largest of the state.
+      Sweeps of all states. For states with contacts, also the largest error as a share of the
+      state's largest acceleration.
     """
     size = np.abs(expected).max(axis=(1, 2))
     off = (np.abs(found - expected).max(axis=(1, 2)) / size)[touching]
@@ -482,12 +482,12 @@ def figures(
 def results(
     settings: RubSweepsConfig, words: Sequence[str], steps: int = STEPS
 ) -> Iterator[dict[str, Any]]:
-    """Tries every design on the states of every stage; yields a line each.
+    """Tries every design on the states of every stage; yields one line each.
 
     Args:
-      settings: which.
+      settings: the stages, designs and driver.
       words: keys of `swarmjax.train`.
-      steps: control steps that arenas are driven.
+      steps: number of control steps that arenas are driven.
 
     Yields:
       Lines for JSON.
@@ -521,18 +521,18 @@ def results(
 
 
 def _check(settings: RubSweepsConfig, words: Sequence[str]) -> None:
-    """Refuses what cannot be measured."""
+    """Checks that the settings can be measured."""
     known = *DESIGNS, BUILT
     for name in settings.designs:
         if name not in known:
-            raise ConfigError(f"designs has '{name}': give of {', '.join(known)}.")
+            raise ConfigError(f"designs has '{name}': give some of {', '.join(known)}.")
     config = load_train([*DEFAULTS, *words])
     if config.arenas % WARP:
         raise ConfigError(f"arenas is {config.arenas}: give a multiple of {WARP}, a GPU's warp.")
     rubs, body = config.robot.hull_friction > 0.0, config.robot.body
     if not rubs or dispatch.choose(config.sim, config.robot).solver != "swarm" or body != "planar":
         raise ConfigError(
-            "rub_sweeps measures discs that rub: give robot=planar, sim.solver=swarm and a "
+            "rub_sweeps measures discs with friction: give robot=planar, sim.solver=swarm and a "
             "robot.hull_friction above 0."
         )
 

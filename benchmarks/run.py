@@ -1,12 +1,13 @@
-"""Runs suites of benchmarks, goes on where it was cut off, and writes docs/benchmarks.md.
+"""Runs suites of benchmarks, continues where a run was cut off, and writes docs/benchmarks.md.
 
 `python -m benchmarks.run suite=peers out=FILE.jsonl` runs each entry of the suite
-(`benchmarks.suites`) in a process of its own, and appends its JSON lines to `out` as they come,
-with the entry's name. What `out` has already is not run again; what failed is. A process that
-dies, or prints nothing for as long as its entry allows, is noted as `failed`, and the rest goes on.
+(`benchmarks.suites`) in its own process. It appends the entry's JSON lines to `out` as they come,
+with the entry's name. Results that `out` already has are not run again; failures are. If a process
+dies, or prints nothing for longer than its entry allows, it is recorded as `failed` and the other
+entries continue.
 
-`python -m benchmarks.run table=FILE.jsonl docs=docs` runs nothing: it writes the tables and plots
-of that file into docs/benchmarks.md. With `suite` and `docs` this is done at the end.
+`python -m benchmarks.run table=FILE.jsonl docs=docs` only writes the tables and plots of that file
+into docs/benchmarks.md. With `suite` and `docs` this is done at the end.
 """
 
 import json
@@ -30,12 +31,12 @@ from swarmjax import command
 from swarmjax.config import ConfigError, Section, about
 
 Line = dict[str, Any]
-_GRACE = 10.0  # s that a process is given to end by itself
+_GRACE = 10.0  # s; a process has this time to end by itself
 
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteRunConfig(Section):
-    """What is run, and where its results go."""
+    """Settings: what to run, and where the results go."""
 
     suite: str | None = field(
         default=None, metadata=about(f"which benchmarks: {', '.join(SUITES)}")
@@ -43,9 +44,9 @@ class SuiteRunConfig(Section):
     only: tuple[str, ...] = field(
         default=(), metadata=about("entries of the suite, by name; []: all of them")
     )
-    out: str | None = field(default=None, metadata=about("file of JSON lines that is added to"))
+    out: str | None = field(default=None, metadata=about("file for JSON lines, which are appended"))
     minutes: float | None = field(
-        default=None, metadata=about("after which nothing more is run; null: no limit", above=0.0)
+        default=None, metadata=about("starts no entry after this time; null: no limit", above=0.0)
     )
     table: str | None = field(
         default=None, metadata=about("file of JSON lines for the page; null: out")
@@ -62,31 +63,31 @@ class SuiteRunConfig(Section):
         if self.suite is None and (self.table is None or self.docs is None):
             raise ConfigError("suite is null: give suite=NAME, or table=FILE.jsonl and docs=DIR.")
         if self.suite is not None and self.out is None:
-            raise ConfigError("out is null: give out=FILE.jsonl for what the suite finds.")
+            raise ConfigError("out is null: give out=FILE.jsonl for the results of the suite.")
         if self.table is not None and self.docs is None:
             raise ConfigError("docs is null: give the folder of the page with table.")
 
 
-# What is left to do
+# Remaining work
 
 
 def entries(config: SuiteRunConfig) -> list[SuiteEntry]:
-    """The entries that are chosen, in the order of their suite."""
+    """Returns the chosen entries, in the order of their suite."""
     if config.suite is None:
         return []
     return [entry for entry in SUITES[config.suite] if entry.name in config.only or not config.only]
 
 
 def left(entry: SuiteEntry, lines: Sequence[Line]) -> list[str | None]:
-    """Values of an entry that have no result yet.
+    """Returns the values of an entry that have no result yet.
 
     Args:
-      entry: of a suite.
-      lines: of `out`.
+      entry: entry of a suite.
+      lines: lines of `out`.
 
     Returns:
-      Those of its values that are missing, or failed or were skipped when last tried; for an entry
-      without values, None alone.
+      The values that are missing, or that failed or were skipped when last tried. An entry without
+      values counts as one value, None.
     """
     values = entry.values or (None,)
     return [value for value in values if not _is_done(entry, value, lines)]
@@ -105,7 +106,7 @@ def _is_of(entry: SuiteEntry, value: str | None, line: Line) -> bool:
 
 
 def command_line(entry: SuiteEntry, values: Sequence[str | None]) -> list[str]:
-    """The command of a process that measures some values of an entry."""
+    """Returns the command of a process that measures some values of an entry."""
     words = [*entry.words]
     if entry.over is not None:
         words.append(f"{entry.over}={','.join(str(value) for value in values)}")
@@ -119,10 +120,10 @@ class Output:
     """The file of JSON lines that a suite adds to."""
 
     def __init__(self, path: Path) -> None:
-        """Reads what is there.
+        """Reads the existing lines.
 
         Raises:
-          ConfigError: if it cannot be read or written.
+          ConfigError: if the file cannot be read or written.
         """
         self.lines, self._path = read(path) if path.exists() else [], path
         try:
@@ -134,7 +135,7 @@ class Output:
             ) from None
 
     def add(self, line: Line) -> None:
-        """Writes a line down at once."""
+        """Writes a line to the file at once."""
         self.lines.append(line)
         with self._path.open("a") as file:
             file.write(json.dumps(line) + "\n")
@@ -144,7 +145,7 @@ def read(path: Path) -> list[Line]:
     """Reads JSON lines.
 
     Args:
-      path: of the file; a last line that was cut off is left out.
+      path: path of the file; a last line that was cut off is skipped.
 
     Returns:
       The lines.
@@ -161,20 +162,21 @@ def read(path: Path) -> list[Line]:
         try:
             found.append(json.loads(line))
         except ValueError:
-            raise ConfigError(f"{path} in line {number} is no JSON: take it out.") from None
+            raise ConfigError(f"{path} in line {number} is not JSON: remove it.") from None
     return found
 
 
 def run_entry(entry: SuiteEntry, output: Output, deadline: float) -> None:
-    """Runs what is left of an entry, in as many processes as it takes.
+    """Runs the remaining values of an entry, in as many processes as needed.
 
-    A value that a process did not come to is left to the next process, but for the one that it
-    died or was ended at, which is noted as failed.
+    If a process dies or is ended, the value that it was at is recorded as failed. The next process
+    takes the values after it.
 
     Args:
-      entry: of a suite.
+      entry: entry of a suite.
       output: gets the lines.
-      deadline: by `time.monotonic`; the process that runs then is ended, and is no failure.
+      deadline: time by `time.monotonic`. The process that runs at this time is ended, which is no
+        failure.
     """
     waiting = left(entry, output.lines)
     while waiting:
@@ -193,16 +195,16 @@ def run_entry(entry: SuiteEntry, output: Output, deadline: float) -> None:
 
 
 def _failed(entry: SuiteEntry, value: str | None, reason: str) -> Line:
-    """The line of a value that has no result."""
+    """Makes the line of a value that has no result."""
     line = {"benchmark": entry.module, "entry": entry.name, "failed": reason}
     return line if entry.over is None else {**line, entry.over: value}
 
 
 class Process:
-    """A benchmark in a process of its own.
+    """A benchmark in its own process.
 
     Attributes:
-      reason: why it ended without a result; of use once its lines are read.
+      reason: why it ended without a result; valid once its lines have been read.
       late: whether it was ended because the time of the whole run was over.
     """
 
@@ -231,10 +233,10 @@ class Process:
         self._queue.put(None)
 
     def lines(self, deadline: float) -> Iterator[Line]:
-        """Yields its JSON lines as they come; what else it prints is passed over.
+        """Yields its JSON lines as they come, and ignores all other output.
 
         Args:
-          deadline: by `time.monotonic`, when it is ended.
+          deadline: time by `time.monotonic` when the process is ended.
 
         Yields:
           The lines.
@@ -247,7 +249,7 @@ class Process:
             self._end()
 
     def _next(self, deadline: float) -> str | None:
-        """The next line of output; None at its end, or when the time is over."""
+        """Returns the next line of output; None at its end, or when the time is over."""
         left = deadline - time.monotonic()
         try:
             text = self._queue.get(timeout=max(0.0, min(self._limit, left)))
@@ -259,7 +261,7 @@ class Process:
             return None
 
     def _end(self) -> None:
-        """Ends it, with all that it started, if it does not end by itself."""
+        """Ends the process and its children, unless it ends by itself."""
         if not self._closed:
             os.killpg(self._process.pid, signal.SIGTERM)
         try:
@@ -272,18 +274,18 @@ class Process:
         self._errors.close()
 
     def _last_words(self) -> str:
-        """Its exit code, and the last line that it complained with."""
+        """Returns its exit code, and the last line of its errors."""
         self._errors.seek(0)
         words = [line.strip() for line in self._errors if line.strip()]
         return f"exit code {self._process.returncode}: {words[-1][:300] if words else 'silent'}"
 
 
 def run_suite(config: SuiteRunConfig, say: TextIO) -> None:
-    """Runs all entries, and says of each what is done.
+    """Runs all entries, and reports each.
 
     Args:
-      config: which, and for how long.
-      say: gets a sentence an entry.
+      config: which entries to run, and for how long.
+      say: gets one sentence per entry.
     """
     output = Output(Path(config.out or ""))
     deadline = math.inf if config.minutes is None else time.monotonic() + 60.0 * config.minutes

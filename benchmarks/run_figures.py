@@ -1,4 +1,4 @@
-"""The plots of docs/benchmarks.md."""
+"""Draws the plots of docs/benchmarks.md."""
 
 import re
 from collections.abc import Sequence
@@ -13,16 +13,16 @@ from benchmarks import run_tables
 
 mpl.use("Agg")
 Line = dict[str, Any]
-_SIZE, _DOTS = (7.0, 4.0), 90  # inches; dots an inch
+_SIZE, _DOTS = (7.0, 4.0), 90  # inches; dots per inch
 _PREFIX = "benchmarks_"
 
 
 def draw(folder: Path, lines: Sequence[Line]) -> list[Path]:
-    """Draws all plots that the lines have anything for, a file for each device.
+    """Draws all plots for which there are lines, one file per device.
 
     Args:
-      folder: where the PNG files go.
-      lines: of a file of results.
+      folder: folder for the PNG files.
+      lines: lines of a file of results.
 
     Returns:
       The files.
@@ -39,7 +39,7 @@ def draw(folder: Path, lines: Sequence[Line]) -> list[Path]:
         }.items():
             if plot is not None:
                 path = folder / f"{_PREFIX}{name}_{slug}.png"
-                # Without the version of Matplotlib, so that the same plot is the same file.
+                # Without Matplotlib's version, so that the same plot gives the same file.
                 plot.savefig(path, dpi=_DOTS, metadata={"Software": None})
                 written.append(path)
     return written
@@ -53,7 +53,7 @@ def _figure() -> tuple[Figure, Axes]:
 
 
 def _speeds(lines: Sequence[Line], benchmark: str, key: str) -> Figure | None:
-    """Speed over the number of arenas, a curve a system; a bar from slowest to fastest call."""
+    """Draws speed over arenas, one curve per system, with bars from slowest to fastest call."""
     curves: dict[str, list[Line]] = {}
     for line in run_tables.choose(lines, benchmark):
         if not line["benchmark"].startswith("robots_speed"):
@@ -64,7 +64,7 @@ def _speeds(lines: Sequence[Line], benchmark: str, key: str) -> Figure | None:
     for name, points in curves.items():
         points.sort(key=lambda line: line["arenas"])
         speeds = [line[key] for line in points]
-        # Calls that take longer are slower in proportion.
+        # The speed of a call is inversely proportional to its time.
         low = [
             s * (1 - p["call_s"] / max(p["calls_s"])) for s, p in zip(speeds, points, strict=True)
         ]
@@ -84,7 +84,7 @@ def _speeds(lines: Sequence[Line], benchmark: str, key: str) -> Figure | None:
 
 
 def _race(lines: Sequence[Line]) -> Figure | None:
-    """Share of targets over seconds of training."""
+    """Draws the share of targets over seconds of training."""
     mine = [line for line in lines if "curve" in line]
     if not mine:
         return None

@@ -12,15 +12,15 @@ MARKER = "results"
 
 
 def write(folder: Path, lines: Sequence[dict[str, Any]], source: Path) -> None:
-    """Writes the part of the page that comes from results, and the plots beside it.
+    """Writes the generated part of the page, and the plots next to it.
 
     Args:
-      folder: of the page.
-      lines: of the results.
-      source: their file, which the page names.
+      folder: folder of the page.
+      lines: lines of the results.
+      source: file of the results, which the page names.
 
     Raises:
-      ConfigError: the page is not there, or has no place for the tables.
+      ConfigError: if the page is missing, or has no place for the tables.
     """
     path = folder / PAGE
     try:

@@ -1,24 +1,24 @@
-"""The tables of docs/benchmarks.md: what the lines of `benchmarks.run` come to, in Markdown."""
+"""Makes the Markdown tables of docs/benchmarks.md from the lines of `benchmarks.run`."""
 
 import statistics
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 Line = dict[str, Any]
-# What tells the lines of one entry from each other.
+# Keys that distinguish the lines of one entry.
 _KEYS = ("arenas", "robots", "seed", "trainer", "cache", "reset", "share")
 _SHARES = ("seconds_to_0.90", "seconds_to_0.95")
 _COUNTED = ("step", "substeps", "resets", "precision", "matmul_precision")
 
 
 def newest(lines: Iterable[Line]) -> list[Line]:
-    """Leaves out of all lines those that a later one replaces, and those without a result.
+    """Selects the newest results, and skips lines without a result.
 
     Args:
-      lines: of a file of results, oldest first.
+      lines: lines of a file of results, oldest first.
 
     Returns:
-      Of each entry, benchmark and size the newest result.
+      The newest result of each entry, benchmark and size.
     """
     found = {}
     for line in lines:
@@ -28,7 +28,7 @@ def newest(lines: Iterable[Line]) -> list[Line]:
 
 
 def missing(lines: Sequence[Line]) -> list[Line]:
-    """The lines that tell of a failure or a skipped peer and have no result after them."""
+    """Returns the lines of failures and skipped peers without a later result."""
     found = {}
     for i, line in enumerate(lines):
         if {"failed", "skipped"} & line.keys():
@@ -39,32 +39,32 @@ def missing(lines: Sequence[Line]) -> list[Line]:
 
 
 def _answers(line: Line, given: dict[str, str], later: Line) -> bool:
-    """Tells whether a later line is a result of what failed."""
+    """Tells whether a later line is a result for a failed one."""
     same = later.get("entry") == line.get("entry")
     result = not {"failed", "skipped"} & later.keys()
     return same and result and all(str(later.get(key)) == x for key, x in given.items())
 
 
 def label(line: Line) -> str:
-    """What a line measures: a peer by its name, ours by body and implementation."""
+    """Names the system of a line: a peer by its name, ours by body and implementation."""
     if "peer" in line:
         return line["peer"]
     return f"swarmjax, {line['robot']}, {line['impl']}"
 
 
 def choose(lines: Iterable[Line], *benchmarks: str) -> list[Line]:
-    """The lines of some benchmarks, those of peers by the ending of their names."""
+    """Selects the lines of some benchmarks; those of peers match by the end of their names."""
     return [line for line in lines if line["benchmark"].endswith(benchmarks)]
 
 
 def markdown(lines: Sequence[Line]) -> str:
-    """Writes all tables, a part for each device.
+    """Writes all tables, one part per device.
 
     Args:
-      lines: of a file of results.
+      lines: lines of a file of results.
 
     Returns:
-      Markdown, without a heading of its own.
+      Markdown without a main heading.
     """
     results = newest(lines)
     parts = []
@@ -86,7 +86,7 @@ def _words(lines: Sequence[Line], key: str) -> str:
 
 
 def _rows(heads: Sequence[str], body: Iterable[Sequence[str]]) -> list[str]:
-    """A table; the first column is text, the others are numbers."""
+    """Makes a table whose first column is text and whose other columns are numbers."""
     cells = [list(row) for row in body]
     if not cells:
         return []
@@ -95,7 +95,7 @@ def _rows(heads: Sequence[str], body: Iterable[Sequence[str]]) -> list[str]:
 
 
 def speed(value: float | None) -> str:
-    """Three digits, in thousands, millions or thousands of millions."""
+    """Writes a speed with three digits, in thousands, millions or billions."""
     if value is None:
         return "-"
     for unit, name in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
@@ -105,14 +105,14 @@ def speed(value: float | None) -> str:
 
 
 def seconds(value: float | None, digits: int = 1) -> str:
-    """Seconds with so many digits behind the point; `-` where it never came to that."""
+    """Writes seconds with some decimal places; `-` for None."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 
 def _over(
     lines: Sequence[Line], key: str, show: Callable[[Line], str], name: Callable[[Line], str]
 ) -> list[str]:
-    """A table with a column for each value of a key, and a row for each name."""
+    """Makes a table with a column for each value of a key, and a row for each name."""
     columns = sorted({line[key] for line in lines})
     rows: dict[str, dict[Any, str]] = {}
     for line in lines:
@@ -133,7 +133,7 @@ def _is_robots(line: Line) -> bool:
 
 
 def _counted(lines: Sequence[Line]) -> list[str]:
-    """What a step of each system is: a row a system."""
+    """Makes the table of what a step of each system includes, one row per system."""
     mine = {label(line): line for line in choose(lines, ".environment")}
     body = ([name, *(str(line.get(key, "")) for key in _COUNTED)] for name, line in mine.items())
     return [row.replace("--:", "---") for row in _rows(["system", *_COUNTED], body)]
@@ -189,7 +189,7 @@ def _bytes(value: float) -> str:
 
 
 def _trainers(lines: Sequence[Line]) -> list[str]:
-    """A row for each trainer: medians of all seeds, and the seconds of each."""
+    """Makes a row for each trainer: medians of all seeds, and the seconds of each."""
     rows: dict[tuple[str, int], list[Line]] = {}
     for line in lines:
         if "trainer" in line:
@@ -225,7 +225,7 @@ def _middle(lines: Sequence[Line], key: str) -> float:
 
 
 def _success(lines: Sequence[Line]) -> list[str]:
-    """A row for each swarm: median and all seeds."""
+    """Makes a row for each swarm: median and all seeds."""
     rows: dict[tuple[str, str], list[Line]] = {}
     for line in choose(lines, "command_to_success"):
         rows.setdefault((line["entry"], label(line)), []).append(line)
@@ -246,7 +246,7 @@ def _success(lines: Sequence[Line]) -> list[str]:
 
 
 def _median(values: Sequence[float | None], digits: int = 1) -> str:
-    """The median and all values; a seed that never came so far counts as slower than all."""
+    """Writes the median and all values; a seed that never got there counts as the slowest."""
     known = sorted(value if value is not None else float("inf") for value in values)
     middle = statistics.median_high(known)
     shown = ", ".join(seconds(value, digits) for value in values)
@@ -270,7 +270,7 @@ def _missing_rows(lines: Sequence[Line]) -> Iterator[str]:
         yield f"- {name}{f' ({what})' if what else ''}: {why}: {line[why]}"
 
 
-# Titles of the tables, and what writes their rows.
+# Titles of the tables, and functions that write their rows.
 SECTIONS: dict[str, Callable[[Sequence[Line]], list[str]]] = {
     "Environment: robot steps a second, random actions": _environment,
     "What is counted": _counted,

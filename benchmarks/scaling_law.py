@@ -1,17 +1,18 @@
-"""What more arenas and more training make of the default recipe.
+"""How do more arenas and more training change the default recipe?
 
 `python -m benchmarks.scaling_law dir=DIR do=train|judge|table [key=value ...]` takes the keys of
 `ScalingConfig`, and those of `swarmjax.train` for `do=train`.
 
-- `train` trains every point of `arenas` x `transitions`, `seeds` policies each, into `DIR`. A
-  transition is a control step of one of the five robots of an arena; `budget` follows from it. A
-  point of less than one update is passed over and said.
-- `judge` tries the policies on wheels in MuJoCo C, with drawn and with mean actions, on the suite
-  `scaling`: the cells of `headline`, and `crowd_dense`, on which none was trained.
-- `table` prints a JSON line for each point, cell and kind of action, with what changed from the
-  next smaller number of arenas and of transitions, level by level.
+- `train` trains `seeds` policies for every point of `arenas` x `transitions`, in `DIR`. A
+  transition is a control step of one of the five robots of an arena; it determines `budget`. A
+  point with less than one update is skipped, and its line says so.
+- `judge` tries the policies on wheels in MuJoCo C, with drawn and with mean actions. It uses the
+  suite `scaling`: the cells of `headline`, and `crowd_dense`, on which no policy was trained.
+- `table` prints a JSON line for each point, cell and kind of action, with the changes, level by
+  level, from the next smaller number of arenas and of transitions.
 
-All three go on with what `DIR` holds, so that they may be stopped, and judged on another machine.
+All three continue from the contents of `DIR`. They may be stopped, and judging may run on another
+machine.
 """
 
 import json
@@ -38,24 +39,24 @@ from swarmjax.task.stage_files import load_levels
 
 MEASURES = ("targets_reached", "all_reached", "contacts_per_robot", "episode_time_s")
 ACTIONS = ("sampled", "mean")
-_ROBOTS = 5  # of an arena, which a transition is counted by
+_ROBOTS = 5  # per arena, to convert arena steps to transitions
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScalingConfig(Section):
-    """Which points are trained, and how they are judged."""
+    """Settings: which points to train, and how to judge them."""
 
-    dir: str = field(metadata=about("folder of the runs and of what was judged"))
+    dir: str = field(metadata=about("folder of the runs and of the judged results"))
     do: Literal["train", "judge", "table"] = field(metadata=about("what is done"))
     arenas: tuple[int, ...] = field(
         default=(128, 1024, 8192, 65_536), metadata=about("numbers of arenas", 1, 2**20)
     )
     transitions: tuple[float, ...] = field(
-        default=(1e7, 1e8, 1e9), metadata=about("robot steps of a seed", 1, 10**15)
+        default=(1e7, 1e8, 1e9), metadata=about("robot steps per seed", 1, 10**15)
     )
-    seeds: int = field(default=5, metadata=about("policies of a point", 3, 4096))
+    seeds: int = field(default=5, metadata=about("policies per point", 3, 4096))
     seed: int = field(default=700, metadata=about("first of them", 0, MAX_COUNT))
-    levels: int = field(default=200, metadata=about("of each cell that are judged", 1, 200))
+    levels: int = field(default=200, metadata=about("levels of each cell to judge on", 1, 200))
     cells: tuple[str, ...] = field(
         default=("s6", "crowd_dense", "expanded", "r10", "r20"), metadata=about("that are judged")
     )
@@ -72,7 +73,7 @@ class Point(NamedTuple):
 
 
 def points(config: ScalingConfig) -> list[Point]:
-    """Lists the points, the quickest to train first."""
+    """Lists the points, starting with the fastest to train."""
     every = [Point(*each) for each in product(config.arenas, config.transitions)]
     return sorted(every, key=lambda point: (point.transitions, -point.arenas))
 
@@ -81,7 +82,7 @@ def training(config: ScalingConfig, point: Point, words: Sequence[str]) -> Train
     """Makes the settings of a point's run; None if it has no whole update.
 
     Raises:
-      ConfigError: a word is unsound.
+      ConfigError: if a word is invalid.
     """
     base = load_train(words)
     if point.transitions < _ROBOTS * point.arenas * base.algo.rollout_length:
@@ -98,7 +99,7 @@ def training(config: ScalingConfig, point: Point, words: Sequence[str]) -> Train
 
 
 def train(config: ScalingConfig, words: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Trains the points that have no policies yet; yields a line each."""
+    """Trains the points that have no policies yet; yields one line each."""
     for point in points(config):
         place = Path(config.dir) / str(point)
         settings = training(config, point, words)
@@ -116,7 +117,7 @@ def train(config: ScalingConfig, words: Sequence[str]) -> Iterator[dict[str, Any
 
 
 def _updates(place: Path) -> int:
-    """Reads how many updates a run has ended after; 0 if it has not."""
+    """Reads the number of updates of a finished run; 0 if it has not finished."""
     summary = place / "summary.json"
     return json.loads(summary.read_text())["updates"] if summary.exists() else 0
 
@@ -132,7 +133,7 @@ def judged_file(config: ScalingConfig, point: Point, cell: str, action: str) -> 
 
 
 def judge(config: ScalingConfig) -> Iterator[dict[str, Any]]:
-    """Judges the points that were not judged yet, all of them cell by cell; yields short lines."""
+    """Judges the points that have not been judged yet, cell by cell; yields short lines."""
     trained = {point: policies(config, point) for point in points(config)}
     some = next((files[0] for files in trained.values() if files), None)
     if some is None:
@@ -149,7 +150,7 @@ def judge(config: ScalingConfig) -> Iterator[dict[str, Any]]:
 
 
 def _chosen(config: ScalingConfig, settings: EvaluateConfig) -> list[Cell]:
-    """Takes the cells that are asked for, and their first levels."""
+    """Takes the requested cells and their first levels."""
     found = {cell.name: cell for cell in cells.load(settings).cells}
     for name in config.cells:
         if name not in found:
@@ -179,7 +180,7 @@ def _try(
 
 
 def table(config: ScalingConfig) -> Iterator[dict[str, Any]]:
-    """Yields the line of every point, cell and kind of action that was judged."""
+    """Yields a line for every judged point, cell and kind of action."""
     for path in sorted((Path(config.dir) / "judged").glob("*-sampled.npz")):
         head = path.name.removesuffix("-sampled.npz")
         for point in points(config):
@@ -192,7 +193,7 @@ def table(config: ScalingConfig) -> Iterator[dict[str, Any]]:
 
 def _line(config: ScalingConfig, point: Point, cell: str, action: str) -> dict[str, Any]:
     found = _load(config, point, cell, action)
-    assert found is not None  # its file is there
+    assert found is not None  # its file exists
     line: dict[str, Any] = {
         "benchmark": "scaling_law",
         **point._asdict(),
@@ -215,7 +216,7 @@ def _line(config: ScalingConfig, point: Point, cell: str, action: str) -> dict[s
 
 
 def _smaller(config: ScalingConfig, point: Point) -> dict[str, Point]:
-    """Names the next smaller points of a row and of a column."""
+    """Returns the points with the next smaller number of arenas and of transitions."""
     arenas = [each for each in config.arenas if each < point.arenas]
     transitions = [each for each in config.transitions if each < point.transitions]
     found = {}

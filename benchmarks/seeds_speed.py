@@ -1,9 +1,9 @@
-"""How much faster do several seeds train in one program than one by itself?
+"""How much faster do several seeds train in one program than one seed alone?
 
 `python -m benchmarks.seeds_speed [key=value ...]` takes the keys of `swarmjax.train` (`seeds` is 10
-unless given; `arenas` are those of each seed) and trains all seeds, and one, in turn. It prints a
-JSON line: transitions a second of both, and their ratio, the median over `PAIRS` pairs with a 95 %
-interval by order statistics.
+by default; `arenas` is the number per seed) and trains all seeds and one seed alternately. It
+prints a JSON line with the transitions per second of both, and their ratio: the median over `PAIRS`
+pairs with a 95 % interval by order statistics.
 """
 
 import json
@@ -19,17 +19,17 @@ from swarmjax.run.settings import TrainConfig, load_train
 from swarmjax.sim import dispatch
 
 PAIRS = 10
-CALL_SECONDS = 0.5  # of a call of one seed, about
+CALL_SECONDS = 0.5  # approximate time per call of one seed
 
 
 def _speed(arm: Arm, updates: int) -> float:
-    """Transitions a second of one call."""
+    """Returns the transitions per second of one call."""
     seconds = arm.time(updates)
     return arm.transitions / seconds
 
 
 def result(settings: TrainConfig) -> dict[str, Any]:
-    """Compiles both programs and times them in turn; returns the line."""
+    """Compiles both programs and times them alternately; returns the line."""
     with ThreadPoolExecutor(2) as pool:
         one, all_ = pool.map(Arm, [replace(settings, seeds=1), settings])
     for arm in (one, all_):

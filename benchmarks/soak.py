@@ -1,13 +1,13 @@
-"""Does a long run stay as it began: its memory, its descriptors, its speed?
+"""Do memory, descriptors and speed of a long run stay constant?
 
-`python -m benchmarks.soak dir=DIR minutes=60 [key=value ...]` trains in `DIR`/run for so many
-minutes, asks the run to stop, and appends what it saw every ten seconds to `DIR`/samples.jsonl. The
-other words are those of `swarmjax.train`. The same command again goes on with the run, which is
-another leg. `python -m benchmarks.soak dir=DIR do=table` prints a JSON line: for each leg and
-quantity the median and the slope in percent of it an hour, by Theil and Sen with a 95 % interval.
+`python -m benchmarks.soak dir=DIR minutes=60 [key=value ...]` trains in `DIR`/run for this time and
+then asks the run to stop. It appends a sample every ten seconds to `DIR`/samples.jsonl. The other
+words are those of `swarmjax.train`. The same command again resumes the run as another leg.
+`python -m benchmarks.soak dir=DIR do=table` prints a JSON line with the median of each leg and
+quantity, and its slope in percent of the median per hour, by Theil and Sen with a 95 % interval.
 
-Speed is counted by the second, and by the second of processor time, which other processes on the
-machine do not change as much.
+Speed is given per second, and per second of processor time, which other processes on the machine
+affect less.
 """
 
 import json
@@ -31,16 +31,16 @@ from swarmjax.exit_codes import REQUEUE
 from swarmjax.run import directory
 
 EVERY_S = 10.0  # between two samples
-WARM_UP = 0.1  # share of a leg that is left out: caches fill, and the policy learns to move
+WARM_UP = 0.1  # this share of a leg is left out: caches fill, and the policy learns to move
 SAMPLES = "samples.jsonl"
-_TAIL = 65_536  # bytes at the end of the metrics, which hold its last line
+_TAIL = 65_536  # bytes at the end of the metrics, which contain the last line
 _LEVELS = ("memory_mb", "device_memory_mb", "descriptors", "threads")
 _SPEEDS = ("arena_steps_per_s", "arena_steps_per_cpu_s")
 
 
 @dataclass(frozen=True, kw_only=True)
 class SoakConfig(Section):
-    """How long is trained, and where."""
+    """Settings: how long to train, and where."""
 
     dir: str = field(metadata=about("folder of the run and of the samples"))
     minutes: float = field(default=60.0, metadata=about("of this leg", above=0.0))
@@ -48,15 +48,15 @@ class SoakConfig(Section):
 
 
 def sample(pid: int, run: Path) -> dict[str, float]:
-    """Looks at a process and at how far its run is.
+    """Samples a process and the progress of its run.
 
     Args:
-        pid: Of the process.
-        run: Its run directory.
+        pid: Id of the process.
+        run: The run directory.
 
     Returns:
-        Resident memory and that of the GPU, if there is one; open descriptors, threads, processor
-        seconds since it began, and arena control steps of the run.
+        Resident memory, memory of the GPU if there is one, open descriptors, threads, processor
+        seconds since the start, and arena control steps of the run.
 
     Raises:
         OSError: If the process has ended.
@@ -75,7 +75,7 @@ def sample(pid: int, run: Path) -> dict[str, float]:
 
 
 def _device_memory() -> float | None:
-    """Reads how much memory of the first GPU is in use, MB; None without a GPU."""
+    """Reads the used memory of the first GPU, MB; None without a GPU."""
     if (command := shutil.which("nvidia-smi")) is None:
         return None
     words = [command, "--query-gpu=memory.used", "--format=csv,noheader,nounits", "--id=0"]
@@ -83,7 +83,7 @@ def _device_memory() -> float | None:
 
 
 def _arena_steps(metrics: Path) -> int:
-    """Reads how far a run is from the last whole line of its metrics; 0 before the first."""
+    """Reads the steps of a run from the last complete line of its metrics; 0 without a line."""
     if not metrics.exists():
         return 0
     with metrics.open("rb") as file:
@@ -94,11 +94,11 @@ def _arena_steps(metrics: Path) -> int:
 
 
 def leg(settings: SoakConfig, words: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Trains for a while and yields what was seen of it, which is also written down.
+    """Trains for a while, writes samples to the file and yields them.
 
     Args:
-        settings: Of the soak.
-        words: Of `swarmjax.train`.
+        settings: Settings of the soak.
+        words: Words for `swarmjax.train`.
     """
     folder = Path(settings.dir)
     folder.mkdir(parents=True, exist_ok=True)
@@ -132,11 +132,11 @@ def sum_up(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
     """Finds the median and the slope of each quantity of one leg.
 
     Args:
-        rows: Samples of the leg, in their order.
+        rows: Samples of the leg, in order.
 
     Returns:
-        By quantity: `median`, `slope`, `slope_low` and `slope_high`; slopes in percent of the
-        median an hour. Speeds are left out of a leg that stood still in most samples.
+        `median`, `slope`, `slope_low` and `slope_high` of each quantity. Slopes are in percent of
+        the median per hour. A leg that made no progress in most samples has no speeds.
     """
     rows = rows[int(WARM_UP * len(rows)) :]
     hours = np.array([row["seconds"] for row in rows]) / 3600.0
@@ -166,7 +166,7 @@ def _trend(hours: np.ndarray, values: np.ndarray) -> dict[str, float]:
 
 
 def table(folder: Path) -> dict[str, Any]:
-    """Sums up all legs; returns the line."""
+    """Summarises all legs; returns the line."""
     rows = read(folder)
     legs = {
         str(number): {

@@ -1,9 +1,9 @@
-"""How many seconds from the command to the first update, with cold caches and with warm ones?
+"""How many seconds pass from the command to the first update, with cold and with warm caches?
 
 `python -m benchmarks.start_up [warm=5] [key=value ...]` takes the keys of `swarmjax.train` and runs
-that command in processes of their own: once with XLA's compile cache and Warp's kernel cache empty,
-then `warm` times with what the first left in them. It prints a JSON line for each of the two, the
-median of its runs. The clock starts before Python does and stops when the metrics of the first
+this command in separate processes: once with empty caches of XLA and Warp, then `warm` times with
+the caches that the first run filled. It prints a JSON line for cold and for warm caches, with the
+median over the runs. The clock starts before Python starts and stops when the metrics of the first
 update are on the disk.
 """
 
@@ -26,13 +26,13 @@ _FIRST = ("run.chunk=1", "run.stop_after=1")
 
 @dataclass(frozen=True, kw_only=True)
 class StartConfig(Section):
-    """How often it is measured."""
+    """Settings: how often to measure."""
 
     warm: int = field(default=5, metadata=about("runs with warm caches", 1, 100))
 
 
 def caches(folder: Path) -> dict[str, str]:
-    """Variables that put all caches into a folder, small programs too."""
+    """Returns environment variables that put all caches into a folder, also for small programs."""
     return {
         "JAX_COMPILATION_CACHE_DIR": str(folder / "xla"),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
@@ -45,12 +45,12 @@ def measure(words: Sequence[str], run: Path, environment: dict[str, str]) -> tup
     """Starts a run.
 
     Args:
-      words: of training.
-      run: its directory.
-      environment: variables that it is given.
+      words: words for training.
+      run: directory of the run.
+      environment: environment variables of the run.
 
     Returns:
-      Seconds to its first update, and its summary.
+      Seconds to the first update, and the run's summary.
     """
     watched = Watched([*words, *_FIRST], run, environment)
     first = [seconds for seconds, _ in watched.rows()]
@@ -58,7 +58,7 @@ def measure(words: Sequence[str], run: Path, environment: dict[str, str]) -> tup
 
 
 def results(given: StartConfig, words: Sequence[str]) -> Iterator[Row]:
-    """Measures cold and warm starts; yields a line each."""
+    """Measures cold and warm starts; yields one line each."""
     trained = load_train(words)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

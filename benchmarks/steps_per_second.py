@@ -1,13 +1,16 @@
-"""How many steps a second: physics alone, the environment with it, training with both?
+"""How many steps per second do physics alone, the environment and training reach?
 
-`python -m benchmarks.steps_per_second [key=value ...]` takes the keys of `swarmjax.train`, and
-numbers of arenas with commas between them, as in `arenas=1024,65536`. It prints a JSON line for
-each of the three at every number of arenas, the median of `timing.REPEATS` timed calls after one
-that is not counted; compile time is apart. All robots of the last stage act at random (physics and
-environment) or by the policy that is being trained. Before environment and physics are timed, the
-environment steps for a whole episode from clocks spread over the step limit, so that arenas have
-all ages and reset in every timed call; `episodes_ended` counts those of the last. Speeds are those
-of all `seeds` together. What a device has no memory for gives a line that says so, as `failed`.
+`python -m benchmarks.steps_per_second [key=value ...]` takes the keys of `swarmjax.train`. Several
+numbers of arenas are separated by commas, as in `arenas=1024,65536`. For every number of arenas it
+prints a JSON line for physics alone, for the environment including physics, and for training
+including both. Each number is the median of `timing.REPEATS` timed calls after a warm-up call.
+Compile time is listed separately.
+
+All robots of the last stage take random actions (physics and environment) or actions of the policy
+in training. Before the timing of environment and physics, the environment steps for a whole
+episode, with clocks spread over the step limit. Arenas then have all ages, and some reset in every
+timed call; `episodes_ended` counts these in the last call. Speeds are totals over all `seeds`. If a
+device runs out of memory, the line says so as `failed`.
 """
 
 import json
@@ -37,11 +40,11 @@ from swarmjax.training import rollout, seeds
 from swarmjax.training.loop import TrainState
 from swarmjax.training.program import Program
 
-# Of one call of physics and environment; whole rollouts of the default algorithm.
+# Control steps per call of physics and environment; whole rollouts of the default algorithm.
 CONTROL_STEPS = {"planar": 64, "wheeled": 32}
-TRAIN_SECONDS = 1.0  # of one call of training, about
-THREADS = 4  # sizes that are compiled side by side
-# Said in every line, as peers say it in theirs.
+TRAIN_SECONDS = 1.0  # approximate time per call of training
+THREADS = 4  # sizes compiled in parallel
+# Every line has these entries, as the lines of peers do.
 COUNTED = {
     "step": "control step: command, rigid bodies with contacts, 8 infrared rays, reward",
     "resets": "at once, each on a fresh random level that was drawn ahead of the rollout",
@@ -51,11 +54,11 @@ COUNTED = {
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """One size, compiled and not yet run.
+    """One size, compiled but not run.
 
     Attributes:
-      program: the compiled side.
-      schedule: the curriculum's numbers.
+      program: the compiled program.
+      schedule: numbers of the curriculum.
       start: makes the first state of a schedule.
       keys: [N] a random key for each seed.
       physics: steps the physics alone.
@@ -73,7 +76,7 @@ class Prepared:
 
 
 def prepare(settings: TrainConfig) -> Prepared:
-    """Compiles all programs of one size; several sizes may be prepared in threads."""
+    """Compiles all programs of one size; threads may prepare several sizes in parallel."""
     program, schedule = programs.load(settings)
     init = partial(seeds.init, program)
     template: TrainState = jax.eval_shape(init, schedule)
@@ -95,8 +98,8 @@ def physics_alone(program: Program, arenas: EnvState, key: Array) -> tuple[EnvSt
     """Moves all arenas with random commands.
 
     Returns:
-      The arenas as they were, so that each timed call does the same work, and a number that
-      depends on all of it.
+      The unchanged arenas, so that each timed call does the same work, and a number that depends on
+      every result.
     """
     world = program.world
     move = jax.vmap(partial(physics.step, world.physics))
@@ -116,11 +119,11 @@ def physics_alone(program: Program, arenas: EnvState, key: Array) -> tuple[EnvSt
 def environment(
     program: Program, schedule: Schedule, arenas: rollout.Arena, key: Array
 ) -> tuple[rollout.Arena, dict[str, Array]]:
-    """Steps all arenas with random actions, resets and all.
+    """Steps all arenas with random actions, including resets.
 
     Returns:
-      The arenas, and the sums of `reward` (with the observations, so that none is left out) and of
-      `episodes_ended`.
+      The arenas, and the sums of `reward` and `episodes_ended`. The sum of `reward` includes the
+      observations, so that the compiler cannot remove them.
     """
     world = program.world
     step = jax.vmap(partial(env.step, world))
@@ -139,7 +142,7 @@ def environment(
         keys = jax.random.split(key, program.config.algo.rollout_length)
         return jax.lax.scan(partial(body, starts=starts), arenas, keys)
 
-    began = replace(arenas, sim=unpack(arenas.sim), recall=None)  # who drives at random forgets
+    began = replace(arenas, sim=unpack(arenas.sim), recall=None)  # random robots need no memory
     keys = jax.random.split(key, _rollouts(program.config))
     ended, sums = jax.lax.scan(rolled, began, keys)
     packed = jax.vmap(physics.pack)(ended.sim)
@@ -147,12 +150,12 @@ def environment(
 
 
 def _rollouts(settings: TrainConfig) -> int:
-    """How many rollouts a call of the environment is."""
+    """Returns the number of rollouts per call of the environment."""
     return max(1, CONTROL_STEPS[settings.robot.body] // settings.algo.rollout_length)
 
 
 def _actions(program: Program, key: Array) -> Array:
-    """Uniform random actions [A, R, U]."""
+    """Draws uniform random actions [A, R, U]."""
     shape = (program.config.arenas, program.config.sim.max_robots, program.world.action_size)
     return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
 
@@ -164,7 +167,7 @@ def _line(
     calls_s: list[float],
     transitions: float | None = None,
 ) -> dict[str, Any]:
-    """Puts a result together under the names of docs/interface.md."""
+    """Makes a result line with the names in docs/interface.md."""
     settings, compiled = prepared.program.config, getattr(prepared, name)
     seconds = statistics.median(calls_s)
     arena_steps = control_steps * settings.seeds * settings.arenas / seconds
@@ -184,14 +187,14 @@ def _line(
 
 
 def about(settings: TrainConfig, impl: str | None = None) -> dict[str, Any]:
-    """The fields of a line that say what was simulated, and how it is counted.
+    """Returns the entries of a line about the simulation and the way of counting.
 
     Args:
-      settings: of training.
-      impl: that was used; None looks for it, which takes the card if it is to be found out.
+      settings: settings of training.
+      impl: implementation that was used; None finds it out, which may need the GPU.
 
     Returns:
-      Fields under the names of docs/interface.md.
+      Entries with the names in docs/interface.md.
     """
     return {
         "robot": settings.robot.body,
@@ -211,7 +214,7 @@ def about(settings: TrainConfig, impl: str | None = None) -> dict[str, Any]:
 
 
 def made_with() -> dict[str, Any]:
-    """The fields of a line that say where it was made."""
+    """Returns the entries of a line about device, versions and commit."""
     return {
         "device": provenance.device(),
         "versions": provenance.versions(),
@@ -223,7 +226,7 @@ def settle(prepared: Prepared) -> rollout.Arena:
     """Steps the environment until its arenas have all ages.
 
     Returns:
-      The arenas, after a step limit that they began with clocks spread evenly over it.
+      The arenas after one step limit, started with clocks spread evenly over it.
     """
     settings = prepared.program.config
     arenas: rollout.Arena = prepared.start(prepared.schedule).arenas
@@ -237,14 +240,14 @@ def settle(prepared: Prepared) -> rollout.Arena:
 
 
 def time_physics(prepared: Prepared, arenas: EnvState) -> dict[str, Any]:
-    """Times the physics alone; returns the line. The arenas are used up."""
+    """Times the physics alone; returns the line. The arenas' buffers are donated."""
     calls_s, _ = timing.time_program(prepared.physics, arenas, prepared.keys)
     steps = CONTROL_STEPS[prepared.program.config.robot.body]
     return _line(prepared, "physics", steps, calls_s)
 
 
 def time_environment(prepared: Prepared, arenas: rollout.Arena) -> dict[str, Any]:
-    """Times the environment; returns the line. The arenas are used up."""
+    """Times the environment; returns the line. The arenas' buffers are donated."""
     settings = prepared.program.config
     argument = prepared.schedule, prepared.keys
     calls_s, sums = timing.time_program(prepared.environment, arenas, argument)
@@ -254,11 +257,11 @@ def time_environment(prepared: Prepared, arenas: rollout.Arena) -> dict[str, Any
 
 
 def time_training(prepared: Prepared, arena_steps_per_s: float) -> dict[str, Any]:
-    """Times training, in calls whose length follows from the environment's speed.
+    """Times training, in calls with a length based on the environment's speed.
 
     Args:
-      prepared: what to run.
-      arena_steps_per_s: of the environment; training is taken to be half as fast.
+      prepared: the compiled size.
+      arena_steps_per_s: speed of the environment; training is assumed to be half as fast.
 
     Returns:
       The line.
@@ -284,14 +287,14 @@ def results(prepared: Prepared) -> list[dict[str, Any]]:
 def sweep(points: Sequence[TrainConfig]) -> Iterator[list[dict[str, Any]]]:
     """Compiles all sizes, then runs one after the other; yields the lines of each.
 
-    Compiling, not running, is what takes long; it is done in threads, and over before the first
-    call is timed.
+    Compiling takes much longer than running, so it is done in threads. It is complete before the
+    first call is timed.
     """
     with ThreadPoolExecutor(THREADS) as pool:
         futures = [pool.submit(prepare, settings) for settings in points]
     for settings in points:
         try:
-            # Taken out of the list: what one size holds on the device is not to outlive it.
+            # Removed from the list, so that each size frees its device memory.
             yield results(futures.pop(0).result())
         except jax.errors.JaxRuntimeError as error:
             reason = str(error).partition("\n")[0][:300]
@@ -300,28 +303,28 @@ def sweep(points: Sequence[TrainConfig]) -> Iterator[list[dict[str, Any]]]:
 
 
 def _physics(program: Program, arenas: EnvState, keys: Array) -> tuple[EnvState, Array]:
-    """`physics_alone` for all seeds."""
+    """Runs `physics_alone` for all seeds."""
     return seeds.each(program.config, lambda lane: physics_alone(program, *lane), (arenas, keys))
 
 
 def _environments(
     program: Program, arenas: rollout.Arena, argument: tuple[Schedule, Array]
 ) -> tuple[rollout.Arena, dict[str, Array]]:
-    """`environment` for all seeds."""
+    """Runs `environment` for all seeds."""
     schedule, keys = argument
     step = partial(environment, program, schedule)
     return seeds.each(program.config, lambda lane: step(*lane), (arenas, keys))
 
 
 def split(words: Sequence[str], key: str) -> tuple[list[str], list[str]]:
-    """Takes a key with several values out of the words of a command line.
+    """Separates a key with several values from the other words of a command line.
 
     Args:
-      words: `key=value`.
-      key: the one with commas in its value.
+      words: `key=value` words.
+      key: the key; commas separate its values.
 
     Returns:
-      Its values, none if it is not there, and the other words.
+      The key's values, none if the key is missing, and the other words.
     """
     given = [word.partition("=")[2] for word in words if word.startswith(f"{key}=")]
     rest = [word for word in words if not word.startswith(f"{key}=")]

@@ -1,14 +1,14 @@
-"""The suites of `benchmarks.run`: which benchmarks, of what size, what matters most first.
+"""Defines the suites of `benchmarks.run`: benchmarks and their sizes, the most important first.
 
-An entry is one question, put to one file of benchmarks/ in a process of its own.
+An entry answers one question: it runs one file of benchmarks/ in its own process.
 """
 
 from dataclasses import dataclass, field, replace
 
 CPU = {"JAX_PLATFORMS": "cpu"}
-# Peers, and ours beside them, are not to differ by what a tensor core leaves out.
+# Peers and our entries next to them use full precision, so that tensor cores make no difference.
 HIGHEST = {"JAX_DEFAULT_MATMUL_PRECISION": "highest"}
-# So that what Warp and others allocate is seen in what is left of the card.
+# Without preallocation, the GPU's free memory also shows the allocations of Warp and others.
 AS_NEEDED = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
 ARENAS = ("65536", "16384", "262144", "4096", "1024", "256")
 SEEDS = ("0", "1", "2", "3", "4")
@@ -19,14 +19,14 @@ class SuiteEntry:
     """One benchmark with its settings.
 
     Attributes:
-      name: of the entry; lines bear it.
-      module: of benchmarks/.
-      words: `key=value`.
-      over: key that is given several values.
-      values: these; a line has one of them under `over`.
-      each: of how many values a process takes; None: all of them.
-      seconds: that a value may take before the process is ended.
-      environment: variables that the process is given.
+      name: name of the entry, also in its lines.
+      module: module in benchmarks/.
+      words: `key=value` words.
+      over: key with several values.
+      values: the values of `over`; each line has one of them.
+      each: number of values per process; None for all.
+      seconds: time limit per value; the process is ended after it.
+      environment: environment variables of the process.
     """
 
     name: str
@@ -40,19 +40,19 @@ class SuiteEntry:
 
 
 def _speed(name: str, *words: str, values: tuple[str, ...] = ARENAS) -> SuiteEntry:
-    """Physics, environment and training at several numbers of arenas."""
+    """Makes an entry for physics, environment and training at several numbers of arenas."""
     return SuiteEntry(
         name=name,
         module="steps_per_second",
         words=("budget=1e10", *words),
         over="arenas",
         values=values,
-        seconds=480.0,  # the first one waits until all are compiled
+        seconds=480.0,  # the first value waits until all are compiled
     )
 
 
 def _robots(name: str, *words: str) -> SuiteEntry:
-    """The same with swarms of several sizes."""
+    """Makes the same entry for swarms of several sizes."""
     values = ("5", "1", "50", "10", "20", "2", "3")
     return SuiteEntry(
         name=name, module="robots_speed", words=words, over="robots", values=values, seconds=480.0
@@ -60,7 +60,7 @@ def _robots(name: str, *words: str) -> SuiteEntry:
 
 
 def _memory(name: str, *words: str) -> SuiteEntry:
-    """Memory at two sizes, a process each: a peak is one of a whole process."""
+    """Makes an entry for memory at two sizes, in a process each, since a peak covers a process."""
     return SuiteEntry(
         name=name,
         module="memory",
@@ -73,7 +73,7 @@ def _memory(name: str, *words: str) -> SuiteEntry:
 
 
 def _peer(name: str, values: tuple[str, ...], *words: str) -> SuiteEntry:
-    """The environment of a peer."""
+    """Makes an entry for the environment of a peer."""
     return SuiteEntry(
         name=name, module=name, words=words, over="arenas", values=values, environment=HIGHEST
     )

@@ -1,10 +1,10 @@
-"""How many seconds of training until a swarm reaches its targets, and how fast was it trained?
+"""How many seconds of training does a swarm need to reach its targets, and how fast was training?
 
-`python -m benchmarks.time_to_success RUN [SHARE]` reads a run directory that `swarmjax.train` left
-and prints a JSON line for each seed: the seconds after compilation at which the success of the last
-stage was first measured at SHARE (0.9) of the targets or more, over a whole cohort of training
-episodes. Seconds are those at the end of the call (`run.chunk`), so they are rounded up to it;
-seeds of one run share them, and its speeds are those of all of them together.
+`python -m benchmarks.time_to_success RUN [SHARE]` reads a run directory of `swarmjax.train` and
+prints a JSON line for each seed. It gives the seconds, without compilation, until the last stage
+first had a measured success of at least SHARE (0.9) of the targets, over a whole cohort of training
+episodes. Seconds are taken at the end of a call (`run.chunk`), so they are rounded up to it. The
+seeds of a run share these times, and the speeds are totals over all seeds.
 """
 
 import json
@@ -34,11 +34,11 @@ OF_THE_RUN = (
 
 
 def lines(run: Path, share: float) -> list[Row]:
-    """Sums a run up.
+    """Summarises a run.
 
     Args:
       run: the run directory.
-      share: of targets that counts as success, 0..1.
+      share: share of targets that counts as success, 0..1.
 
     Returns:
       A JSON line for each seed; seconds and steps are None if the share was never measured.
@@ -76,7 +76,7 @@ def lines(run: Path, share: float) -> list[Row]:
 
 
 def _read_summary(run: Path) -> Row:
-    """Reads what a run came to; it is there once the run is over."""
+    """Reads the summary of a finished run."""
     path = run / report_rows.SUMMARY
     summary = report_rows.read_object(path)
     for key in ("seeds", "targets_reached", *OF_THE_RUN):
@@ -92,7 +92,7 @@ def _read_summary(run: Path) -> Row:
 
 
 def _read_rows(run: Path, stages: int) -> list[Row]:
-    """Reads the metrics of a run, with all that its lines take of them."""
+    """Reads the metrics of a run, and checks the values that the lines need."""
     found = []
     for where, row in report_rows.read_lines(run, METRICS):
         report_rows.check(row, ("seed", "arena_steps", "broken_arenas"), report_rows.WHOLE, where)
@@ -115,7 +115,7 @@ def _share(text: str) -> float:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Runs the command; returns its exit code: 2 for an error of the user's, in one sentence."""
+    """Runs the command; returns its exit code, which is 2 for a user error."""
     if {"-h", "--help"} & set(arguments):
         sys.stdout.write(USAGE)
         return 0

@@ -1,4 +1,4 @@
-"""Timed calls, and compiled programs whose compile time and memory are kept apart from them."""
+"""Times calls of compiled programs, and measures their compile time and memory separately."""
 
 import statistics
 import time
@@ -13,13 +13,13 @@ REPEATS = 5
 
 
 class TimedProgram(NamedTuple):
-    """A compiled `(state, argument) -> (state, rest)`, the state donated.
+    """A compiled `(state, argument) -> (state, rest)` that donates the state.
 
     Attributes:
       call: the program.
-      compile_s: seconds that tracing and compiling took.
-      size: bytes of device memory that a call needs, arguments and results counted, by XLA's own
-        analysis; what Warp allocates for itself is not in it.
+      compile_s: seconds of tracing and compiling.
+      size: bytes of device memory that a call needs, including arguments and results, from XLA's
+        analysis; Warp's own allocations are not included.
     """
 
     call: Callable[[Any, Any], tuple[Any, Any]]
@@ -28,12 +28,12 @@ class TimedProgram(NamedTuple):
 
 
 def compile_program(call: Callable[[Any, Any], Any], state: Any, argument: Any) -> TimedProgram:
-    """Compiles ahead of time.
+    """Compiles a program ahead of time.
 
     Args:
       call: `(state, argument) -> (state, rest)`.
-      state: what it takes, or its shapes.
-      argument: likewise.
+      state: the state, or its shapes.
+      argument: the argument, or its shapes.
 
     Returns:
       The program.
@@ -43,7 +43,7 @@ def compile_program(call: Callable[[Any, Any], Any], state: Any, argument: Any) 
     compiled = lowered.compile(loop.compiler_options())
     seconds = time.perf_counter() - began
     memory = compiled.memory_analysis()
-    assert memory is not None  # both CPU and GPU tell
+    assert memory is not None  # known on both CPU and GPU
     size = memory.argument_size_in_bytes + memory.temp_size_in_bytes
     size += memory.output_size_in_bytes - memory.alias_size_in_bytes
     return TimedProgram(compiled, seconds, size)
@@ -52,16 +52,16 @@ def compile_program(call: Callable[[Any, Any], Any], state: Any, argument: Any) 
 def time_program(
     program: TimedProgram, state: Any, argument: Any, repeats: int = REPEATS
 ) -> tuple[list[float], Any]:
-    """Times calls, each on the state that the one before left, after one that is not counted.
+    """Times calls after a warm-up call; each call continues with the state of the one before.
 
     Args:
-      program: what to call.
-      state: to begin with; donated.
-      argument: of every call.
-      repeats: calls that are timed.
+      program: the program to call.
+      state: the first state; it is donated.
+      argument: argument of every call.
+      repeats: number of timed calls.
 
     Returns:
-      Seconds of each call, and what the last one returned besides the state.
+      Seconds of each call, and the rest that the last one returned.
     """
     taken, rest = [], None
     for _ in range(1 + repeats):
@@ -73,14 +73,14 @@ def time_program(
 
 
 def time_calls(call: Callable[[], Any], repeats: int = REPEATS) -> list[float]:
-    """Times a call that waits for its own end, after one that is not counted.
+    """Times a call that waits for its own end, after a warm-up call.
 
     Args:
-      call: what is timed.
-      repeats: how often.
+      call: the call.
+      repeats: number of timed calls.
 
     Returns:
-      Seconds of each.
+      Seconds of each call.
     """
     taken = []
     for _ in range(1 + repeats):
@@ -91,10 +91,10 @@ def time_calls(call: Callable[[], Any], repeats: int = REPEATS) -> list[float]:
 
 
 def spread(calls_s: list[float]) -> dict[str, Any]:
-    """The fields of a line that say how calls differed: all of them, and their median."""
+    """Returns the entries of a line about the times of calls: all times, and their median."""
     return {"calls_s": calls_s, "call_s": statistics.median(calls_s)}
 
 
 def matmul_precision() -> str:
-    """What JAX's matrix products are computed in: `default` may be TF32 on a GPU."""
+    """Returns the precision of JAX's matrix products; `default` may be TF32 on a GPU."""
     return jax.config.jax_default_matmul_precision or "default"

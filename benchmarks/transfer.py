@@ -1,12 +1,14 @@
-"""What does a policy lose on the wheeled body, and under a realism that it was not trained with?
+"""What does a policy lose on the wheeled body, and with a realism that it was not trained with?
 
 `python -m benchmarks.transfer policies=ideal:a.npz+b.npz,real:c.npz [key=value ...]` takes the keys
-of `swarmjax.evaluate` but `policy` and `suite`, and judges every policy (`label:` files of several
-seeds, `+` between them) in MuJoCo C on the same levels in each world of `WORLDS`. It prints a JSON
-line for each label and world: means with 95 % intervals, and paired differences to the label's
-first world (`_change`) and to the same body's ideal one (`_realism_change`). Intervals are of a
-bootstrap that draws whole levels, for all seeds alike: they hold for these policies on other
-levels; how far seeds differ is in `targets_reached_by_seed`.
+of `swarmjax.evaluate` except `policy` and `suite`. Each `label:` has the files of one or several
+seeds, joined by `+`. Every policy is judged in MuJoCo C on the same levels in each world of
+`WORLDS`.
+
+It prints a JSON line for each label and world: means with 95 % intervals, and paired differences to
+the label's first world (`_change`) and to the same body's ideal world (`_realism_change`).
+Intervals are from a bootstrap that draws whole levels, the same for all seeds, so they hold for
+these policies on other levels. `targets_reached_by_seed` shows how much seeds differ.
 """
 
 import json
@@ -30,11 +32,11 @@ def judge(settings: EvaluateConfig, files: Sequence[str]) -> dict[str, np.ndarra
     """Judges the policies of one label.
 
     Args:
-      settings: of the evaluation; its policy is not read.
-      files: of the policies, one a seed.
+      settings: settings of the evaluation; its policy is not used.
+      files: policy files, one per seed.
 
     Returns:
-      [seeds, levels] of each measure.
+      [seeds, levels] values of each measure.
     """
     (trial,) = trials.run(settings, cells.load(settings).cells, trials.read_policies(files))
     return {name: trial.found[name] for name in MEASURES}
@@ -43,15 +45,15 @@ def judge(settings: EvaluateConfig, files: Sequence[str]) -> dict[str, np.ndarra
 def summarize(
     found: dict[str, np.ndarray], first: dict[str, np.ndarray], ideal: dict[str, np.ndarray]
 ) -> dict[str, Any]:
-    """Means with intervals, and paired differences, level by level.
+    """Computes means with intervals, and differences paired by level.
 
     Args:
-      found: [seeds, levels] of each measure in a world.
-      first: those of the label's first world.
-      ideal: those of the same body without realism.
+      found: [seeds, levels] values of each measure in a world.
+      first: values in the label's first world.
+      ideal: values of the same body without realism.
 
     Returns:
-      The figures of a line.
+      The numbers of a line.
     """
     result: dict[str, Any] = {"targets_reached_by_seed": found["targets_reached"].mean(1).tolist()}
     for name in MEASURES:
@@ -67,7 +69,7 @@ def summarize(
 
 
 def results(words: Sequence[str], policies: dict[str, list[str]]) -> Iterator[dict[str, Any]]:
-    """Judges all labels in all worlds; yields a line each."""
+    """Judges all labels in all worlds; yields one line each."""
     some = next(iter(policies.values()))[0]
     for label, files in policies.items():
         worlds: dict[tuple[str, str], dict[str, np.ndarray]] = {}
@@ -98,7 +100,7 @@ def results(words: Sequence[str], policies: dict[str, list[str]]) -> Iterator[di
 
 
 def _policies(words: Sequence[str]) -> tuple[dict[str, list[str]], list[str]]:
-    """Takes `policies=...` out of the words of the command line."""
+    """Separates `policies=...` from the other words of the command line."""
     given = [word.partition("=")[2] for word in words if word.startswith("policies=")]
     labelled = [part.partition(":") for part in given[-1].split(",")] if given else []
     if not labelled or not all(label and files for label, _, files in labelled):

@@ -1,11 +1,10 @@
-"""How fast does this tree train beside another checkout, or beside itself with other settings?
+"""How fast does this tree train compared with another checkout, or with other settings?
 
 `python -m benchmarks.trees_speed [before=FOLDER] [than=key=value] [stage=NAME] [key=value ...]`
 takes the keys of `swarmjax.train`, for both sides. `before` is a checkout of another commit, this
-one by default; `than` is a setting of this tree's side alone. Each side is a process of its own
-that waits for the other: a call of each, `PAIRS` times, after one that is not counted. It prints a
-JSON line: the median ratio of this tree's speed to that of the other, with an interval that holds
-it whatever its distribution.
+one by default. `than` is a setting only for this tree's side. Each side is a separate process, and
+the two run alternately: one call each, `PAIRS` times, after a warm-up pair. It prints a JSON line:
+the median ratio of this tree's speed to the other's, with an interval that assumes no distribution.
 """
 
 import json
@@ -25,8 +24,8 @@ from swarmjax.config import ConfigError, Section, about
 from swarmjax.run.settings import TrainConfig, load_train
 
 PAIRS = 15
-CALL_SECONDS = 0.7  # of either side, about
-# What either process runs, in the checkout that is its working directory.
+CALL_SECONDS = 0.7  # approximate time per call of either side
+# Program of both processes; each runs it in the checkout that is its working directory.
 _SIDE = """
 import sys
 from benchmarks.pairs import Arm
@@ -42,15 +41,15 @@ for line in sys.stdin:
 class TreesSpeedConfig(Section):
     """What is compared."""
 
-    before: str = field(default=".", metadata=about("checkout that is compared with this one"))
-    than: str | None = field(default=None, metadata=about("setting of this tree's side alone"))
+    before: str = field(default=".", metadata=about("checkout to compare with this one"))
+    than: str | None = field(default=None, metadata=about("setting only for this tree's side"))
 
 
 class Side:
-    """A process that trains in a checkout when it is asked to.
+    """A process that trains in a checkout on request.
 
     Attributes:
-      compile_s: seconds that compiling took.
+      compile_s: seconds of compiling.
     """
 
     def __init__(self, tree: Path, words: Sequence[str]) -> None:
@@ -81,16 +80,16 @@ class Side:
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
-            raise ConfigError("one side ended before it was timed: its own words say why.")
+            raise ConfigError("one side ended before it was timed: see its output for the reason.")
         return float(line)
 
 
 def compare(settings: TreesSpeedConfig, words: Sequence[str]) -> dict[str, Any]:
-    """Times both sides in turn.
+    """Times both sides alternately.
 
     Args:
-      settings: what is compared.
-      words: of both sides.
+      settings: the two sides.
+      words: words for both sides.
 
     Returns:
       A line for JSON.
@@ -126,7 +125,7 @@ def compare(settings: TreesSpeedConfig, words: Sequence[str]) -> dict[str, Any]:
 
 
 def _commit(tree: Path) -> str | None:
-    """Reads the commit of a checkout; of a mere copy, the file `commit` in it."""
+    """Reads the commit of a checkout; for a copy without git, from its file `commit`."""
     if (tree / "commit").is_file():
         return (tree / "commit").read_text().strip()
     words = ["git", "-C", str(tree), "rev-parse", "--short=12", "HEAD"]

@@ -1,4 +1,4 @@
-"""A `swarmjax.train` in a process of its own, watched from the outside with a clock."""
+"""Runs `swarmjax.train` in its own process and times it from outside."""
 
 import json
 import os
@@ -16,10 +16,10 @@ from swarmjax.exit_codes import INTERRUPTED
 from swarmjax.report import rows as report_rows
 from swarmjax.run.recorder import METRICS
 
-# Of a run's summary, what a line about it says of where it was made.
+# Entries of a run's summary about device, versions and commit.
 MADE_WITH = ("device", "versions", "commit")
-_PAUSE = 0.01  # s between two looks at what the run has written
-# Many containers forbid Python to keep what it compiles, which makes every start seconds longer.
+_PAUSE = 0.01  # s between two reads of the run's metrics
+# Many containers keep Python from saving its bytecode, which makes every start seconds longer.
 _AS_EVERYWHERE = {"PYTHONDONTWRITEBYTECODE": ""}
 
 
@@ -27,19 +27,19 @@ class Watched:
     """A training run.
 
     Attributes:
-      directory: of the run.
-      seconds: from the command to its end, once it has ended.
+      directory: directory of the run.
+      seconds: seconds from the command to its end, once it has ended.
     """
 
     def __init__(
         self, words: Sequence[str], directory: Path, environment: Mapping[str, str]
     ) -> None:
-        """Starts it.
+        """Starts the run.
 
         Args:
-          words: of `swarmjax.train`, `key=value`.
-          directory: for the run, not there yet.
-          environment: variables that it is given besides those of this process.
+          words: `key=value` words for `swarmjax.train`.
+          directory: directory for the run; it must not exist.
+          environment: environment variables in addition to those of this process.
         """
         self.directory, self.seconds, self._asked = directory, 0.0, False
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115  # `_finish` closes it
@@ -52,10 +52,10 @@ class Watched:
         )
 
     def rows(self) -> Iterator[tuple[float, dict[str, Any]]]:
-        """Yields the rows of its metrics, each with the seconds since the command, to its end.
+        """Yields the rows of its metrics until it ends, each with the seconds since the command.
 
         Raises:
-          ConfigError: if it ends with an error, which the sentence has.
+          ConfigError: if the run ends with an error; the message is the run's.
         """
         path, at = self.directory / METRICS, 0
         while True:
@@ -70,13 +70,16 @@ class Watched:
         self._finish()
 
     def stop(self) -> None:
-        """Asks it to save and stop; `rows` goes on until it has. A second time would end it."""
+        """Asks the run to save and stop, only once, since a second signal would kill it.
+
+        `rows` continues until the run has stopped.
+        """
         if self._process.poll() is None and not self._asked:
             self._process.send_signal(signal.SIGINT)
             self._asked = True
 
     def summary(self) -> dict[str, Any]:
-        """What it came to. Device, versions and commit are in it: this process takes no card."""
+        """Reads the run's summary, with device, versions and commit; this process uses no GPU."""
         return report_rows.read_object(self.directory / report_rows.SUMMARY)
 
     def _finish(self) -> None:

@@ -1,9 +1,9 @@
-"""Way-points for those who know the map: shortest paths on a grid of the arena.
+"""Computes way-points for robots that know the map: shortest paths on a grid of the arena.
 
-A robot's centre may be where its hull has room. Cells of such places are joined to their eight
-neighbours; Dijkstra from each target leads from every cell to it, so that a robot that is pushed
-off its way has one from where it is. Steps close to an obstacle count longer: without that, paths
-touch every corner.
+A cell is free if a hull fits around its middle. Free cells are connected to their eight neighbours.
+Dijkstra's algorithm from each target gives a path from every cell, so a robot that is pushed off
+its path still has one. Steps close to an obstacle cost more, since paths would otherwise touch
+every corner.
 """
 
 import importlib
@@ -13,10 +13,10 @@ import numpy as np
 
 from swarmjax.config import ConfigError
 
-CELL = 0.01  # m; s6 leaves 0.016 m of a passage of 0.09 m to a centre, which 0.02 m could miss
-COARSE_CELL, LARGE = 0.02, 2.0  # m, of arenas with a side of more than LARGE, m
-MARGIN, DEARER = 0.015, 3.0  # a step within this of the hull's limit (m) counts so many times
-REACH = 24  # cells of a path that are looked at; a way-point lies at most so far
+CELL = 0.01  # m; a 0.09 m passage on s6 leaves a centre 0.016 m, which 0.02 m cells could miss
+COARSE_CELL, LARGE = 0.02, 2.0  # m; COARSE_CELL is for arenas with a side above LARGE
+MARGIN, DEARER = 0.015, 3.0  # steps within MARGIN (m) of the hull's limit cost DEARER times as much
+REACH = 24  # maximum distance of a way-point, in cells along the path
 _STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))  # to half of a cell's neighbours
 
 
@@ -25,10 +25,10 @@ class Plan(NamedTuple):
 
     Attributes:
       cell: edge of a cell, m.
-      free: [G, G] whether a hull has room around the middle of a cell; rows are y.
+      free: [G, G] whether a hull fits around the middle of a cell; rows are y.
       nearest: [G * G] the nearest free cell.
-      following: [R, G * G] the next cell on the way to each robot's target; the cell itself at the
-        end, and where there is no way.
+      following: [R, G * G] the next cell on the path to each robot's target; the cell itself at
+        the end, and if there is no path.
     """
 
     cell: float
@@ -38,13 +38,13 @@ class Plan(NamedTuple):
 
 
 def plan(side: float, target: np.ndarray, obstacle: np.ndarray, hull_radius: float) -> Plan:
-    """Finds the ways to all targets of an arena.
+    """Finds the paths to all targets of an arena.
 
     Args:
-      side: of the arena, m.
-      target: [R, 2] m.
+      side: side of the arena, m.
+      target: [R, 2] targets, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
-      hull_radius: m.
+      hull_radius: radius of the hull, m.
 
     Returns:
       The plan.
@@ -70,7 +70,7 @@ def scipy() -> tuple[Any, Any]:
     """Imports `scipy.sparse` with its graphs, and `scipy.ndimage`.
 
     Raises:
-      ConfigError: if it is not installed.
+      ConfigError: if scipy is not installed.
     """
     try:
         importlib.import_module("scipy.sparse.csgraph")
@@ -80,7 +80,7 @@ def scipy() -> tuple[Any, Any]:
 
 
 def clearance(point: np.ndarray, side: float, obstacle: np.ndarray) -> np.ndarray:
-    """Distances [...] of points [..., 2] to the nearest wall or obstacle, m; inside of one 0."""
+    """Computes the distances [...] of points [..., 2] to the nearest wall or box, m; 0 inside."""
     found = 0.5 * side - np.abs(point).max(axis=-1)
     for x, y, yaw, *half in obstacle:
         cos, sin = np.cos(yaw), np.sin(yaw)
@@ -94,7 +94,7 @@ def clearance(point: np.ndarray, side: float, obstacle: np.ndarray) -> np.ndarra
 
 
 def _graph(sparse: Any, free: np.ndarray, room: np.ndarray, cell: float) -> Any:
-    """Joins free cells, as a symmetric matrix of lengths in m."""
+    """Connects free cells; returns a symmetric matrix of lengths in m."""
     count = len(free)
     number = np.arange(free.size).reshape(free.shape)
     price = np.where(room < MARGIN, DEARER, 1.0)
@@ -112,21 +112,21 @@ def _graph(sparse: Any, free: np.ndarray, room: np.ndarray, cell: float) -> Any:
 
 
 def _cell_of(place: np.ndarray, cell: float, count: int) -> np.ndarray:
-    """Numbers [...] of the cells that places [..., 2] lie in."""
+    """Returns the numbers [...] of the cells that contain places [..., 2]."""
     index = np.clip(np.floor(place / cell + 0.5 * count).astype(int), 0, count - 1)
     return index[..., 1] * count + index[..., 0]
 
 
 def way_points(plan: Plan, place: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Finds where robots should head: as far along their path as the line there is free.
+    """Finds each robot's way-point: the furthest point of its path with a free straight line to it.
 
     Args:
-      plan: of the arena.
-      place: [R, 2] of the robots, m.
-      target: [R, 2] m.
+      plan: plan of the arena.
+      place: [R, 2] positions of the robots, m.
+      target: [R, 2] targets, m.
 
     Returns:
-      [R, 2] m; the target itself where it is in sight.
+      [R, 2] way-points, m; the target itself if it is in sight.
     """
     count, robot = len(plan.free), np.arange(len(place))
     path = [plan.nearest[_cell_of(place, plan.cell, count)]]
@@ -140,7 +140,7 @@ def way_points(plan: Plan, place: np.ndarray, target: np.ndarray) -> np.ndarray:
     share = np.linspace(0.0, 1.0, REACH + 1)[:, None, None, None]
     line = place[:, None] + share * (point - place[:, None])
     open_ = plan.free.ravel()[_cell_of(line, plan.cell, count)]
-    # The ends may lie in cells without room: robots are pushed there, and targets drawn there.
+    # The ends may lie in occupied cells, since robots are pushed there and targets drawn there.
     seen = open_[1:-1].all(axis=0)
     furthest = np.where(seen, np.arange(REACH + 1), 1).max(axis=-1)
     return point[robot, furthest]

@@ -1,7 +1,7 @@
 """Draws levels of a suite: `python -m benchmarks.worlds_figure suite=worlds out=FILE.png`.
 
-One level of each cell, seen from above: walls and boxes in black, robots as discs, their targets as
-circles of the zone of arrival in the same colour.
+It shows one level of each cell from above. Walls and boxes are black. Robots are discs, and the
+arrival zones of their targets are circles of the same colour.
 """
 
 import math
@@ -35,7 +35,7 @@ class WorldsFigureConfig(Section):
 
     suite: str = field(default="worlds", metadata=about("a name of configs/suites/, or a file"))
     out: str = field(metadata=about("file .png"))
-    level: int = field(default=0, metadata=about("which of each cell", 0, MAX_COUNT))
+    level: int = field(default=0, metadata=about("which level of each cell", 0, MAX_COUNT))
 
 
 def draw(chosen: Sequence[CellConfig], number: int, out: Path) -> None:
@@ -43,7 +43,7 @@ def draw(chosen: Sequence[CellConfig], number: int, out: Path) -> None:
 
     Args:
         chosen: The cells.
-        number: Of the level.
+        number: Number of the level.
         out: The file.
     """
     count = math.ceil(len(chosen) / COLUMNS)

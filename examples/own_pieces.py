@@ -1,6 +1,6 @@
-"""Pieces of your own: a reward term, an observation, a way of drawing levels and a network.
+"""Defines your own pieces: a reward term, an observation, a drawing of levels and a network.
 
-Train with them, and judge what was trained:
+Train with them, and judge the policy:
 
     python -m swarmjax.train extensions=examples/own_pieces.py stage=examples/ring.yaml
     python -m swarmjax.evaluate policy=runs/NAME/policy.npz extensions=examples/own_pieces.py
@@ -18,13 +18,13 @@ from swarmjax.task.reward import Step
 
 @reward_term(weight=-0.0005)
 def turning(step: Step) -> jax.Array:
-    """The square of the turn command: a price on zigzag, [R]."""
+    """Returns the square of the turn command, to penalise zigzag, [R]."""
     return step.action[:, 1] ** 2
 
 
 @observation(unit="m")
 def nearest_robot(view: View) -> jax.Array:
-    """Distance to the nearest other robot, 1 m at most, [R]."""
+    """Returns the distance to the nearest other robot, at most 1 m, [R]."""
     place = view.pose[:, :2]
     apart = jnp.linalg.norm(place[:, None] - place[None, :], axis=-1)
     other = view.present[None, :] & ~jnp.eye(len(place), dtype=bool)
@@ -33,7 +33,7 @@ def nearest_robot(view: View) -> jax.Array:
 
 @level_drawing
 def ring(level: Level, key: jax.Array) -> Level:
-    """Robots on a circle, each with its target on the other side; no obstacles."""
+    """Places robots on a circle, each with its target on the opposite side; no obstacles."""
     robots = level.present.shape[0]
     spread = 2 * jnp.pi / jnp.sum(level.present)
     angle = jax.random.uniform(key, maxval=2 * jnp.pi) + spread * jnp.arange(robots)
@@ -45,10 +45,10 @@ def ring(level: Level, key: jax.Array) -> Level:
 
 @network
 class Residual(nn.Module):
-    """Two layers, the second around a shortcut."""
+    """Two layers; the second one has a skip connection."""
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> jax.Array:
-        """Turns observations [..., O] into features [..., 64]."""
+        """Computes features [..., 64] from observations [..., O]."""
         features = nn.tanh(nn.Dense(64)(observation))
         return features + nn.tanh(nn.Dense(64)(features))

@@ -1,6 +1,6 @@
-"""A small PPO in PyTorch trains s1 until 90 % of targets are reached: python torch_ppo.py.
+"""Trains s1 with a small PPO in PyTorch until 90 % of targets are reached: python torch_ppo.py.
 
-All robots share the policy. An argument bounds the number of updates. It needs the extra `torch`.
+All robots share the policy. An argument limits the number of updates. It needs the extra `torch`.
 """
 
 import sys
@@ -18,7 +18,7 @@ TARGET = 0.9
 
 
 class ActorCritic(nn.Module):
-    """A Gaussian policy and a value, of observations that are normalised as they come."""
+    """A Gaussian policy and a value; both normalise the observations with running statistics."""
 
     def __init__(self, size: int) -> None:
         super().__init__()
@@ -32,7 +32,7 @@ class ActorCritic(nn.Module):
         self.log_std = nn.Parameter(torch.full((2,), -0.5))
 
     def forward(self, seen: Tensor) -> tuple[torch.distributions.Distribution, Tensor]:
-        """[..., O] to the distribution of actions [..., 2] and the value [...]."""
+        """Maps [..., O] to the distribution of actions [..., 2] and the value [...]."""
         seen = self.norm(seen.reshape(-1, seen.shape[-1])).reshape(seen.shape)
         chosen = torch.distributions.Normal(self.actor(seen), self.log_std.exp())
         return torch.distributions.Independent(chosen, 1), self.critic(seen)[..., 0]
@@ -40,7 +40,7 @@ class ActorCritic(nn.Module):
 
 @torch.no_grad()
 def collect(env: SwarmTorchEnv, model: ActorCritic, seen: Tensor) -> tuple[dict, Tensor]:
-    """Drives all robots for STEPS control steps: [T, N, ...] by name, and what is seen next."""
+    """Drives all robots for STEPS control steps; returns [T, N, ...] and the next observation."""
     rows = []
     for _ in range(STEPS):
         policy, value = model(seen)
@@ -53,7 +53,7 @@ def collect(env: SwarmTorchEnv, model: ActorCritic, seen: Tensor) -> tuple[dict,
 
 
 def advantages(batch: dict) -> Tensor:
-    """[T, N] generalised advantages: nothing follows an arrival, and a late robot's value does."""
+    """Computes generalised advantages [T, N]; time-outs are bootstrapped, arrivals are not."""
     goes_on = ~batch["terminated"]
     delta = batch["reward"] + DISCOUNT * batch["next_value"] * goes_on - batch["value"]
     linked, found, ahead = goes_on & ~batch["over"], torch.zeros_like(delta), 0.0
@@ -64,7 +64,7 @@ def advantages(batch: dict) -> Tensor:
 
 
 def update(model: ActorCritic, optimizer: torch.optim.Optimizer, batch: dict) -> None:
-    """Learns from the robots that were on their way."""
+    """Learns from the robots that had not arrived."""
     gain = advantages(batch)
     learn = batch["valid"]
     flat = {name: batch[name][learn] for name in ("seen", "action", "log_prob")}
@@ -81,18 +81,18 @@ def update(model: ActorCritic, optimizer: torch.optim.Optimizer, batch: dict) ->
             loss.backward()
             nn.utils.clip_grad_norm_(model.parameters(), 0.5)
             optimizer.step()
-    model.norm.train()(flat["seen"])  # last: ratios are those of what acted
+    model.norm.train()(flat["seen"])  # last: ratios use the policy that acted
     model.norm.eval()
 
 
 def train(updates: int) -> tuple[float, int, float]:
-    """Trains until TARGET of the last 200 robots, or more, reached their targets.
+    """Trains until at least TARGET of the last 200 robots reached their targets.
 
     Returns:
-        That share, robot steps, and seconds without those of the first step, which compiles.
+        This share, robot steps, and seconds without the first step, which compiles.
     """
     torch.manual_seed(0)
-    torch.set_num_threads(1)  # more cost more than they save networks this small, beside JAX's
+    torch.set_num_threads(1)  # for small networks more threads are slower, next to JAX's
     env = SwarmTorchEnv(swarmjax.make_env("s1", arenas=ARENAS))
     seen = env.reset(seed=0)
     model = ActorCritic(seen.shape[1]).eval()

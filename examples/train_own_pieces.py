@@ -1,4 +1,4 @@
-"""Trains with pieces of your own and judges what was trained: python train_own_pieces.py."""
+"""Trains with your own pieces and judges the policy: python train_own_pieces.py."""
 
 import sys
 from pathlib import Path

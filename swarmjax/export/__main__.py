@@ -1,9 +1,9 @@
-"""`python -m swarmjax.export run=DIR`: a checkpoint becomes `policy.npz`, ONNX, C or for Webots.
+"""`python -m swarmjax.export run=DIR`: exports a checkpoint as `policy.npz`, ONNX, C or for Webots.
 
 Usage: python -m swarmjax.export run=runs/NAME [format=onnx] [step=UPDATE] [seed=SEED] [out=FILE]
        python -m swarmjax.export policy=policy.npz format=c [out=FOLDER]
 
-A run of several seeds gives `policy-seed0.npz` and so on, or that of one `seed`.
+A run with several seeds gives `policy-seed0.npz` and so on; `seed` exports only one of them.
 """
 
 import re
@@ -23,9 +23,9 @@ from swarmjax.run.checkpoint import CheckpointError
 from swarmjax.run.policy_export import POLICY, seed_path, write_policy
 from swarmjax.run.settings import TrainConfig, from_stored, read_config, settle
 
-# What each format is called where `out` does not say.
+# Default name of each format if `out` is not given.
 _NAMES = {"npz": POLICY, "onnx": "policy.onnx", "c": "policy_c", "webots": "swarmjax_epuck"}
-# A controller of such a name would be imported in the place of what it or NumPy needs.
+# A controller with one of these names would hide a module that it or NumPy imports.
 _IMPORTED = sys.stdlib_module_names | {"policy", "controller", "numpy"}
 
 
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str]) -> int:
     targets = _targets(settings, trained)
     leaves, update, skipped = checkpoint.restore(run, settings.step)
     for sentence in skipped:
-        sys.stderr.write(f"swarmjax.export: {sentence}: it was passed over.\n")
+        sys.stderr.write(f"swarmjax.export: {sentence}: it was skipped.\n")
     for seed, out in targets.items():
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / POLICY
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _targets(settings: ExportConfig, trained: TrainConfig) -> dict[int, Path]:
-    """Says which seeds are exported, and where to."""
+    """Lists the seeds to export and their paths."""
     every, seed = trained.numbers, settings.seed
     if seed is not None and seed not in every:
         several = f"seeds {every[0]} to {every[-1]}: give one of them."
@@ -69,10 +69,10 @@ def _targets(settings: ExportConfig, trained: TrainConfig) -> dict[int, Path]:
 
 
 def _target(settings: ExportConfig, folder: Path) -> Path:
-    """Where to, where there is one policy; what is there already is not looked at."""
+    """Returns the path of a single policy, whether or not it already exists."""
     out = Path(settings.out) if settings.out else folder / _default(settings)
     if out.name in ("", ".."):
-        raise ConfigError(f"out is {out}, which others use too: give a name of its own.")
+        raise ConfigError(f"out is {out}, which has no name of its own: give another name.")
     ending = Path(_NAMES[settings.format]).suffix
     if out.suffix != ending and ending:
         raise ConfigError(f"out is {out}, but format is {settings.format}: end it in {ending}.")
@@ -82,7 +82,7 @@ def _target(settings: ExportConfig, folder: Path) -> Path:
 
 
 def _default(settings: ExportConfig) -> str:
-    """What is written where `out` does not say; a `step` leaves the final policy alone."""
+    """Returns the default name of the export; with `step` it does not replace the final policy."""
     name = Path(_NAMES[settings.format])
     return str(
         name if settings.step is None else name.with_stem(f"{name.stem}-step{settings.step}")
@@ -90,7 +90,7 @@ def _default(settings: ExportConfig) -> str:
 
 
 def _check_controller(out: Path) -> None:
-    """Refuses a folder whose name cannot be that of the module of a controller."""
+    """Checks that a folder's name can be the name of a controller's module."""
     if not re.fullmatch(r"[A-Za-z_][\w-]*", out.name, re.ASCII):
         raise ConfigError(
             f"out is {out}, whose name is also the controller's: give letters, digits, _ and - "
@@ -98,8 +98,8 @@ def _check_controller(out: Path) -> None:
         )
     if out.name in _IMPORTED:
         raise ConfigError(
-            f"out is {out}, whose name is also the controller's, and that of a module that it "
-            "imports: give another, as in swarmjax_epuck."
+            f"out is {out}, whose name is also the controller's, but it imports a module of that "
+            "name: give another, as in swarmjax_epuck."
         )
 
 

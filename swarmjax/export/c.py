@@ -1,4 +1,4 @@
-"""A policy as C99 for a microcontroller, with a self-test."""
+"""Writes a policy as C99 for a microcontroller, with a self-test."""
 
 import itertools
 from collections.abc import Iterable, Sequence
@@ -12,12 +12,12 @@ from swarmjax.export import layout as export_layout
 from swarmjax.export.layout import short
 from swarmjax.policy import Policy
 
-CASES = 32  # of the self-test, for each learner
+CASES = 32  # of the self-test, per learner
 _TEMPLATES = Path(__file__).resolve().parent / "templates" / "c"
 _ACTIVATIONS = {
     "tanh": "tanhf(x[i])",
     "relu": "x[i] > 0.0f ? x[i] : 0.0f",
-    # The logistic function by its identity with tanh, as NumPy's side computes it.
+    # The logistic function expressed by tanh, as the NumPy code computes it.
     "swish": "0.5f * x[i] * (1.0f + tanhf(0.5f * x[i]))",
 }
 
@@ -28,11 +28,11 @@ typedef struct {
     float recalled[POLICY_MEMORY];
 } PolicyMemory;
 
-/* Forgets, as a robot does where an episode begins. */
+/* Clears the memory, as at the start of an episode. */
 void policy_begin(PolicyMemory *memory);
 
 """
-# The gated recurrent unit of `policy.step`: gates reset, update and candidate, one after the other.
+# The gated recurrent unit of `policy.step`, with its gates in the order reset, update, candidate.
 _MEMORY_CODE = """static float logistic(float x)
 {
     return 0.5f + 0.5f * tanhf(0.5f * x);
@@ -52,7 +52,8 @@ static void remember(unsigned learner, const float *features, float *recalled)
 }
 
 """
-# The observations of a history, newest first: zeros where an episode begins, as in `policy.step`.
+# The observations of a history, newest first. It is zero at the start of an episode, as in
+# `policy.step`.
 _HISTORY_CODE = """static void remember(const float *observation, float *recalled)
 {
     for (unsigned i = POLICY_MEMORY; i-- > POLICY_OBSERVATIONS;) {
@@ -64,7 +65,7 @@ _HISTORY_CODE = """static void remember(const float *observation, float *recalle
 }
 
 """
-# The sum over neighbours of one layer, in the place of their entries, as in `policy.step`.
+# Replaces the neighbours' entries with one layer's sum over neighbours, as in `policy.step`.
 _HEARING_CODE = """static void hear(unsigned learner, float *x)
 {
     float sum[WIDTH] = {0.0f}, each[WIDTH];
@@ -107,7 +108,7 @@ _MEMORY_RESET = """        if (i % (CASES / 2) < POLICY_LEARNERS) {
 
 
 def render(trained: Policy) -> dict[str, bytes]:
-    """Makes the files of a policy.
+    """Makes the C files of a policy.
 
     Args:
         trained: the policy.
@@ -131,7 +132,7 @@ def _fill(name: str, values: dict[str, str]) -> bytes:
 
 
 def _about(trained: Policy) -> dict[str, str]:
-    """What the comments and the constants say of a policy."""
+    """Returns the texts and constants of a policy that fill the templates."""
     robot, task = trained.meta["robot"], trained.meta["task"]
     sizes, learners = _sizes(trained), len(trained.mean)
     weights = [part for layer in trained.layers for part in layer]
@@ -158,7 +159,7 @@ def _about(trained: Policy) -> dict[str, str]:
 
 
 def _sizes(trained: Policy) -> list[int]:
-    """The sizes of the layers, from what the first one takes to the action."""
+    """Returns the sizes of the layers, from the input of the first one to the action."""
     taken = trained.mean.shape[1]
     if trained.hearing is not None:
         taken = _first(trained) + trained.hearing[1].shape[1]
@@ -166,29 +167,29 @@ def _sizes(trained: Policy) -> list[int]:
 
 
 def _first(trained: Policy) -> int:
-    """The entry at which neighbours begin, of a policy that hears."""
-    assert trained.hearing is not None  # the callers have looked
+    """Returns the first entry about neighbours, for a policy with neighbour messages."""
+    assert trained.hearing is not None  # checked by the callers
     return trained.mean.shape[1] - trained.neighbours["count"] * trained.hearing[0].shape[1]
 
 
 def _seen(trained: Policy) -> int:
-    """The size of one observation."""
+    """Returns the size of one observation."""
     return trained.mean.shape[1] // trained.history
 
 
 def _recalled(trained: Policy) -> int:
-    """The size of the gated recurrent unit; 0 without one."""
+    """Returns the size of the gated recurrent unit; 0 without one."""
     return 0 if trained.memory is None else trained.memory[2].shape[1]
 
 
 def _widest(trained: Policy) -> int:
-    """The most numbers that a layer takes."""
+    """Returns the largest input size of a layer."""
     *inputs, last, _ = _sizes(trained)
     return max([trained.mean.shape[1], *inputs, last + _recalled(trained)])
 
 
 def _hearing(trained: Policy) -> dict[str, str]:
-    """The parts of the code that are about neighbours; empty for a policy that does not hear."""
+    """Returns the code about neighbours; empty for a policy without neighbour messages."""
     said = _SAID_CODE if trained.log_std.shape[1] > 2 else ""
     if trained.hearing is None:
         return {"hearing_code": "", "hearing_call": "", "said": said}
@@ -204,15 +205,15 @@ def _hearing(trained: Policy) -> dict[str, str]:
 
 
 def _memory(trained: Policy) -> dict[str, str]:
-    """The parts of the files that are about a memory; empty for a policy without one."""
+    """Returns the texts and code about the memory; empty for a policy without one."""
     size = trained.carried
     if not size:
         names = ("type", "parameter", "code", "begin", "reset", "argument", "word")
         return dict.fromkeys((f"memory_{name}" for name in names), "") | {
-            "kept": "Nothing is kept in RAM between calls.",
+            "kept": "It keeps nothing in RAM between calls.",
             "memory_start": "",
         }
-    what, code = "What a robot remembers.", _MEMORY_CODE
+    what, code = "The memory of a robot.", _MEMORY_CODE
     if trained.history > 1:
         what = f"The {trained.history - 1} observations before the last one, newest first."
         code = _HISTORY_CODE
@@ -224,14 +225,14 @@ def _memory(trained: Policy) -> dict[str, str]:
         "memory_reset": _MEMORY_RESET,
         "memory_argument": "&memory[i % POLICY_LEARNERS], ",
         "memory_word": "&memory, ",
-        "kept": f"A robot keeps {4 * size} bytes between calls, a\n`PolicyMemory`.",
-        "memory_start": "Where an episode begins:\n\n    PolicyMemory memory;\n\n"
+        "kept": f"A robot keeps {4 * size} bytes between calls, in a\n`PolicyMemory`.",
+        "memory_start": "At the start of an episode:\n\n    PolicyMemory memory;\n\n"
         "    policy_begin(&memory);\n\n",
     }
 
 
 def _layout(trained: Policy) -> dict[str, str]:
-    """Tables of the observation and the action, as lines of a comment."""
+    """Makes tables of the observation and the action as lines of a comment."""
     action = trained.meta["action"]
     rows = zip(*(action[key] for key in ("names", "units", "low", "high")), strict=True)
     commanded = [f" *   {n:<20} {u:<8} {short(a)} to {short(b)}" for n, u, a, b in rows]
@@ -244,7 +245,7 @@ def _layout(trained: Policy) -> dict[str, str]:
 
 
 def _code(trained: Policy) -> dict[str, str]:
-    """What differs from policy to policy in its code."""
+    """Returns the parts of the code that differ between policies."""
     robot, layout = trained.meta["robot"], trained.meta["observation"]
     sizes, limit = _sizes(trained), number(layout["limit"])
     return {
@@ -264,7 +265,7 @@ def _code(trained: Policy) -> dict[str, str]:
 
 
 def _arrays(trained: Policy) -> Iterable[str]:
-    """Definitions of the arrays; a kernel is turned so that an output's weights follow closely."""
+    """Yields the arrays; kernels are transposed so that an output's weights are adjacent."""
     yield _array("MEAN", trained.mean)
     yield _array("STD", trained.std)
     for i, (kernel, bias) in enumerate(trained.layers):
@@ -291,7 +292,7 @@ def _array(name: str, rows: np.ndarray) -> str:
 
 
 def _calls(sizes: Sequence[int], recalled: int) -> Iterable[str]:
-    """The calls of the layers, to and fro between two buffers; before the last, of the memory."""
+    """Yields the calls of the layers, alternating between two buffers; memory precedes the last."""
     source, target = "a", "b"
     last = len(sizes) - 2
     for i, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
@@ -300,7 +301,7 @@ def _calls(sizes: Sequence[int], recalled: int) -> Iterable[str]:
             yield "    for (unsigned i = 0; i < POLICY_MEMORY; i++) {"
             yield f"        {source}[{inputs} + i] = memory->recalled[i];"
             yield "    }"
-            inputs += recalled  # the head takes what is remembered besides
+            inputs += recalled  # the head also takes the memory
         weights = f"KERNEL_{i}[learner], BIAS_{i}[learner], {inputs}, {outputs}"
         yield f"    layer({weights}, {source}, {'action' if i == last else target});"
         if i < last:
@@ -309,7 +310,7 @@ def _calls(sizes: Sequence[int], recalled: int) -> Iterable[str]:
 
 
 def _cases(trained: Policy) -> dict[str, str]:
-    """Cases of the self-test, half of them beyond the clip, and what NumPy makes of them."""
+    """Makes the self-test's cases, half of them beyond the clip, and the results of NumPy."""
     draw = np.random.default_rng(0)
     mean, std = (part[:, : _seen(trained)] for part in (trained.mean, trained.std))
     shape = (CASES, *mean.shape)
@@ -330,7 +331,7 @@ def _cases(trained: Policy) -> dict[str, str]:
 
 
 def _play(trained: Policy, observation: np.ndarray) -> np.ndarray:
-    """Most likely actions of observations one after the other; at half of them all is forgotten."""
+    """Computes the most likely actions for successive observations; clears memory halfway."""
     found, memory = [], None
     for i, seen in enumerate(observation):
         if i in (0, CASES // 2):
@@ -348,12 +349,12 @@ def _values(row: Iterable[float]) -> str:
 
 
 def number(value: float) -> str:
-    """Writes a number so that C reads the very same float32: as a constant of C99.
+    """Writes a number as a C99 constant that C reads as exactly the same float32.
 
     Args:
-        value: rounded to float32.
+        value: the number, rounded to float32.
 
     Returns:
-        As few digits as tell it from its neighbours.
+        The fewest digits that distinguish it from its neighbours.
     """
     return f"{np.format_float_scientific(np.float32(value), trim='0')}f"

@@ -9,21 +9,21 @@ from swarmjax.config.section import MAX_COUNT
 
 @dataclass(frozen=True, kw_only=True)
 class ExportConfig(Section):
-    """Which policy leaves in which form, and where to."""
+    """Settings: which policy to export, in which form, and where to."""
 
     command: ClassVar[str] = "export"
 
     run: str | None = field(default=None, metadata=about("run directory; this or policy"))
     policy: str | None = field(default=None, metadata=about("path of a policy.npz; this or run"))
     format: Literal["npz", "onnx", "c", "webots"] = field(
-        default="npz", metadata=about("of what is written: a file of npz or onnx, or a folder")
+        default="npz", metadata=about("form of the export: an npz or onnx file, or a folder")
     )
     step: int | None = field(
         default=None,
-        metadata=about("update of the run's checkpoint; null: the newest sound", 0, MAX_COUNT),
+        metadata=about("update of the run's checkpoint; null: the newest valid", 0, MAX_COUNT),
     )
     seed: int | None = field(
-        default=None, metadata=about("of the run's policies; null: all of them", 0, MAX_COUNT)
+        default=None, metadata=about("seed of the run's policy; null: all seeds", 0, MAX_COUNT)
     )
     out: str | None = field(
         default=None,
@@ -31,11 +31,11 @@ class ExportConfig(Section):
     )
     extensions: str | None = field(
         default=None,
-        metadata=about("Python file with the pieces that the policy needs; it is run"),
+        metadata=about("Python file with the pieces that the policy needs; it is executed"),
     )
     sensors: Literal["webots", "real"] = field(
         default="webots",
-        metadata=about("what answers the webots controller: simulated e-pucks, or real ones"),
+        metadata=about("sensors of the webots controller: simulated or real e-pucks"),
     )
 
     def _check(self) -> None:

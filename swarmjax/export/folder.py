@@ -1,9 +1,8 @@
-"""Writes what is exported, whole or not at all.
+"""Writes exported files and folders completely or not at all.
 
-A file takes the place of the one before it, whatever that was, in one move. A folder never goes
-over what somebody else has made: it has a manifest, `export.json`,
-with the SHA-256 of each of its files: one that holds nothing but what it lists, unchanged, can be
-exported again, and is replaced; any other is refused.
+A file replaces an older file at its path in one move. A folder has a manifest, `export.json`, with
+the SHA-256 of each of its files. A new export replaces a folder only if it holds exactly the listed
+files, unchanged. Any other folder is left alone and raises an error.
 """
 
 import hashlib
@@ -17,18 +16,18 @@ from swarmjax.atomic_file import replacing
 from swarmjax.config import ConfigError, reading
 
 MANIFEST = "export.json"
-BUILT = ("__pycache__", "build")  # folders that using an export makes, and using it again would
+BUILT = ("__pycache__", "build")  # made by using an export; can be made again
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Writes a file in the place of the one before it, whatever that was.
+    """Writes a file and replaces any older file at its path.
 
     Args:
-        path: of the file; folders that are missing are made.
-        content: all of it.
+        path: path of the file; missing folders are created.
+        content: the whole content.
 
     Raises:
-        ConfigError: if it cannot be written.
+        ConfigError: if the file cannot be written.
     """
     try:
         with replacing(path) as temporary:
@@ -38,11 +37,11 @@ def write_file(path: Path, content: bytes) -> None:
 
 
 def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
-    """Writes a folder, in the place of an export that nobody has changed.
+    """Writes a folder; replaces an older export there if it is unchanged.
 
     Args:
-        path: of the folder.
-        files: content of each, by name.
+        path: path of the folder.
+        files: content of each file, by name.
 
     Raises:
         ConfigError: if the folder holds anything else, or cannot be written.
@@ -69,13 +68,13 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
 
 
 def check_folder(path: Path) -> None:
-    """Refuses to replace a folder that holds more than an unchanged export.
+    """Checks that a folder holds only an unchanged export, so that it can be replaced.
 
     Args:
-        path: of the folder, which need not exist.
+        path: path of the folder; it need not exist.
 
     Raises:
-        ConfigError: if something in it would be lost.
+        ConfigError: if something in the folder would be lost.
     """
     try:
         if not path.exists() or (path.is_dir() and not any(path.iterdir())):
@@ -87,13 +86,13 @@ def check_folder(path: Path) -> None:
         raise _unwritable(path, error) from None
     if strange:
         raise ConfigError(
-            f"out is {path}, where {strange} is not as an export left it: give another folder, "
+            f"out is {path}, where {strange} is not as an export wrote it: give another folder, "
             "or move it away."
         )
 
 
 def _strange(path: Path) -> str | None:
-    """Names something in a folder that its manifest does not vouch for."""
+    """Names a file in the folder that does not match the manifest."""
     try:
         listed = reading.read_json(path / MANIFEST)
     except ConfigError:

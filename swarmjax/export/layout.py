@@ -1,4 +1,4 @@
-"""What a policy observes, in words for the people who get it exported."""
+"""Describes a policy's observation in words, for users of an exported policy."""
 
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ def entries(policy: Policy) -> list[LayoutEntry]:
         policy: the policy.
 
     Returns:
-        [O] in their order.
+        [O] entries in order.
     """
     layout = policy.meta["observation"]
     keys = ("names", "units", "offset", "scale")
@@ -29,13 +29,13 @@ def entries(policy: Policy) -> list[LayoutEntry]:
 
 
 def table(policy: Policy) -> str:
-    """Writes the observation's layout down.
+    """Writes the observation's layout as a table.
 
     Args:
         policy: the policy.
 
     Returns:
-        A Markdown table with a row for each entry, without a line feed at its end.
+        A Markdown table with one row per entry, without a final newline.
     """
     lines = ["| entry | quantity | unit | offset | scale |", "|---|---|---|---|---|"]
     for i, entry in enumerate(entries(policy)):
@@ -64,24 +64,24 @@ def trained_as(policy: Policy) -> str:
 
 
 def holds(policy: Policy) -> bool:
-    """Tells whether a policy was trained to drive on within its target, by `task.arrival=hold`.
+    """Tells whether a policy was trained to keep driving within its target (`task.arrival=hold`).
 
     Args:
         policy: the policy.
 
     Returns:
-        False of files that do not say, which are older than that rule.
+        False for files without this setting, since they are older than that rule.
     """
     return policy.meta["task"].get("arrival", "latch") == "hold"
 
 
 def short(value: float) -> str:
-    """Writes a number in the digits of a float32.
+    """Writes a number with the digits of a float32.
 
     Args:
-        value: finite.
+        value: a finite number.
 
     Returns:
-        At most nine digits, which tell any float32 from its neighbours.
+        At most nine digits, enough to distinguish any float32 from its neighbours.
     """
     return f"{value:.9g}"

@@ -1,6 +1,6 @@
-"""A policy as an ONNX graph, from the observation to the action and the command.
+"""Writes a policy as an ONNX graph, from the observation to the action and the command.
 
-Needs the package `onnx`, an extra. The layout of the observation is in the model's metadata.
+Needs the package `onnx`, an extra. The model's metadata describe the layout of the observation.
 """
 
 import json
@@ -14,16 +14,16 @@ from swarmjax.policy import Policy
 if TYPE_CHECKING:
     from onnx import NodeProto, TensorProto
 
-# What every operation here has been since 2021, so that old runtimes read the file too.
+# The operations here have not changed since this version of 2021, so old runtimes read the file.
 OPSET = 17
 IR_VERSION = 8
 
 
 class _Graph:
-    """A chain of operations, each on what the one before came to."""
+    """A chain of operations; each takes the result of the one before."""
 
     def __init__(self, start: str) -> None:
-        """Begins at the graph's input."""
+        """Starts at the graph's input."""
         self.nodes: list[NodeProto] = []
         self.constants: list[TensorProto] = []
         self.value = start
@@ -37,7 +37,7 @@ class _Graph:
         return name
 
     def then(self, operation: str, *others: str, name: str | None = None, **options: Any) -> str:
-        """Adds an operation on the newest value and `others`; returns what it came to."""
+        """Adds an operation on the newest value and `others`; returns the name of its result."""
         from onnx import helper
 
         result = name or f"value_{len(self.nodes)}"
@@ -54,11 +54,12 @@ def render(policy: Policy) -> bytes:
         policy: the policy.
 
     Returns:
-        The bytes of an ONNX file. Its input `observation` is [B, O] if the policy is shared, else
-        [B, R, O] with R the number of learners, as `meta["observation"]` of the policy says; its
-        outputs are `action` ([..., U], as `policy.act` without `normal`) and `command` (as
-        `policy.command`: m/s and rad/s). One that remembers takes `memory` [..., H] too, or of a
-        history [..., (k - 1) O], zeros where an episode begins, and gives `memory_after`.
+        The bytes of an ONNX file. Its input `observation` is [B, O] for a shared policy, else
+        [B, R, O], where R is the number of learners; `meta["observation"]` of the policy describes
+        the entries. Its outputs are `action` ([..., U], as `policy.act` without `normal`) and
+        `command` (as `policy.command`: m/s and rad/s). A policy with memory has a second input
+        `memory` and a third output `memory_after`: [..., H], or [..., (k - 1) O] for a history.
+        `memory` is zero at the start of an episode.
 
     Raises:
         ConfigError: if the package `onnx` is not installed.
@@ -100,19 +101,19 @@ def render(policy: Policy) -> bytes:
 
 
 def _graph(policy: Policy) -> _Graph:
-    """Puts the operations of `policy.act` and `policy.command` one after the other."""
+    """Chains the operations of `policy.act` and `policy.command`."""
     graph = _Graph("observation")
     limit = policy.meta["observation"]["limit"]
     shared = policy.is_shared
 
     def rows(array: np.ndarray) -> str:
-        """Adds what every row of a batch, robots first, is added to."""
+        """Adds a constant that broadcasts over the rows of a batch; robots come first."""
         return graph.constant(array[0] if shared else array[:, None])
 
     if policy.history > 1:
         _stack(graph, policy.carried)
     if not shared:
-        graph.then("Transpose", perm=[1, 0, 2])  # robots first, so that each meets its own matrix
+        graph.then("Transpose", perm=[1, 0, 2])  # robots first, so that each gets its own matrix
     graph.then("Sub", rows(policy.mean))
     graph.then("Div", rows(policy.std))
     graph.then("Clip", graph.constant(-limit), graph.constant(limit))
@@ -140,7 +141,7 @@ def _command(graph: _Graph, policy: Policy) -> None:
 
 
 def _stack(graph: _Graph, size: int) -> None:
-    """Puts the observations before behind the newest, and hands on all but the oldest."""
+    """Appends the earlier observations to the newest one, and outputs all but the oldest."""
     stacked = graph.then("Concat", "memory", axis=-1)
     bounds = (graph.constant([bound], np.int64) for bound in (0, size, -1))  # start, end, axis
     graph.then("Slice", *bounds, name="memory_after")
@@ -148,7 +149,7 @@ def _stack(graph: _Graph, size: int) -> None:
 
 
 def _hear(graph: _Graph, policy: Policy) -> None:
-    """Puts the sum over neighbours of one layer in the place of their entries, if any are heard."""
+    """Replaces the neighbours' entries with one layer's sum over neighbours, if there are any."""
     if policy.hearing is None:
         return
     (kernel, bias), seen, shared = policy.hearing, graph.value, policy.is_shared
@@ -162,7 +163,7 @@ def _hear(graph: _Graph, policy: Policy) -> None:
 
     own = cut(seen, 0, first)
     cut(seen, first, policy.mean.shape[1])
-    leading = [0] if shared else [0, 0]  # as they are
+    leading = [0] if shared else [0, 0]  # 0 keeps the size
     rows = graph.then("Reshape", graph.constant([*leading, count, width], np.int64))
     is_there = cut(rows, 0, 1)
     graph.value = rows
@@ -176,13 +177,13 @@ def _hear(graph: _Graph, policy: Policy) -> None:
 
 
 def _remember(graph: _Graph, parts: tuple[np.ndarray, ...], *, shared: bool) -> None:
-    """Puts the gated recurrent unit of `policy.step` behind the features, beside which it goes."""
+    """Adds the gated recurrent unit of `policy.step` and appends its state to the features."""
     size, features = parts[2].shape[1], graph.value
     graph.value = "memory"
     old = graph.value if shared else graph.then("Transpose", perm=[1, 0, 2])
 
     def product(source: str, weights: tuple[np.ndarray, ...], gate: int) -> str:
-        """Of one gate: 0 reset, 1 update, 2 candidate."""
+        """Computes the product of one gate: 0 reset, 1 update, 2 candidate."""
         mine = slice(gate * size, (gate + 1) * size)
         kernel, bias = weights[0][..., mine], weights[1][..., mine]
         graph.value = source
@@ -190,7 +191,7 @@ def _remember(graph: _Graph, parts: tuple[np.ndarray, ...], *, shared: bool) -> 
         return graph.then("Add", graph.constant(bias[0] if shared else bias[:, None]))
 
     def opened(gate: int) -> str:
-        """Of reset or update, within 0..1."""
+        """Computes the reset or update gate, within 0..1."""
         seen = product(features, parts[:2], gate)
         product(old, parts[2:], gate)
         graph.then("Add", seen)
@@ -222,7 +223,7 @@ def _activate(graph: _Graph, activation: str) -> None:
 
 
 def _properties(policy: Policy) -> dict[str, str]:
-    """Says in the model's metadata what goes in and what comes out."""
+    """Describes the model's inputs and outputs for its metadata."""
     keys = ("observation", "action", "robot", "sensors", "task", "policy", "learners", "config")
     described = {key: policy.meta[key] for key in (*keys, "versions", "update", "seed")}
     text = {key: json.dumps(value, sort_keys=True) for key, value in described.items()}

@@ -1,6 +1,6 @@
-"""A policy as a controller for e-pucks in Webots, a folder that needs only NumPy.
+"""Makes a Webots e-puck controller from a policy: a folder that needs only NumPy.
 
-The controller is `webots_controller.py` as it stands, told to import the `policy.py` beside it.
+The controller is a copy of `webots_controller.py` that imports the `policy.py` in its own folder.
 """
 
 import json
@@ -26,9 +26,9 @@ def render(
 
     Args:
         trained: the policy.
-        content: of its file.
-        answers: whose sensors it is to read: those of simulated e-pucks, or of real ones.
-        name: of the controller and its folder, which Webots wants to be the same.
+        content: content of the policy file.
+        answers: whose sensors to read: those of simulated or of real e-pucks.
+        name: name of the controller and of its folder; Webots needs them to be equal.
 
     Returns:
         The controller, `policy.py`, `policy.npz`, `sensors.json` and `README.md`.
@@ -44,15 +44,16 @@ def render(
 
 
 def sensors(answers: Literal["webots", "real"]) -> dict[str, Any]:
-    """Says in numbers what the counts of infrared sensors mean.
+    """Describes how to convert the counts of infrared sensors to distances.
 
     Args:
-        answers: whose sensors they are.
+        answers: whose sensors they are: those of simulated or of real e-pucks.
 
     Returns:
-        `answers`; `distance` (m) and `counts`, the points of Webots' table, with lines in between;
-        and for real sensors `fit`, where a count n above free space, at most `span` [K], means
-        sqrt(`strength` / n) - `depth` + `to_hull` [K] m, between 0 and `reach`.
+        `answers`, and the points of Webots' table as `distance` (m) and `counts`, to be
+        interpolated linearly. For real sensors also `fit`: a count n above free space, at most
+        `span` [K], means a distance of sqrt(`strength` / n) - `depth` + `to_hull` [K] m, clipped to
+        the range from 0 to `reach`.
     """
     counts = np.array([row[1] for row in epuck.INFRARED_TABLE])
     found: dict[str, Any] = {
@@ -74,16 +75,16 @@ def sensors(answers: Literal["webots", "real"]) -> dict[str, Any]:
 
 
 def _about(trained: Policy, answers: Literal["webots", "real"], name: str) -> dict[str, str]:
-    """What the README says of a policy."""
+    """Returns the README's texts about a policy."""
     meta = trained.meta
     robot, task = meta["robot"], meta["task"]
     learners = len(trained.mean)
     each = (
-        f"   - of the {learners} policies each robot takes its own: add `robot=0` to "
+        f"   - one of the {learners} policies for each robot: add `robot=0` to "
         f"`robot={learners - 1}`.\n"
     )
     stops = f"A robot stops at {task['target_radius']:g} m from its target."
-    stays = "A robot drives on at its target: the policy is trained to stay there by itself."
+    stays = "A robot keeps driving at its target: the policy is trained to stay there by itself."
     who = {
         "webots": "the sensors that Webots simulates",
         "real": "the sensors of real e-pucks, zeroed to read 0 in free space",

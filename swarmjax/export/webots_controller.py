@@ -1,10 +1,13 @@
-"""Drives an e-puck of Webots to its target by a trained policy. Needs NumPy alone.
+"""Drives a Webots e-puck to its target with a trained policy. Needs only NumPy.
 
-Once every control step: infrared, GPS and compass in, speeds of the wheels out. `policy.npz` and
-`sensors.json`, which says what the sensors' counts mean, lie beside this file. The target comes as
-`target=x,y` (m) in the robot's controllerArgs, or in its customData, where it may change; so does
-`robot=i`, the robot's number from 0, for a policy that is not shared. controllerArgs win. The robot
-draws its actions from the policy; with `action=mean` it does what is most likely.
+In every control step it reads infrared, GPS and compass, and sets the speeds of the wheels. It
+needs `policy.npz` and `sensors.json`, which gives the meaning of the sensors' counts, in the same
+folder.
+
+The target is `target=x,y` (m) in the robot's controllerArgs, or in its customData, where it may
+change. A policy that is not shared also needs `robot=i`, the robot's number from 0. controllerArgs
+take precedence. The robot draws its actions from the policy. With `action=mean` it takes the most
+likely action.
 """
 
 import importlib
@@ -21,13 +24,13 @@ from swarmjax import policy
 from swarmjax.policy import Policy
 
 INFRARED = tuple(f"ps{i}" for i in range(8))
-# What it can put into an observation, in any order.
+# Quantities that the controller can measure; an observation may have them in any order.
 QUANTITIES = (*(f"infrared_{i}" for i in range(8)), "target_distance", "target_bearing")
 MOTORS = ("left wheel motor", "right wheel motor")
 
 
 class Orders(NamedTuple):
-    """Where a robot is to go, which one it is, and whether it draws its actions."""
+    """A robot's target, its number, and whether it draws its actions."""
 
     target: tuple[float, float] | None = None
     robot: int = 0
@@ -38,13 +41,13 @@ def parse(words: Iterable[str]) -> Orders:
     """Reads `target=x,y`, `robot=i` and `action=mean` or `action=sampled`.
 
     Args:
-        words: of controllerArgs, or of customData.
+        words: words of controllerArgs or of customData.
 
     Returns:
         The orders.
 
     Raises:
-        ValueError: if a word is none of them.
+        ValueError: if a word is none of these.
     """
     orders = Orders()
     for word in words:
@@ -75,17 +78,17 @@ def observe(
     distance: float,
     bearing: float,
 ) -> np.ndarray:
-    """Puts an observation together.
+    """Assembles an observation.
 
     Args:
-        trained: the policy that is to observe.
-        sensors: what `sensors.json` holds.
-        counts: [K] of the infrared sensors.
-        distance: to the target, m.
-        bearing: of the target from the robot's x axis, rad, left positive.
+        trained: the policy.
+        sensors: contents of `sensors.json`.
+        counts: [K] counts of the infrared sensors.
+        distance: distance to the target, m.
+        bearing: direction of the target from the robot's x axis, rad, left positive.
 
     Returns:
-        [O] float32, scaled as the policy's layout says.
+        [O] float32, scaled by the policy's layout.
     """
     layout = trained.meta["observation"]
     seen = np.asarray(counts, float)
@@ -102,14 +105,14 @@ def observe(
 
 
 def ray(counts: np.ndarray, sensors: dict[str, Any]) -> np.ndarray:
-    """Turns counts into metres, as a robot does whose sensors are calibrated.
+    """Converts counts to metres, as a robot with calibrated sensors does.
 
     Args:
-        counts: [K].
-        sensors: what `sensors.json` holds.
+        counts: [K] counts of the sensors.
+        sensors: contents of `sensors.json`.
 
     Returns:
-        [K] the distances at which nominal sensors report such counts, m.
+        [K] distances at which nominal sensors report these counts, m.
     """
     if sensors["answers"] == "webots":
         return np.interp(counts, sensors["counts"][::-1], sensors["distance"][::-1])
@@ -123,12 +126,12 @@ def ray(counts: np.ndarray, sensors: dict[str, Any]) -> np.ndarray:
 def to_target(
     position: Sequence[float], north: Sequence[float], target: tuple[float, float]
 ) -> tuple[float, float]:
-    """Works out how a target lies from a robot.
+    """Computes the distance and the bearing of a target from a robot.
 
     Args:
-        position: of the robot, x and y first, m; what a GPS reports.
-        north: in the robot's frame, x and y first; what a compass reports. The world is ENU, so
-            north is its y axis.
+        position: position of the robot from its GPS, x and y first, m.
+        north: direction of north in the robot's frame from its compass, x and y first. The world
+            is ENU, so north is its y axis.
         target: x and y, m.
 
     Returns:
@@ -141,11 +144,11 @@ def to_target(
 
 
 def begin(trained: Policy, robot: int) -> np.ndarray | None:
-    """Returns the memory of a robot that has a new target; None if the policy has none.
+    """Returns the memory of a robot with a new target; None if the policy has no memory.
 
     Args:
         trained: the policy.
-        robot: its number, from 0.
+        robot: the robot's number, from 0.
     """
     return policy.begin(trained, (1 if trained.is_shared else robot + 1,))
 
@@ -157,20 +160,20 @@ def wheel_speeds(
     normal: Any = 0.0,
     memory: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Lets the policy act.
+    """Computes the speeds of the wheels from an observation.
 
     Args:
         trained: the policy.
-        observation: [O].
-        robot: its number, from 0.
-        normal: [U] standard normal, to draw the action with; 0 is the most likely one.
-        memory: as `begin` or the call before returned it.
+        observation: [O] the observation.
+        robot: the robot's number, from 0.
+        normal: [U] standard normal numbers to draw the action; 0 gives the most likely one.
+        memory: memory that `begin` or the previous call returned.
 
     Returns:
         [2] speeds of the left and the right wheel, rad/s, each within its own limit, and the memory
-        after.
+        afterwards.
     """
-    # Robots before this one are there only so that it meets its own network.
+    # Rows of the robots before this one only ensure that it gets its own network.
     seen = np.broadcast_to(observation, (1 if trained.is_shared else robot + 1, observation.size))
     memory, action = policy.step(trained, memory, seen, normal)
     speed, turn_rate = policy.command(trained, action)[-1]
@@ -181,7 +184,7 @@ def wheel_speeds(
 
 
 class Devices(NamedTuple):
-    """What the controller has to do with."""
+    """The robot's devices that the controller uses."""
 
     infrared: list[Any]
     gps: Any
@@ -193,26 +196,26 @@ def find_devices(robot: Any, period: int) -> Devices:
     """Finds a robot's devices and switches them on.
 
     Args:
-        robot: of Webots.
-        period: between samples, ms.
+        robot: the robot object of Webots.
+        period: time between samples, ms.
 
     Returns:
-        The devices: sensors that report every `period`, and motors that stand still.
+        The devices: sensors that report every `period`, and motors at rest.
 
     Raises:
-        ValueError: if one is missing.
+        ValueError: if a device is missing.
     """
     found = {name: robot.getDevice(name) for name in (*INFRARED, "gps", "compass", *MOTORS)}
     for name, device in found.items():
         if device is None:
             raise ValueError(
                 f"the robot has no device {name!r}: an E-puck with a GPS and a Compass in its "
-                "turretSlot has all that this needs."
+                "turretSlot has all of them."
             )
     for name in (*INFRARED, "gps", "compass"):
         found[name].enable(period)
     for name in MOTORS:
-        found[name].setPosition(math.inf)  # turned by speed
+        found[name].setPosition(math.inf)  # controlled by speed
         found[name].setVelocity(0.0)
     return Devices(
         [found[name] for name in INFRARED],
@@ -227,18 +230,18 @@ def control_period(trained: Policy, basic_step: float) -> int:
 
     Args:
         trained: the policy.
-        basic_step: of the world, ms.
+        basic_step: basic time step of the world, ms.
 
     Returns:
         The control step that the policy was trained with, ms.
 
     Raises:
-        ValueError: if it is not whole, or no multiple of the world's step.
+        ValueError: if the control step is not a whole number of ms or a multiple of `basic_step`.
     """
     period = 1000 * trained.meta["task"]["control_step"]
     if abs(round(period) - period) > 1e-6 * period:
         raise ValueError(
-            f"the control step of the policy is {period:g} ms: Webots has whole milliseconds only."
+            f"the control step of the policy is {period:g} ms: Webots needs whole milliseconds."
         )
     steps = round(period / basic_step)
     if steps < 1 or abs(steps * basic_step - period) > 1e-6 * period:
@@ -253,12 +256,12 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
     """Drives a robot until the simulation ends.
 
     Args:
-        robot: of Webots.
-        folder: where `policy.npz` and `sensors.json` lie.
-        words: of controllerArgs.
+        robot: the robot object of Webots.
+        folder: folder with `policy.npz` and `sensors.json`.
+        words: words of controllerArgs.
 
     Raises:
-        ValueError: if the policy, the robot or the orders are unsound.
+        ValueError: if the policy, the robot or the orders are invalid.
     """
     trained = policy.load(folder / "policy.npz")
     sensors = json.loads((folder / "sensors.json").read_text())
@@ -277,7 +280,7 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
                 devices.gps.getValues(), devices.compass.getValues(), orders.target
             )
             counts = [sensor.getValue() for sensor in devices.infrared]
-            # A robot that has arrived stays where it is, as in training.
+            # An arrived robot stays where it is, as in training.
             if stops and distance <= trained.meta["task"]["target_radius"]:
                 parked_at = orders.target
             else:
@@ -289,14 +292,17 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
 
 
 def _custom(robot: Any, given: Orders) -> list[str]:
-    """The words of customData; if it need not name the target, somebody else may use it too."""
+    """Returns the words of customData.
+
+    If controllerArgs name the target, other programs may use customData, so only `robot=` counts.
+    """
     words = robot.getCustomData().split()
     return [word for word in words if given.target is None or word.startswith("robot=")]
 
 
 def main() -> int:
     """Runs the controller in Webots; returns its exit code."""
-    # Webots puts its own package `controller` where a controller finds it, and nowhere else.
+    # Only a controller started by Webots can import its package `controller`.
     robot = importlib.import_module("controller").Robot()
     try:
         drive(robot, Path(__file__).resolve().parent, sys.argv[1:])

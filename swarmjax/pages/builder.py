@@ -1,8 +1,8 @@
-"""Fills templates of pages, and writes them.
+"""Fills templates of pages, and writes pages.
 
-A template `room/name` is the file `swarmjax/room/templates/name`. Jinja2 escapes every value. What
-comes from a run is only ever a value, never a template, and each page carries a policy that lets it
-load and run nothing but what its own room put into it.
+A template `package/name` is the file `swarmjax/package/templates/name`. Jinja2 escapes every value.
+Data from a run are always values, never templates. Each page has a content security policy that
+lets it load and run only what its own package put into it.
 """
 
 import base64
@@ -20,10 +20,10 @@ STYLE = "pages/page.css"
 
 
 def read(name: str) -> str:
-    """Reads a file of a room's templates.
+    """Reads a file from a package's templates.
 
     Args:
-      name: `room/name`.
+      name: `package/name`.
     """
     room, _, file = name.partition("/")
     place = resources.files("swarmjax") / room / "templates" / file
@@ -52,15 +52,15 @@ def render(
     sources: Mapping[str, str] | None = None,
     **values: Any,
 ) -> str:
-    """Lays a page out.
+    """Lays out a page.
 
     Args:
-      template: of the page, which extends `pages/base.html`.
-      styles: names of its style sheets; of two rules the later one counts.
-      script: that it runs, if any; from this package, since it is not escaped.
-      sources: what it may load beside its own style and script and pictures inside it, by the
-        directive of its policy.
-      values: that the template names. They are escaped.
+      template: template of the page; it extends `pages/base.html`.
+      styles: names of the style sheets; later rules override earlier ones.
+      script: script of the page, if any. It must come from `swarmjax`, since it is not escaped.
+      sources: what else the page may load, by directive of its content security policy. Its own
+        style, script and embedded pictures are always allowed.
+      values: values for the template. They are escaped.
 
     Returns:
       HTML.
@@ -81,22 +81,22 @@ def render(
 
 
 def _hash_source(text: str) -> str:
-    """Names a style or a script in a policy (W3C, Content Security Policy Level 3, 2.3.1)."""
+    """Writes the hash of a style or a script for the policy (W3C, CSP Level 3, 2.3.1)."""
     return f"'sha256-{_base64(hashlib.sha256(text.encode()).digest())}'"
 
 
 def write(out: Path, files: Mapping[str, bytes]) -> list[Path]:
-    """Writes files into a directory, which is made.
+    """Writes files into a directory and creates the directory.
 
     Args:
       out: the directory.
-      files: contents by name, which may lead into folders of it.
+      files: contents by name; a name may contain subfolders.
 
     Returns:
-      The files, in their order.
+      The paths of the files, in order.
 
     Raises:
-      ConfigError: if one cannot be written.
+      ConfigError: if a file cannot be written.
     """
     try:
         for name, content in files.items():

@@ -1,6 +1,6 @@
-"""Episodes as one HTML page, or as a film.
+"""Shows episodes as one HTML page, or as a video.
 
-Imports `evaluate`, whose engine steps them, settings and geometry of `task` and `sim`, `pages`, and
-`export.folder` to replace files. `record.py` keeps what happened, `pack.py` makes it
-small, `page.py` and `video.py` show it. Start with `episodes.replay`.
+Imports `evaluate`, whose engine steps the episodes, settings and geometry from `task` and `sim`,
+`pages`, and `export.folder` to replace files. `record.py` records episodes, `pack.py` compresses
+the recordings, and `page.py` and `video.py` show them. Start with `episodes.replay`.
 """

@@ -1,7 +1,7 @@
-"""`python -m swarmjax.replay policy=FILE[,FILE] level=N,... | worst=K`: episodes to look at.
+"""`python -m swarmjax.replay policy=FILE[,FILE] level=N,... | worst=K`: plays episodes.
 
-Runs them in MuJoCo's C engine, as `evaluate` does, and writes one HTML file that plays them in a
-browser; `video=FILE.mp4` renders them in 3-D as well. Two policies are shown side by side on the
+Runs the episodes in MuJoCo's C engine, as `evaluate` does, and writes one HTML file that plays them
+in a browser. `video=FILE.mp4` also renders them in 3-D. Two policies are shown side by side on the
 same levels. No JAX.
 """
 
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _left_out(settings: ReplayConfig, entrant: Entrant) -> str:
-    """Names the terms of the reward of training whose code is not at hand."""
+    """Names the reward terms of training whose code is missing here."""
     earning = record.weights(entrant.policy, settings.task)
     own = record.own_terms(entrant.policy, settings.extensions, earning)
     found = {piece.name for piece, _ in own}
@@ -75,7 +75,7 @@ def _left_out(settings: ReplayConfig, entrant: Entrant) -> str:
 
 
 def _check_file(key: str, path: Path) -> None:
-    """Makes the folder of a file, before there is a replay to lose."""
+    """Makes the folder of a file before the replay is computed, so that no result is lost."""
     _write(key, path, lambda: path.parent.mkdir(parents=True, exist_ok=True))
     if path.is_dir():
         raise _unwritable(key, path, "it is a folder")
@@ -84,7 +84,7 @@ def _check_file(key: str, path: Path) -> None:
 
 
 def _check_out(path: Path, others: Sequence[str | None]) -> None:
-    """Refuses a page that cannot be written, or would be written over another file of these."""
+    """Checks that the page can be written and does not overwrite one of the other files."""
     if path.suffix != ".html":
         raise ConfigError(f"out is {path}: give a name that ends with .html.")
     _check_apart("out", path, others)
@@ -92,14 +92,14 @@ def _check_out(path: Path, others: Sequence[str | None]) -> None:
 
 
 def _check_apart(key: str, path: Path, others: Sequence[str | None]) -> None:
-    """Refuses to write over a file that the command reads or writes too."""
+    """Checks that a file does not overwrite another one that the command reads or writes."""
     for other in others:
         if other is not None and path.resolve() == Path(other).resolve():
             raise ConfigError(f"{key} is {path}, which is given as another file: give a new name.")
 
 
 def _check_video(path: Path, others: Sequence[str | None]) -> None:
-    """Refuses a film that cannot be made or written, or would be written over one of these."""
+    """Checks that the video can be made and written, and overwrites none of the other files."""
     if path.suffix != ".mp4":
         raise ConfigError(f"video is {path}: give a name that ends with .mp4.")
     _check_apart("video", path, others)
@@ -108,7 +108,7 @@ def _check_video(path: Path, others: Sequence[str | None]) -> None:
 
 
 def _write(key: str, path: Path, write: Callable[[], object]) -> None:
-    """Does what may fail for want of permission or room."""
+    """Writes a file; turns missing permission or a full disk into a message."""
     try:
         write()
     except OSError as error:

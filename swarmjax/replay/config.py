@@ -17,31 +17,29 @@ from swarmjax.task.stage_config import StageConfig
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayConfig(Section):
-    """Which episodes of which policies are shown, and where to."""
+    """Settings: which episodes of which policies to show, and where to write the replay."""
 
     command: ClassVar[str] = "replay"
     inherited: ClassVar[Mapping[str, str]] = AS_TRAINED
 
-    policy: str = field(
-        metadata=about("path of a policy.npz; of two for a comparison, as in a.npz,b.npz")
-    )
+    policy: str = field(metadata=about("path of a policy.npz; to compare two, a.npz,b.npz"))
     stage: StageConfig
     suite: str | None = field(
         default=None,
         metadata=about("instead of a stage: a name of configs/suites/, or a file .yaml or .npz"),
     )
     cell: str | None = field(
-        default=None, metadata=about("of the suite; null: all of them, which only worst takes")
+        default=None, metadata=about("cell of the suite; null: all cells, only with worst")
     )
     robot: RobotConfig = field(default_factory=lambda: RobotConfig(body="wheeled"))
     task: TaskConfig = field(default_factory=TaskConfig)
     realism: RealismConfig = field(default_factory=RealismConfig)
-    shape: Shape = field(default="box", metadata=about("of the obstacles of a random level"))
+    shape: Shape = field(default="box", metadata=about("shape of a random level's obstacles"))
     action: Literal["sampled", "mean"] = field(
         default="sampled",
         metadata=about(
-            "of the robots; sampled: drawn from the policy, the same for the same level; mean: "
-            "the most likely one"
+            "actions of the robots; sampled: drawn from the policy, the same for the same level; "
+            "mean: the most likely one"
         ),
     )
     level: str | None = field(
@@ -50,36 +48,36 @@ class ReplayConfig(Section):
     )
     worst: int | None = field(
         default=None,
-        metadata=about("replay this many of the episodes, those that went worst", 1, 100),
+        metadata=about("replay this many of the worst episodes", 1, 100),
     )
     steps: int | None = field(
         default=None,
         metadata=about(
-            f"control steps of an episode; null: those of the suite's cell, else {STEPS}",
+            f"control steps of an episode; null: as in the suite's cell, else {STEPS}",
             1,
             MOST_STEPS,
         ),
     )
     episodes: int = field(
-        default=1000, metadata=about("how many levels there are to choose from", 1, MOST_EPISODES)
+        default=1000, metadata=about("number of levels to choose from", 1, MOST_EPISODES)
     )
     seed: int = field(default=1, metadata=about("random seed of the levels", 0, MAX_COUNT))
     workers: int | None = field(
-        default=None, metadata=about("processes that worst runs; null: one a core", 1, 1024)
+        default=None, metadata=about("processes for worst; null: one per core", 1, 1024)
     )
     substeps: int | None = field(
         default=None,
-        metadata=about("physics steps per control step; null: those of the body", 1, 1000),
+        metadata=about("physics steps per control step; null: the body's default", 1, 1000),
     )
     extensions: str | None = field(
         default=None,
-        metadata=about("Python file with the pieces that the policies need; it is run"),
+        metadata=about("Python file with the pieces that the policies need; it is executed"),
     )
     out: str = field(default="replay.html", metadata=about("HTML file of the replay"))
     video: str | None = field(default=None, metadata=about("MP4 file of the scene in 3-D"))
     video_speed: float = field(
         default=1.0,
-        metadata=about("seconds of the episode in a second of the video", 0.05, 100.0),
+        metadata=about("seconds of the episode per second of video", 0.05, 100.0),
     )
 
     def _check(self) -> None:
@@ -122,18 +120,18 @@ class ReplayConfig(Section):
 
     @property
     def levels(self) -> tuple[int, ...]:
-        """The numbers of the levels that are named."""
+        """The numbers of the named levels."""
         return (0,) if self.level is None else tuple(int(each) for each in self.level.split(","))
 
     @property
     def _drawn(self) -> int:
-        """How many levels of a stage are drawn: of those that are named no more than needed."""
+        """How many levels of a stage are drawn; no more than the named ones need."""
         is_named = self.worst is None and self.suite is None
         return max(self.levels) + 1 if is_named else self.episodes
 
     @property
     def evaluation(self) -> EvaluateConfig:
-        """The evaluation that the episodes are part of."""
+        """The evaluation to which the episodes belong."""
         return EvaluateConfig(
             policy=self.policy,
             stage=self.stage,

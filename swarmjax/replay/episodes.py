@@ -28,15 +28,16 @@ class Pick(NamedTuple):
 def replay(
     settings: ReplayConfig, entrants: Sequence[Entrant], progress: Progress
 ) -> list[ReplayEpisode]:
-    """Records the episodes that are asked for.
+    """Records the requested episodes.
 
     Args:
-        settings: Of the replay.
-        entrants: Who drives.
-        progress: Shows how far it is.
+        settings: The replay's settings.
+        entrants: The policies that drive.
+        progress: Shows the progress.
 
     Returns:
-        What became of each level, in the order in which they were named, or the worst first.
+        The recordings of each level, in the order in which the levels were named, or the worst
+        first.
 
     Raises:
         PolicyError: If a policy does not fit a level's stage.
@@ -60,7 +61,7 @@ def replay(
 
 
 def _cells(settings: ReplayConfig) -> list[Cell]:
-    """Draws the levels that there are to choose from; of a stage no more than are named."""
+    """Draws the levels to choose from; for a stage, no more than the named ones need."""
     if settings.suite is None and settings.worst is None:
         return [cells.draw_stage(settings.evaluation, settings.levels)]
     suite = cells.load(settings.evaluation)
@@ -74,7 +75,7 @@ def _cells(settings: ReplayConfig) -> list[Cell]:
 
 
 def _check_worst(settings: ReplayConfig, count: int) -> None:
-    """Refuses to choose more levels than there are."""
+    """Checks that there are enough levels to choose from."""
     if settings.worst is not None and settings.worst > count:
         where = f"suite {settings.suite}" + (f", cell {settings.cell}," if settings.cell else "")
         raise ConfigError(
@@ -83,7 +84,7 @@ def _check_worst(settings: ReplayConfig, count: int) -> None:
 
 
 def _named(settings: ReplayConfig, chosen: Sequence[Cell]) -> list[Pick]:
-    """Finds the levels that are named; those of the first cell, which is the only one."""
+    """Finds the named levels; they need a single cell."""
     if settings.worst is not None:
         return []
     if len(chosen) > 1:
@@ -105,11 +106,12 @@ def worst(trials: Sequence[Trial], count: int) -> list[Pick]:
     """Chooses the episodes that went worst for the first policy.
 
     Args:
-        trials: What became of it on each cell.
-        count: How many to choose.
+        trials: The policy's results on each cell.
+        count: How many episodes to choose.
 
     Returns:
-        Fewest targets reached first, then most contacts a robot, then longest, then the first.
+        The worst episodes first. The order is by fewest targets reached, then by most contacts per
+        robot, then by longest duration, then by level number.
     """
     picks = [Pick(i, j) for i, each in enumerate(trials) for j in range(len(each.cell.episodes))]
     reached, contacts, time = (
@@ -126,7 +128,7 @@ def _record(
     picks: Sequence[Pick],
     report: Callable[[int], None],
 ) -> list[ReplayEpisode]:
-    """Records episodes, those of one cell side by side."""
+    """Records episodes; those of one cell run side by side."""
     found = {}
     for i in sorted({pick.cell for pick in picks}):
         cell, mine = chosen[i], [pick for pick in picks if pick.cell == i]

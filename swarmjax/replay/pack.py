@@ -1,11 +1,13 @@
-"""Recordings as few bytes: whole numbers of a quantum, differences in time, deflated.
+"""Packs recordings into few bytes: integer quanta, differences in time, deflated.
 
-What is packed is the length of the header (4 bytes, little-endian), the header (JSON), and one
-after the other the series of all runs that the header lists. A series is a table of whole
-numbers, a row a frame: of each number the difference to the one above it (of the first row, the
-number itself), folded to 0, -1, 1, -2, 2, ... = 0, 1, 2, 3, 4, ..., column by column; first the
-lowest byte of all of them, then the next one, as many as are needed. All of it is one zlib
-stream. `templates/replay.js` reads it.
+The packed data are one zlib stream with three parts: the length of the header (4 bytes,
+little-endian), the header (JSON), and the series of all runs that the header lists, in that order.
+
+A series is a table of integers with one row per frame. Each number is stored as the difference to
+the number above it; the first row is stored as it is. Signed differences are folded: 0, -1, 1, -2,
+2, ... become 0, 1, 2, 3, 4, ... The numbers are stored column by column: the lowest byte of all of
+them first, then the next byte, and so on, with as many bytes as needed. `templates/replay.js` reads
+this format.
 """
 
 import colorsys
@@ -19,17 +21,17 @@ import numpy as np
 from swarmjax.config import ConfigError
 from swarmjax.replay.record import Recording, ReplayEpisode
 
-LENGTH = 2e-4  # m; poses are at most half of it off
-ANGLE = 1e-3  # rad; likewise
+LENGTH = 2e-4  # m; positions are off by at most half of it
+ANGLE = 1e-3  # rad; headings are off by at most half of it
 RAY = 5e-4  # m; a ray is shown with the middle of its interval
-MOST = 1 << 30  # of quanta; differences of such numbers fold to 32 bits
-REWARD = 1e-4  # of each term of the reward, summed up since the start
-# Of small swarms; told apart on a light and on a dark page.
+MOST = 1 << 30  # largest number of quanta; differences of such numbers fold to 32 bits
+REWARD = 1e-4  # for each reward term, summed since the start
+# Colours for small swarms, distinct on light and dark pages.
 _PALETTE = (
     "#2f7fd1", "#e06c00", "#1f9d6b", "#c94f9d", "#c9a100",
     "#35a7c9", "#a0653c", "#8e6bd0", "#7a9a1e", "#d1495b",
 )  # fmt: skip
-_GOLDEN = 0.381966  # of a turn: hues that are this far apart stay apart, however many there are
+_GOLDEN = 0.381966  # of a turn: hues with this spacing stay distinct for any number of robots
 
 
 def pack(about: Mapping[str, Any], episodes: Sequence[ReplayEpisode], reach: float) -> bytes:
@@ -37,8 +39,8 @@ def pack(about: Mapping[str, Any], episodes: Sequence[ReplayEpisode], reach: flo
 
     Args:
         about: Further entries of the header.
-        episodes: What became of each level.
-        reach: Length that a ray has where there is nothing, m.
+        episodes: The recordings of each level.
+        reach: Length of a ray that meets nothing, m.
 
     Returns:
         A zlib stream.
@@ -64,11 +66,11 @@ def fold(name: str, table: np.ndarray) -> tuple[bytes, int]:
     """Packs one series.
 
     Args:
-        name: Of the series.
-        table: [N, C] whole numbers of any type, less than `MOST` to either side of 0.
+        name: Name of the series.
+        table: [N, C] whole numbers of any type, with absolute values below `MOST`.
 
     Returns:
-        Its bytes, and how many bytes a number takes, 1 to 4.
+        The bytes, and the number of bytes per number, 1 to 4.
 
     Raises:
         ConfigError: If a number is too large.
@@ -89,10 +91,10 @@ def colours(robots: int) -> list[str]:
     """Gives every robot a colour.
 
     Args:
-        robots: How many there are.
+        robots: Number of robots.
 
     Returns:
-        A colour each, as #rrggbb.
+        One colour per robot, as #rrggbb.
     """
     if robots <= len(_PALETTE):
         return list(_PALETTE[:robots])
@@ -107,16 +109,16 @@ def dark(reach: float) -> int:
     """Returns the whole number that stands for a ray that meets nothing.
 
     Args:
-        reach: Length that such a ray has, m.
+        reach: Length of such a ray, m.
 
     Returns:
-        More than that of any shorter ray.
+        A number larger than that of any shorter ray.
     """
     return int(np.ceil(reach / RAY))
 
 
 def _columns(recording: Recording, reach: float) -> dict[str, np.ndarray]:
-    """Returns the series [N, C] of a run by name, in whole numbers; C counts robots first."""
+    """Returns the series [N, C] of a run by name, as integers; robots come first in C."""
     rows = len(recording.pose)
     ray = np.where(recording.ray < reach, np.floor(recording.ray / RAY), dark(reach))
     touch = recording.touching @ np.array([1, 2, 4])
@@ -129,7 +131,7 @@ def _columns(recording: Recording, reach: float) -> dict[str, np.ndarray]:
         "contacts": recording.contacts,
     }
     latched = (recording.arrival > 0) & (np.arange(rows)[:, None] >= recording.arrival)
-    if (recording.arrived != latched).any():  # it left again: `arrival` alone does not say
+    if (recording.arrived != latched).any():  # a robot left again, which `arrival` cannot show
         series["arrived"] = recording.arrived.astype(int)
     for name, term in recording.reward.items():
         series[f"reward.{name}"] = np.cumsum(term, axis=0) / REWARD
@@ -137,11 +139,11 @@ def _columns(recording: Recording, reach: float) -> dict[str, np.ndarray]:
 
 
 def _describe(episode: ReplayEpisode) -> dict[str, Any]:
-    """Returns what a level's header says, lengths in m to 10 um."""
+    """Returns the header entry of a level, with lengths in m rounded to 10 um."""
     scene = episode.runs[0].scene
     sensor = scene.sensor
     if (sensor == sensor[:1]).all():
-        sensor = sensor[:1]  # every robot has them where they should be
+        sensor = sensor[:1]  # all robots have the same nominal mounting
     return {
         "label": episode.label,
         "level": episode.level,
@@ -154,5 +156,5 @@ def _describe(episode: ReplayEpisode) -> dict[str, Any]:
 
 
 def _describe_run(recording: Recording) -> dict[str, Any]:
-    """Returns what a run's header says beside its series."""
+    """Returns the header entry of a run, without its series."""
     return {"frames": len(recording.pose), "arrival": recording.arrival.tolist()}

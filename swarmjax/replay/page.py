@@ -1,4 +1,4 @@
-"""The page of a replay: one HTML file that needs nothing else and asks for nothing else."""
+"""Builds the page of a replay: one self-contained HTML file that loads nothing else."""
 
 from collections.abc import Sequence
 
@@ -20,16 +20,16 @@ def page(
     episodes: Sequence[ReplayEpisode],
     words: str,
 ) -> str:
-    """Lays the page out.
+    """Lays out the page.
 
     Args:
-        settings: Of the replay.
-        policies: Who drives.
-        episodes: What became of each level.
+        settings: The replay's settings.
+        policies: The policies that drive.
+        episodes: The recordings of each level.
         words: The command that makes the page.
 
     Returns:
-        HTML. What it says about files and settings is escaped or inside the packed data.
+        HTML. Text about files and settings is either escaped or inside the packed data.
     """
     task = settings.task
     header = {
@@ -52,8 +52,8 @@ def fill(title: str, packed: bytes) -> str:
     """Puts title and data into the template.
 
     Args:
-        title: Of the page.
-        packed: What `pack.pack` returned.
+        title: Title of the page.
+        packed: The packed recordings, from `pack.pack`.
 
     Returns:
         HTML.
@@ -69,14 +69,14 @@ def fill(title: str, packed: bytes) -> str:
 
 
 def _levels(settings: ReplayConfig) -> str:
-    """Names the levels as a whole."""
+    """Names the stage or the suite of the levels."""
     if settings.suite is None:
         return settings.stage.name
     return settings.suite if settings.cell is None else f"{settings.suite}, {settings.cell}"
 
 
 def _about(settings: ReplayConfig) -> str:
-    """Says in a line what is seen; cells of a suite may have a realism of their own."""
+    """Describes the replay in one line; cells of a suite may have their own realism."""
     if settings.suite is None:
         realism = files.preset_of("realism", settings.realism)
         where = f"stage {_levels(settings)}, realism {realism}"
@@ -86,7 +86,7 @@ def _about(settings: ReplayConfig) -> str:
 
 
 def _facts(settings: ReplayConfig, policies: Sequence[Policy], words: str) -> list[tuple[str, str]]:
-    """Says how the episodes came about and how exactly they are shown, a line each."""
+    """States how the episodes were made and how precisely they are shown, one fact per line."""
     names = zip(settings.policies, policies, strict=True)
     length, angle = 1e3 * pack.LENGTH, pack.ANGLE
     earned = "; nothing after arrival" if settings.task.arrival == "latch" else ""
@@ -96,10 +96,10 @@ def _facts(settings: ReplayConfig, policies: Sequence[Policy], words: str) -> li
         ("time", f"control steps of {settings.task.control_step:g} s, {_most_steps(settings)}"),
         ("reward", f"by the weights that the policy was trained with{earned}"),
         (
-            "exactness",
-            f"positions to {length / 2:g} mm and headings to {angle / 2:g} rad of the simulated "
-            f"ones, rays to {500 * pack.RAY:g} mm, each reward term's sum to "
-            f"{pack.REWARD / 2:g}",
+            "precision",
+            f"errors of at most {length / 2:g} mm for positions, {angle / 2:g} rad for headings, "
+            f"{500 * pack.RAY:g} mm for rays and {pack.REWARD / 2:g} for the sum of each reward "
+            "term",
         ),
         ("versions", ", ".join(f"{name} {found}" for name, found in _versions().items())),
         ("made by", words),
@@ -107,24 +107,24 @@ def _facts(settings: ReplayConfig, policies: Sequence[Policy], words: str) -> li
 
 
 def _most_steps(settings: ReplayConfig) -> str:
-    """Says how long an episode may be; cells of a suite may have a step limit of their own."""
+    """Writes how long an episode may be; cells of a suite may have their own step limit."""
     limit = f"{settings.evaluation.step_limit} at most"
     is_given = settings.suite is None or settings.steps is not None
-    return limit if is_given else f"{limit} unless the cell has a step limit of its own"
+    return limit if is_given else f"{limit}, unless the cell has its own step limit"
 
 
 def _choice(settings: ReplayConfig) -> str:
-    """Says which levels they are."""
+    """Writes which levels are shown."""
     origin = f"of seed {settings.seed}" if settings.suite is None else f"of {_levels(settings)}"
     if settings.worst is None:
         return origin
     count = f"the first {settings.episodes:,}" if settings.suite is None else "all"
     return (
-        f"the {settings.worst} that {settings.policies[0]} did worst in among {count} {origin}, "
-        "the worst first: fewest targets reached, then most contacts, then longest"
+        f"the {settings.worst} worst levels of {settings.policies[0]} among {count} {origin}, "
+        "worst first: fewest targets reached, then most contacts, then longest"
     )
 
 
 def _versions() -> dict[str, str]:
-    """What computed the episodes."""
+    """Returns the versions of the software that computed the episodes."""
     return {k: v for k, v in provenance.versions().items() if k in ("swarmjax", "mujoco", "numpy")}

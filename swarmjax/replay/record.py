@@ -1,4 +1,4 @@
-"""Episodes as they went, step by step, recorded from the judge in MuJoCo's C engine. No JAX."""
+"""Records episodes step by step from the judge in MuJoCo's C engine. No JAX."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,12 +21,12 @@ from swarmjax.task.level import Level
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReplayScene:
-    """What stands still in an episode.
+    """The parts of an episode that do not move.
 
     Attributes:
-        side: Of the arena, m.
+        side: Side of the arena, m.
         target: [R, 2] x (m), y (m).
-        box: [B, 5] x (m), y (m), yaw (rad), half edges (m) of the boxes that obstacles are made of.
+        box: [B, 5] x (m), y (m), yaw (rad), half edges (m) of the boxes that form the obstacles.
         sensor: [R, K, 4] origin (m) and unit direction of each infrared ray, in the robot's frame.
     """
 
@@ -38,20 +38,21 @@ class ReplayScene:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
-    """An episode. N is its control steps and one more: row 0 is the start.
+    """A recorded episode. N is the number of control steps plus one: row 0 is the start.
 
     Attributes:
-        scene: What stands still.
+        scene: The parts that do not move.
         pose: [N, R, 3] x (m), y (m), yaw (rad).
-        ray: [N, R, K] from a sensor to what it meets, m; no more than the sensor's range.
+        ray: [N, R, K] length of each infrared ray, m; at most the sensor's range.
         distance: [N, R] to the target, m.
-        reward: By term [N, R], its weight included: what the step that led here earned, 0 at the
-            start and, by `task.arrival=latch`, after arrival.
+        reward: [N, R] weighted reward of the step that led here, by term. It is 0 at the start
+            and, with `task.arrival=latch`, after arrival.
         touching: [N, R, 3] whether the robot touches something of each kind of `gaps.KINDS`.
         contacts: [N, R, 3] contacts so far of each kind.
-        arrived: [N, R] whether the robot has arrived; by `task.arrival=hold`, is within its target.
-        arrival: [R] control steps until it arrived, 0 if it has not; by `hold`, until it was within
-            its target for good.
+        arrived: [N, R] whether the robot has arrived; with `task.arrival=hold`, whether it is
+            within its target.
+        arrival: [R] control steps until the robot arrived, 0 if it never did; with `hold`, until
+            it was within its target for good.
     """
 
     scene: ReplayScene
@@ -66,12 +67,12 @@ class Recording:
 
 
 class ReplayEpisode(NamedTuple):
-    """What became of one level.
+    """The recordings of one level.
 
     Attributes:
-        label: What a person calls it.
-        level: Its number.
-        runs: One recording a policy.
+        label: Name of the level for people.
+        level: Number of the level.
+        runs: One recording per policy.
     """
 
     label: str
@@ -80,16 +81,16 @@ class ReplayEpisode(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """All arenas after a control step; of several frames, all with a leading axis N.
+    """All arenas after a control step. Several frames have a leading axis N.
 
     Attributes:
         pose: [A, R, 3] x (m), y (m), yaw (rad).
-        ray: [A, R, K] as far as the electronics reach, m.
+        ray: [A, R, K] ray lengths up to the range of the electronics, m.
         distance: [A, R] to the target, m.
         touching: [A, R, 3] whether the robot touches something of each kind.
-        arrived: [A, R] whether the robot has arrived; by `hold`, is within its target.
+        arrived: [A, R] whether the robot has arrived; with `hold`, whether it is within its target.
         contacts: [A, R, 3] contacts so far of each kind.
-        action: [A, R, 2] that led here, clipped to -1..1; 0 at the start.
+        action: [A, R, 2] action that led here, clipped to -1..1; 0 at the start.
     """
 
     pose: np.ndarray
@@ -102,14 +103,14 @@ class Frame(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """What the reward of control steps looks at, as in `task.reward.Step`; no JAX.
+    """The inputs of the reward of control steps, as in `task.reward.Step`; no JAX.
 
     Attributes:
-        distance_before: [..., R] to the target, m.
-        distance: [..., R] after the step, m.
+        distance_before: [..., R] to the target before the step, m.
+        distance: [..., R] to the target after the step, m.
         infrared: [..., R, K] ray lengths after the step, m.
-        sensor_range: m.
-        arrives: [..., R] whether the robot arrived in this step; by `hold`, whether all did.
+        sensor_range: Range of the sensors, m.
+        arrives: [..., R] whether the robot arrived in this step; with `hold`, whether all did.
         contact_begins: [..., R, 3] whether a contact of each kind began in this step.
         touching: [..., R, 3] whether the robot touches something of each kind after the step.
         outside: [..., R] whether the robot had not arrived when the step began; None: all had not.
@@ -126,14 +127,14 @@ class Steps(NamedTuple):
 
 
 def terms(steps: Steps, weights: RewardConfig) -> dict[str, np.ndarray]:
-    """Works the terms of the reward out, of which equation 3 of the paper has the first two.
+    """Computes the terms of the reward; the first two are those of the paper's equation 3.
 
     Args:
         steps: Control steps.
-        weights: Of the terms.
+        weights: Weights of the terms.
 
     Returns:
-        [..., R] by name: each term times its weight; those of weight 0 are left out.
+        [..., R] by name: each term times its weight. Terms with weight 0 are left out.
     """
     under_way = np.ones(steps.distance.shape) if steps.outside is None else steps.outside
     found = {
@@ -150,11 +151,11 @@ def terms(steps: Steps, weights: RewardConfig) -> dict[str, np.ndarray]:
 
 
 def weights(trained: Policy, task: TaskConfig) -> RewardConfig:
-    """Returns the weights that a policy was trained with; those of `task` if it does not say.
+    """Returns the weights that a policy was trained with; those of `task` if its file has none.
 
     Raises:
-        ConfigError: If its weights are no weights.
-        PolicyError: If what they should be in is no task.
+        ConfigError: If the weights in the file are invalid.
+        PolicyError: If the file's task is invalid.
     """
     stored = trained.meta["config"].get("task", {})
     if not isinstance(stored, dict):
@@ -168,26 +169,26 @@ def weights(trained: Policy, task: TaskConfig) -> RewardConfig:
 def record(
     judge: Judge, levels: Sequence[Level], report: Callable[[int], None] = lambda _: None
 ) -> list[Recording]:
-    """Runs episodes side by side and keeps all that there is to see.
+    """Runs episodes side by side and records everything that a replay shows.
 
     Args:
-        judge: What the arenas share.
-        levels: What they start from.
-        report: Told how many more control steps there were, one by one.
+        judge: Everything that the arenas share.
+        levels: The arenas' levels.
+        report: Called after each control step with the number of steps added.
 
     Returns:
-        Each episode up to the step in which all robots had arrived or the time was out.
+        Each episode up to the step in which all robots had arrived or the time was up.
 
     Raises:
-        ConfigError: If the physics of an episode breaks down, or the policy's weights are none.
-        PolicyError: If the policy's task is none.
+        ConfigError: If the physics of an episode breaks down, or the policy's weights are invalid.
+        PolicyError: If the policy's task is invalid.
     """
     earning = weights(judge.policy, judge.config.task)
     own = own_terms(judge.policy, judge.config.extensions, earning)
     arenas = engine_c.start(judge, levels)
     mount = electronics.mount(arenas.factors)
     frames = [_look(judge, arenas, np.zeros_like(arenas.pose[..., :2]))]
-    over = np.zeros(len(levels), bool)  # by `hold` robots may leave again, and it stays over
+    over = np.zeros(len(levels), bool)  # with `hold` robots may leave again; over stays over
     driver = engine_c.by_policy(judge)
     memory = driver.init(arenas)
     while len(frames) <= judge.config.step_limit and not over.all():
@@ -212,15 +213,15 @@ def record(
 def own_terms(
     trained: Policy, extensions: str | None, earning: RewardConfig
 ) -> tuple[tuple[RewardTerm, float], ...]:
-    """Finds the terms of an extension that a policy was trained with.
+    """Finds the reward terms of an extension that a policy was trained with.
 
     Args:
-        trained: The policy, whose file has the digest of each term.
-        extensions: As the key of that name.
+        trained: The policy; its file has the digest of each term.
+        extensions: As the setting of that name.
         earning: The policy's weights.
 
     Returns:
-        Each term whose code is still the same, with its weight; none of weight 0.
+        Each term whose code has not changed, with its weight. Terms with weight 0 are left out.
     """
     digests = trained.meta.get("extensions", {}).get("reward", {})
     return tuple(
@@ -231,7 +232,7 @@ def own_terms(
 
 
 def _look(judge: Judge, arenas: Arenas, action: np.ndarray) -> Frame:
-    """Sees where everything is."""
+    """Takes a frame of all arenas."""
     sight = engine_c.look(
         judge, arenas.data, arenas.factors, arenas.pose, arenas.target, arenas.obstacle
     )
@@ -253,7 +254,7 @@ def _cut(
     earning: RewardConfig,
     own: Sequence[tuple[RewardTerm, float]],
 ) -> Recording:
-    """Makes a recording of the frames of one arena [N, ...], up to the end of its episode."""
+    """Makes the recording of one arena from its frames [N, ...], up to the end of its episode."""
     over = frames.arrived.all(axis=-1)
     frames = Frame(*(field[: over.argmax() + 1 if over.any() else None] for field in frames))
     before = frames.arrived[:-1]
@@ -289,7 +290,7 @@ def _cut(
 
 
 def _since(arrived: np.ndarray) -> np.ndarray:
-    """Finds the row [R] from which on robots have arrived [N, R] to the end; 0 if they have not."""
+    """Finds the row [R] at which robots arrive [N, R] and stay to the end; 0 if they never do."""
     away = len(arrived) - 1 - np.argmin(arrived[::-1], axis=0)  # the last row outside
     return np.where(arrived[-1], away + 1, 0)
 
@@ -297,10 +298,10 @@ def _since(arrived: np.ndarray) -> np.ndarray:
 def _own(
     own: Sequence[tuple[RewardTerm, float]], steps: Steps, frames: Frame
 ) -> dict[str, np.ndarray]:
-    """Works the terms of an extension out, [N, R] by name."""
+    """Computes the reward terms of an extension, [N, R] by name."""
     if not own:
         return {}
-    from swarmjax.task import extended  # pieces run on JAX
+    from swarmjax.task import extended  # extensions run on JAX
 
     whole = steps._asdict() | {
         "pose_before": frames.pose[:-1],
@@ -313,7 +314,7 @@ def _own(
 
 
 def _scene(level: Level, mount: infrared.Mount | None) -> ReplayScene:
-    """Keeps what stands still in an arena, and how its sensors sit."""
+    """Records the fixed parts of an arena and the mounting of its sensors."""
     at_origin = np.zeros((len(level.target), 3))
     origin, toward = infrared.rays(at_origin, np, mount)
     return ReplayScene(

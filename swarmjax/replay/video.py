@@ -1,7 +1,8 @@
-"""A replay as a film: the scene in 3-D, drawn by MuJoCo's renderer and encoded by ffmpeg.
+"""Makes a video of a replay: MuJoCo's renderer draws the scene in 3-D and ffmpeg encodes it.
 
-The scene is made for the eye alone, of what was recorded: robots, walls and obstacles in their
-true sizes, targets as discs of their radius on the floor, lit infrared rays as lines.
+The scene is built from the recording, only to be looked at. Robots, walls and obstacles have their
+true sizes. Targets are discs of their radius on the floor. Infrared rays that meet something are
+lines.
 """
 
 import math
@@ -24,12 +25,12 @@ from swarmjax.replay.record import Recording, ReplayEpisode
 from swarmjax.sim.model import HALF_HEIGHT
 
 FRAME_RATE = 30  # 1/s
-HOLD = 1.0  # s for which the end of an episode stays
-HEIGHT = 720  # px; a picture is 16:9, of two beside each other 4:3 each
+HOLD = 1.0  # s; the last frame of an episode stays this long
+HEIGHT = 720  # px; a picture is 16:9, two side by side are 4:3 each
 ELEVATION = math.radians(58.0)  # of the camera
-FIELD_OF_VIEW = math.radians(40.0)  # of its height
+FIELD_OF_VIEW = math.radians(40.0)  # vertical
 _MARGIN = 1.06  # around the arena
-_WALL = 0.015  # m; half of what is shown of a wall's thickness
+_WALL = 0.015  # m; half of a wall's drawn thickness
 _RAY = 0.0022  # m; half the width of a ray
 _FLAT = 5e-4  # m; half height of a target
 _BOX, _CYLINDER = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
@@ -39,7 +40,7 @@ _HIDDEN = (0.0, 0.0, 0.0, 0.0)
 
 
 def check() -> None:
-    """Finds out whether films can be made here.
+    """Checks that videos can be made on this machine.
 
     Raises:
         ConfigError: If imageio or OpenGL is missing.
@@ -55,9 +56,9 @@ def check() -> None:
         ) from None
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # GLFW warns of what is said below
+            warnings.simplefilter("ignore")  # GLFW warns about what the error below explains
             mujoco.Renderer(mujoco.MjSpec().compile(), 16, 16).close()
-    except Exception:  # each platform's library raises errors of its own
+    except Exception:  # each platform's library raises its own errors
         raise ConfigError(
             f"video needs OpenGL, which MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} does not find "
             "here: set MUJOCO_GL=egl (Debian's libegl1) or MUJOCO_GL=osmesa (libosmesa6)."
@@ -70,13 +71,13 @@ def write(
     episodes: Sequence[ReplayEpisode],
     report: Callable[[int], None] = lambda _: None,
 ) -> None:
-    """Films episodes one after the other, two policies side by side.
+    """Writes a video of episodes one after the other, with two policies side by side.
 
     Args:
-        path: Of the MP4 file.
-        settings: Of the replay.
-        episodes: What became of each level.
-        report: Told how many more pictures are done, one by one.
+        path: Path of the MP4 file.
+        settings: The replay's settings.
+        episodes: The recordings of each level.
+        report: Called after each picture with the number of pictures added.
 
     Raises:
         OSError: If the file cannot be written.
@@ -92,30 +93,31 @@ def write(
 
 
 def count(settings: ReplayConfig, episodes: Sequence[ReplayEpisode]) -> int:
-    """Counts the pictures of a film.
+    """Counts the pictures of a video.
 
     Args:
-        settings: Of the replay.
-        episodes: What became of each level.
+        settings: The replay's settings.
+        episodes: The recordings of each level.
 
     Returns:
-        How many pictures there are, `FRAME_RATE` a second.
+        The number of pictures, at `FRAME_RATE` per second.
     """
     return sum(len(rows(settings, each.runs)) for each in episodes)
 
 
 def rows(settings: ReplayConfig, runs: Sequence[Recording]) -> list[int]:
-    """Says which row of a level's recordings each picture shows.
+    """Lists which row of a level's recordings each picture shows.
 
     Args:
-        settings: Of the replay: its control step (s), and its speed, seconds in a second of film.
-        runs: Recordings of the level, one a policy, [N, ...] each; N may differ.
+        settings: The replay's settings, with the control step (s) and the speed of the video.
+        runs: Recordings of the level, one per policy, [N, ...] each; N may differ.
 
     Returns:
-        A row for each picture, from 0, of the longest recording; its last one for `HOLD` seconds.
+        A row of the longest recording for each picture, from 0. The last row stays for `HOLD`
+        seconds.
     """
     last = max(len(run.pose) for run in runs) - 1
-    pace = settings.video_speed / (FRAME_RATE * settings.task.control_step)  # rows a picture
+    pace = settings.video_speed / (FRAME_RATE * settings.task.control_step)  # rows per picture
     moving = [math.floor(k * pace) for k in range(math.ceil(last / pace))]
     return moving + [last] * round(HOLD * FRAME_RATE)
 
@@ -133,7 +135,7 @@ def _pictures(settings: ReplayConfig, episodes: Sequence[ReplayEpisode]) -> Iter
 
 
 class _Shot:
-    """The camera on one recording, and what is before it; MuJoCo edits all of it in place."""
+    """The camera and the scene of one recording; MuJoCo edits both in place."""
 
     def __init__(self, settings: ReplayConfig, recording: Recording, width: int) -> None:
         self.recording = recording
@@ -146,7 +148,7 @@ class _Shot:
         self.rings = [self.model.geom(f"robot{i}_ring").id for i in robots]
 
     def draw(self, row: int) -> np.ndarray:
-        """Draws one row of the recording, or its last one where it is over."""
+        """Draws one row of the recording; after its end, the last row."""
         row = min(row, len(self.recording.pose) - 1)
         pose = self.recording.pose[row]
         self.data.mocap_pos[:, :2] = pose[:, :2]
@@ -179,12 +181,12 @@ class _Shot:
 
 
 def build(settings: ReplayConfig, recording: Recording, width: int) -> mujoco.MjSpec:
-    """Describes the scene of an episode, its robots as bodies that are moved by hand.
+    """Describes the scene of an episode, with robots as bodies that the video places itself.
 
     Args:
-        settings: Of the replay.
-        recording: Of the episode.
-        width: Of a picture, px.
+        settings: The replay's settings.
+        recording: Recording of the episode.
+        width: Width of a picture, px.
 
     Returns:
         The spec; robot i is the mocap body i.
@@ -230,7 +232,7 @@ def _set_visuals(spec: mujoco.MjSpec, width: int) -> None:
 
 
 def _add_floor(spec: mujoco.MjSpec, side: float) -> None:
-    """Adds a floor of squares of 0.1 m."""
+    """Adds a floor with squares of 0.1 m."""
     spec.add_texture(
         name="floor",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -249,7 +251,7 @@ def _add_floor(spec: mujoco.MjSpec, side: float) -> None:
 
 
 def _add_fixtures(spec: mujoco.MjSpec, recording: Recording) -> None:
-    """Adds walls, through which one sees, and obstacles."""
+    """Adds see-through walls, and obstacles."""
     half = 0.5 * recording.scene.side
     for turn in range(4):
         bearing = 0.5 * math.pi * turn
@@ -263,7 +265,7 @@ def _add_fixtures(spec: mujoco.MjSpec, recording: Recording) -> None:
 
 
 def _add_robot(spec: mujoco.MjSpec, name: str, radius: float, colour: list[float]) -> None:
-    """Adds a robot: its hull, a lid with an arrow ahead, and a ring that shows that it touches."""
+    """Adds a robot: its hull, a lid with an arrow ahead, and a ring that shows contacts."""
     body = spec.worldbody.add_body(name=name, mocap=True)
     half = 0.5 * (epuck.HULL_TOP - epuck.HULL_BOTTOM)
     top = epuck.HULL_TOP
@@ -271,7 +273,7 @@ def _add_robot(spec: mujoco.MjSpec, name: str, radius: float, colour: list[float
     _add(body, _CYLINDER, [0.8 * radius, 5e-4, 0], [0, 0, top], [0.15, 0.16, 0.18, 1.0])
     white = [0.97, 0.97, 0.97, 1.0]
     for side in (1.0, -1.0):
-        # Two bars that meet in a point ahead.
+        # Two bars form the head of the arrow.
         place = [0.18 * radius, side * 0.24 * radius, top + 1e-3]
         _add(body, _BOX, [0.4 * radius, 0.09 * radius, 5e-4], place, white, -side * 0.65)
     ring = _add(body, _CYLINDER, [1.2 * radius, 1e-3, 0], [0, 0, 2e-3], list(_HIDDEN))
@@ -286,7 +288,7 @@ def _add(
     colour: Sequence[float] = (1.0, 1.0, 1.0, 1.0),
     yaw: float = 0.0,
 ) -> Any:
-    """Adds a geom that touches nothing."""
+    """Adds a geom without collisions."""
     turn = [math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)]
     return body.add_geom(
         type=kind, size=size, pos=place, quat=turn, rgba=colour, contype=0, conaffinity=0
@@ -299,7 +301,7 @@ def _rgba(colour: str) -> list[float]:
 
 
 def _camera(side: float, aspect: float) -> mujoco.MjvCamera:
-    """Looks at the middle of an arena from so far that all of it is in the picture."""
+    """Makes a camera that looks at the middle of an arena and sees all of it."""
     camera = mujoco.MjvCamera()
     camera.azimuth, camera.elevation = 90.0, -math.degrees(ELEVATION)
     camera.lookat = [0.0, 0.0, 0.0]
@@ -308,16 +310,16 @@ def _camera(side: float, aspect: float) -> mujoco.MjvCamera:
 
 
 def camera_distance(side: float, aspect: float) -> float:
-    """Works out how far the camera is from the middle of the floor.
+    """Computes the distance of the camera from the middle of the floor.
 
     Args:
-        side: Of the arena, m.
-        aspect: Width of a picture, in heights.
+        side: Side of the arena, m.
+        aspect: Width of a picture divided by its height.
 
     Returns:
-        The least distance from which the arena with its walls is in the picture, and a little
-        more, m. Of a corner p, with the directions ahead, right and up of the camera, the depth
-        is distance + p ahead, and p right and p up must be within the field of view at it.
+        The least distance at which the whole arena with its walls is in the picture, plus a
+        margin, m. For a corner p and the camera's axes ahead, right and up, the depth is
+        distance + p.ahead. At this depth p.right and p.up must lie within the field of view.
     """
     half = 0.5 * side + 2 * _WALL
     corners = np.array(

@@ -1,5 +1,5 @@
-"""What a run came to, in figures and on one page, from the files that it wrote. No JAX.
+"""Reports the results of a run as figures and one page, from the files the run wrote. No JAX.
 
-Imports names and settings of `run`, stages of `task`, the statistics of `evaluate`, and `pages`.
-Start with `rows.read`; `table.py` puts several runs beside each other.
+Imports names and settings from `run`, stages from `task`, the statistics of `evaluate`, and
+`pages`. Start with `rows.read`. `table.py` compares several runs.
 """

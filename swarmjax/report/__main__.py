@@ -1,12 +1,12 @@
-"""`python -m swarmjax.report run=DIR|runs=DIR,... [out=DIR]`: what runs came to.
+"""`python -m swarmjax.report run=DIR|runs=DIR,... [out=DIR]`: reports the results of runs.
 
-Of one run it writes `mix.png`, `success.png`, `curves.png`, `levels.png` and `practised.png` if
-there is a curriculum over levels, `grid.png` if the stages make a grid, and `report.html`, which
-holds them all. The run may be under way or have been killed: what it has
-not finished writing is left out. No JAX.
+For one run it writes `mix.png`, `success.png`, `curves.png`, and `report.html`, which holds all
+figures. With a curriculum over levels it also writes `levels.png` and `practised.png`. If the
+stages make a grid, it also writes `grid.png`. The run may still be going or may have been killed:
+the report leaves out a line that is not fully written. No JAX.
 
-Of several it prints a table: see `table`. With `out` it writes it there too, as `report.html` and
-`report.json`.
+For several runs it prints a table: see `table`. With `out` it also writes the table there, as
+`report.html` and `report.json`.
 """
 
 import json
@@ -31,19 +31,19 @@ def write(run: Path, out: Path, made_by: str, *, send: bool = False) -> list[Pat
 
     Args:
       run: the run directory.
-      out: directory of the report, which is made.
-      made_by: the command that makes it, for the page.
-      send: whether the run's loggers are told it too, and the pages that lie in the run directory.
+      out: directory of the report; it is created.
+      made_by: the command that makes the report, for the page.
+      send: whether the run's loggers also get the figures and the pages in the run directory.
 
     Returns:
       The files.
 
     Raises:
-      ConfigError: if the run cannot be read, or `out` not be written, or there is no logger.
+      ConfigError: if the run cannot be read, `out` cannot be written, or `send` finds no logger.
     """
     history = rows.read(run)
     loggers = report_send.of_run(run, history) if send else []
-    # Matplotlib takes a second, which no refusal should.
+    # Importing Matplotlib takes a second. Errors above should come without that delay.
     from swarmjax.pages import figures as drawing
     from swarmjax.report import figures as report_figures
     from swarmjax.report import levels as report_levels
@@ -65,9 +65,9 @@ def write_table(lines: Sequence[table.TableLine], out: Path, made_by: str) -> li
     """Writes the table of several runs.
 
     Args:
-      lines: of the table.
-      out: directory of the report, which is made.
-      made_by: the command that makes it, for the page.
+      lines: the lines of the table.
+      out: directory of the report; it is created.
+      made_by: the command that makes the table, for the page.
 
     Returns:
       The files.

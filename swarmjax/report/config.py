@@ -8,7 +8,7 @@ from swarmjax.config import ConfigError, Section, about
 
 @dataclass(frozen=True, kw_only=True)
 class ReportConfig(Section):
-    """Which run is drawn or which are compared, and where to."""
+    """Settings: the run to draw or the runs to compare, and where to write the report."""
 
     command: ClassVar[str] = "report"
 
@@ -16,18 +16,18 @@ class ReportConfig(Section):
     runs: str | None = field(
         default=None,
         metadata=about(
-            "instead of run: run directories, folders of them (an array, a sweep) and patterns, "
-            "with commas between them; a table of all, seeds of the same settings together"
+            "instead of run: run directories, folders of runs (an array, a sweep) and patterns, "
+            "separated by commas; makes a table with one line per settings"
         ),
     )
     out: str | None = field(
         default=None,
-        metadata=about("directory; null: <run>/report, or with runs what is printed alone"),
+        metadata=about("directory; null: <run>/report, or with runs only the printed table"),
     )
     send: bool = field(
         default=False,
         metadata=about(
-            "hand figures, and links of the report and of replays in the run directory, to the "
+            "send the figures, and links to the report and to replays in the run directory, to the "
             "run's TensorBoard and W&B [run]"
         ),
     )

@@ -1,7 +1,7 @@
-"""The figures of a report, with Matplotlib.
+"""Draws the figures of a report with Matplotlib.
 
-Shares are drawn on a scale that is read without colours too (Crameri et al. 2020, "The misuse of
-colour in science communication"): cividis and viridis rise evenly in lightness.
+The colour maps cividis and viridis rise evenly in lightness, so shares can also be read without
+colours (Crameri et al. 2020, "The misuse of colour in science communication").
 """
 
 import math
@@ -22,11 +22,11 @@ from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History
 from swarmjax.task.stage_config import StageConfig
 
-_POINTS, _STRETCHES = 600, 200  # of a curve and of a band: about what the dots can show
-_NAMED = 24  # stages named along a strip of colours; more would touch
+_POINTS, _STRETCHES = 600, 200  # per curve and per band: about one per pixel
+_NAMED = 24  # stages named along a colour strip; more names would overlap
 SMALL = (5.4, 3.2)  # inches
 _SEED, _ALL, _LIMIT = "0.62", "#0b4f9e", "#c04000"
-_STEPS = "arena control steps of a seed"
+_STEPS = "arena control steps per seed"
 _CURVES = {
     "return": "return per robot",
     "contacts_per_robot": "contacts per robot",
@@ -42,9 +42,9 @@ def draw(history: History) -> dict[str, bytes]:
     """Draws the figures of a run.
 
     Returns:
-      PNG files by name: `mix`, `success`, `curves` if the run wrote them down, `levels` if it has a
-      curriculum over levels, and `grid` if the stages make one. The same run gives the same files:
-      they do not hold Matplotlib's version.
+      PNG files by name: `mix`, `success`, `curves` if the run recorded them, `levels` if it has a
+      curriculum over levels, and `grid` if the stages make one. The same run gives the same files,
+      since they do not hold Matplotlib's version.
     """
     files = {}
     makers = {"mix": mix, "success": success, "curves": curves, "levels": levels, "grid": grid}
@@ -56,13 +56,13 @@ def draw(history: History) -> dict[str, bytes]:
 
 
 def by_stage(history: History) -> dict[str, Figure]:
-    """Draws each stage's newest verdict over time, a colour a stage, small enough for a phone.
+    """Draws each stage's newest verdict over time, one colour per stage, small enough for a phone.
 
-    A line is the interquartile mean of the seeds, where every one has a value; it is dotted where
-    the stage was left behind.
+    A line is the interquartile mean over seeds, drawn where every seed has a value. It is dotted
+    where the stage is no longer trained on.
 
     Returns:
-      A figure each of `targets`, `contacts` and `return`.
+      One figure each for `targets`, `contacts` and `return`.
     """
     measures = {
         "targets": (report_rows.measure(history), history.success),
@@ -97,20 +97,20 @@ def _of_stages(history: History, title: str, values: np.ndarray) -> Figure:
 
 
 def mix(history: History, size: tuple[float, float] = (drawing.WIDTH, 4.2)) -> Figure:
-    """Draws on which stages the arenas were, stacked, as the mean over seeds; `size` in inches."""
+    """Draws each stage's share of the arenas, stacked, as the mean over seeds; `size` in inches."""
     steps, bands = _stretched(history.arena_steps, history.mix.mean(axis=0).T)
     names = history.names
     colours = colormaps["viridis"](np.linspace(0.0, 1.0, len(names)))
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots()
-    # What an update was trained on holds from the end of the one before.
+    # The mix of an update holds from the end of the update before it.
     axes.stackplot(
         np.concatenate([[0], steps]),
         np.concatenate([bands[:, :1], bands], axis=1),
         colors=colours,
         step="pre",
         linewidth=0,
-        antialiased=False,  # or the ground shows between two bands
+        antialiased=False,  # else the background shows between two bands
     )
     axes.set(xlim=(0, steps[-1]), ylim=(0, 1), xlabel=_STEPS)
     seeds = len(history.seeds)
@@ -122,7 +122,7 @@ def mix(history: History, size: tuple[float, float] = (drawing.WIDTH, 4.2)) -> F
 
 
 def success(history: History) -> Figure:
-    """Draws the success of each stage in a panel of its own: every seed, and their IQM."""
+    """Draws the success of each stage in its own panel: every seed, and their IQM."""
     stages = len(history.names)
     columns = min(stages, 3 if stages <= report_rows.MANY else 6 if stages <= 30 else 8)
     rows = math.ceil(stages / columns)
@@ -147,9 +147,9 @@ def success(history: History) -> Figure:
 
 
 def curves(history: History) -> Figure | None:
-    """Draws how learning went, a panel for each number of an update: every seed, and their IQM.
+    """Draws the learning curves, one panel per quantity: every seed, and their IQM.
 
-    None if the run has written none of them down.
+    Returns None if the run recorded none of them.
     """
     if all(np.isnan(values).all() for values in history.curves.values()):
         return None
@@ -165,7 +165,7 @@ def curves(history: History) -> Figure | None:
         panel.tick_params(labelsize=9)
     for panel in panels[len(_CURVES) :]:
         panel.set_visible(False)
-    panels[2].tick_params(labelbottom=True)  # below it there is none
+    panels[2].tick_params(labelbottom=True)  # no panel is below it
     panels[0].set_xlim(0, history.arena_steps[-1])
     panels[0].xaxis.set_major_locator(MaxNLocator(4))
     panels[0].xaxis.set_major_formatter(drawing.thousands())
@@ -175,9 +175,9 @@ def curves(history: History) -> Figure | None:
 
 
 def levels(history: History) -> Figure | None:
-    """Draws what the curriculum over levels did, a colour a stage, as the mean over seeds.
+    """Draws what the curriculum over levels did, one colour per stage, as the mean over seeds.
 
-    None without one.
+    Returns None if the run has no curriculum over levels.
     """
     if history.levels is None:
         return None
@@ -210,14 +210,14 @@ def levels(history: History) -> Figure | None:
 
 
 def _shares(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    """Divides counts; nan where nothing was counted."""
+    """Divides counts; gives nan where nothing was counted."""
     return np.where(whole > 0, part / np.maximum(whole, 1), np.nan)
 
 
 def grid(history: History) -> Figure | None:
-    """Draws the last success of each cell, robots by side, a panel for each number of obstacles.
+    """Draws the last success of each cell, robots by side, one panel per number of obstacles.
 
-    None if the stages of the run make no grid.
+    Returns None if the stages of the run make no grid.
     """
     cells = cells_of(history.config.stage)
     if cells is None:
@@ -252,8 +252,9 @@ def grid(history: History) -> Figure | None:
 def cells_of(stages: tuple[StageConfig, ...]) -> Mapping[Cell, int] | None:
     """Finds the stage of each cell robots x obstacles x side; None if the stages make no grid.
 
-    They do if no two share a cell, two axes at least have several values, and at least half of all
-    cells are there: a grid lacks those that are too small for what they would hold.
+    The stages make a grid if no two share a cell, at least two axes have several values, and at
+    least half of all cells are there. A grid may lack cells whose arena is too small for the
+    robots and obstacles.
     """
     cells = {(stage.robots, stage.obstacles, stage.sides): i for i, stage in enumerate(stages)}
     lengths = [len(set(axis)) for axis in zip(*cells, strict=True)]
@@ -263,14 +264,14 @@ def cells_of(stages: tuple[StageConfig, ...]) -> Mapping[Cell, int] | None:
 
 
 def _at(updates: int, points: int) -> np.ndarray:
-    """Indices of evenly spread points, the last one among them."""
+    """Returns the indices of evenly spread points, including the last one."""
     return np.unique(np.linspace(updates - 1, 0, points).round().astype(int))
 
 
 def _stretched(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means of values [N or S, T] over stretches of updates, and the steps at which each ends.
+    """Averages values [N or S, T] over stretches of updates; gives the steps where each ends, too.
 
-    What was not measured counts for nothing; a stretch in which nothing was is nan.
+    Missing values are skipped. A stretch without any value is nan.
     """
     ends = _at(len(steps), _STRETCHES) + 1
     starts = np.concatenate([[0], ends[:-1]])
@@ -280,12 +281,12 @@ def _stretched(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _name_colours(figure: Figure, axes: Axes | list[Axes], names: list[str]) -> None:
-    """Names the bands along a strip of their colours, in their order."""
+    """Adds a colour strip that names the bands in their order."""
     count = len(names)
     norm = BoundaryNorm(np.arange(count + 1) - 0.5, count)
     strip = ScalarMappable(norm, colormaps["viridis"].resampled(count))
     every = math.ceil(count / _NAMED)
-    ticks = list(range(count - 1, -1, -every))  # the last one is what the others lead to
+    ticks = list(range(count - 1, -1, -every))  # always names the last stage, the goal
     bar = figure.colorbar(strip, ax=axes, ticks=ticks, spacing="uniform", aspect=30, pad=0.02)
     bar.ax.set_yticklabels([names[i] for i in ticks], fontsize=9 if count <= 12 else 7)
     bar.ax.tick_params(length=0)
@@ -295,13 +296,13 @@ def _name_colours(figure: Figure, axes: Axes | list[Axes], names: list[str]) -> 
 def _curve(
     panel: Axes, steps: np.ndarray, share: np.ndarray, lately: np.ndarray, **style: Any
 ) -> None:
-    """Draws a line where the stage was trained on, and dots where it was left behind."""
+    """Draws a line where the stage was trained on, and dots where it no longer was."""
     panel.plot(steps, np.where(lately, share, np.nan), **style)
     panel.plot(steps, np.where(lately, np.nan, share), ":", **style)
 
 
 def _mark(panel: Axes, history: History, stage: int) -> None:
-    """Gives a panel its name, the last share, and the one that promotes."""
+    """Writes a panel's name and last share, and draws the share that promotes."""
     small = len(history.names) > report_rows.MANY
     last, measured = report_rows.among(history.success[:, -1])
     figure = f"{100 * last[stage]:.0f} %" if measured[stage] else "not measured"
@@ -316,7 +317,7 @@ def _mark(panel: Axes, history: History, stage: int) -> None:
 
 
 def _explain_lines(figure: Figure, history: History) -> None:
-    """Says above the panels what each kind of line is."""
+    """Adds a legend of the kinds of lines above the panels."""
     kinds = _seed_lines(history)
     if not report_rows.trained_lately(history)[~np.isnan(history.success)].all():
         kinds.append(Line2D([], [], color=_ALL, ls=":", label="no longer trained on"))
@@ -326,7 +327,7 @@ def _explain_lines(figure: Figure, history: History) -> None:
 
 
 def _seed_lines(history: History) -> list[Line2D]:
-    """Says which line is a seed's and which that of all."""
+    """Makes the legend entries of one seed's line and of the mean over seeds."""
     seeds = len(history.seeds)
     if seeds == 1:
         return [Line2D([], [], color=_ALL, lw=2.0, label=f"seed {history.seeds[0]}")]
@@ -337,12 +338,12 @@ def _seed_lines(history: History) -> list[Line2D]:
 
 
 def _promoting(history: History) -> float | None:
-    """Success that promotes; None where nothing does."""
+    """Returns the success that promotes; None with a single stage."""
     return history.config.curriculum.threshold if len(history.names) > 1 else None
 
 
 def _label_outer(figure: Figure, history: History) -> None:
-    """Labels the axes that all panels share."""
+    """Labels the axes shared by all panels."""
     panel = figure.axes[0]
     panel.set(xlim=(0, history.arena_steps[-1]), ylim=(0, 1.02))
     panel.xaxis.set_major_locator(MaxNLocator(2 if len(history.names) > report_rows.MANY else 4))
@@ -353,7 +354,7 @@ def _label_outer(figure: Figure, history: History) -> None:
 
 
 def _heat(panel: Axes, table: np.ndarray, last: np.ndarray) -> None:
-    """Draws the cells of a table of stages, -1 where there is none, with their numbers."""
+    """Draws a table of stage indices as coloured cells with their numbers; -1 is an empty cell."""
     values = np.where(table < 0, np.nan, last[table])
     panel.set_facecolor("0.93")
     panel.imshow(values, "cividis", Normalize(0.0, 1.0), aspect="auto", origin="lower")

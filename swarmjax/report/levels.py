@@ -1,4 +1,4 @@
-"""Pictures of levels: those that a run practises now, small, a row for each stage."""
+"""Draws small pictures of the levels that a run practises now, one row per stage."""
 
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from swarmjax.task import stage as task_stage
 from swarmjax.task.level import Level, Spacing
 from swarmjax.task.stage_config import BUILT_IN
 
-_MOST_ROWS = 12  # stages that are drawn
+_MOST_ROWS = 12  # stages drawn
 
 
 def read(run: Path, config: TrainConfig) -> list[list[dict[str, Any]]] | None:
@@ -26,10 +26,10 @@ def read(run: Path, config: TrainConfig) -> list[list[dict[str, Any]]] | None:
 
     Args:
       run: the run directory.
-      config: that it was trained with.
+      config: the run's settings.
 
     Returns:
-      Of each stage its best levels, as `practised.best` lists them; None without a buffer.
+      The best levels of each stage, as `practised.best` lists them; None without a buffer.
 
     Raises:
       ConfigError: if the file is damaged.
@@ -57,14 +57,14 @@ def _checked(raw: dict[str, Any]) -> dict[str, Any]:
 
 
 def draw(best: list[list[dict[str, Any]]], config: TrainConfig) -> Figure | None:
-    """Draws the levels that are practised, each with its success and its score.
+    """Draws the practised levels, each with its success and its score.
 
     Args:
-      best: as `read` gives them.
-      config: of the run.
+      best: the levels, as `read` returns them.
+      config: the run's settings.
 
     Returns:
-      The figure; None if there is no level that is drawn without an extension.
+      The figure; None if every level comes from an extension, which cannot be drawn here.
     """
     sizes = config.sim.robots, config.sim.obstacles
     spacing = Spacing(*sizes, config.robot.hull_radius, config.task.target_radius)
@@ -99,8 +99,8 @@ def draw_level(axis: Axes, drawn: Level, target_radius: float) -> None:
 
     Args:
       axis: to draw on.
-      drawn: of one arena; NumPy.
-      target_radius: of the zone of arrival, m.
+      drawn: the level of one arena, in NumPy.
+      target_radius: radius of the arrival zone, m.
     """
     half = 0.5 * float(drawn.side)
     axis.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")

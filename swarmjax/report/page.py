@@ -1,4 +1,4 @@
-"""The page of a report: one HTML file that needs nothing else, with its figures inside."""
+"""Builds the page of a report: one self-contained HTML file with its figures inside."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -13,38 +13,38 @@ from swarmjax.report import table as report_table
 from swarmjax.report.rows import History, Row
 from swarmjax.report.table import TableLine
 
-GOOD = 0.9  # success from which on a stage is counted as learned
+GOOD = 0.9  # success at which a stage counts as learned
 STYLES = (builder.STYLE, "report/report.css")
-_TOP = 5  # stages named of a reweighing
+_TOP = 5  # stages named per reweighing
 
 _CAPTIONS = {
-    "mix": "On which stages the arenas were.",
-    "success": "Success of each stage: the share of a whole cohort, all episodes that began within "
-    "one step limit. Above each panel the last one; the thick line is drawn where every seed has "
-    "one.",
-    "curves": "How learning went, at each update. Return and contacts are sums over an episode and "
-    "means over the robots of the episodes that ended in the update; short episodes end first, so "
-    "the first ones say little. Entropy is that of the policy's actions, in nats.",
-    "levels": "What the curriculum over levels did: how many levels of each stage are kept, how "
-    "many episodes began on one of them, and how those went.",
-    "practised": "The levels of each stage with the highest scores, as the newest checkpoint of "
-    "the first seed has them: success over the episodes that are remembered, and the score. Robots "
-    "are discs, their targets circles of the same colour.",
-    "grid": "Success of each cell at last, in percent; grey: not a stage of this run.",
+    "mix": "Share of the arenas on each stage.",
+    "success": "Success of each stage, over a whole cohort: all episodes that began within one "
+    "step limit. The number above each panel is the last one. The thick line is drawn where every "
+    "seed has a value.",
+    "curves": "Learning curves over updates. Return and contacts are sums over an episode, and "
+    "means over the robots of the episodes that ended in the update. Short episodes end first, so "
+    "the first values mean little. Entropy is that of the policy's actions, in nats.",
+    "levels": "The curriculum over levels: how many levels of each stage are kept, how many "
+    "episodes began on one of them, and the success and score of these levels.",
+    "practised": "The levels of each stage with the highest scores, from the newest checkpoint of "
+    "the first seed: success over the remembered episodes, and the score. Robots are discs, their "
+    "targets circles of the same colour.",
+    "grid": "Last success of each cell, in percent. Grey cells are not stages of this run.",
 }
 
 
 def page(title: str, command: str, history: History, figures: Mapping[str, bytes]) -> str:
-    """Lays the page out.
+    """Lays out the page.
 
     Args:
       title: names the run.
-      command: that makes the report.
-      history: of the run.
+      command: the command that makes the report.
+      history: the run's history.
       figures: PNG files by the names of `_CAPTIONS`.
 
     Returns:
-      HTML in which every name of a run is escaped.
+      HTML with every name from the run escaped.
     """
     return builder.render(
         "report/report.html",
@@ -62,15 +62,15 @@ def page(title: str, command: str, history: History, figures: Mapping[str, bytes
 
 
 def table_page(title: str, command: str, lines: Sequence[TableLine]) -> str:
-    """Lays the table of several runs out.
+    """Lays out the table of several runs.
 
     Args:
-      title: of the page.
-      command: that makes the report.
-      lines: of the table.
+      title: title of the page.
+      command: the command that makes the report.
+      lines: the lines of the table.
 
     Returns:
-      HTML in which every name of a run is escaped.
+      HTML with every name from the runs escaped.
     """
     return builder.render(
         "report/runs.html",
@@ -84,13 +84,13 @@ def table_page(title: str, command: str, lines: Sequence[TableLine]) -> str:
 
 
 def facts(history: History) -> list[tuple[str, str]]:
-    """Says what the run is and what came of it, a line each.
+    """States what the run is and its results, one fact per line.
 
     Args:
-      history: of the run.
+      history: the run's history.
 
     Returns:
-      What a line is about, and its text.
+      The heading and the text of each line.
     """
     trained, names = history.config, history.names
     stages_by = to_dict(trained.curriculum)
@@ -109,7 +109,7 @@ def facts(history: History) -> list[tuple[str, str]]:
         ("seeds", seeds),
         (
             "trained",
-            f"{spent}, {history.arena_steps[-1]:,} arena control steps of a seed, "
+            f"{spent}, {history.arena_steps[-1]:,} arena control steps per seed, "
             f"{words.count(trained.arenas, 'arena')}{time}",
         ),
         ("last stage", _last_stage(history)),
@@ -120,7 +120,7 @@ def facts(history: History) -> list[tuple[str, str]]:
 
 
 def _last_stage(history: History) -> str:
-    """Says how the last stage stands: interquartile mean and range over seeds."""
+    """Writes the success of the last stage: interquartile mean and range over seeds."""
     values = history.success[:, -1, -1]
     mean, measured = report_rows.among(values[:, None])
     name, of = history.names[-1], len(history.seeds)
@@ -137,7 +137,7 @@ def _last_stage(history: History) -> str:
 
 
 def _unmeasured(history: History) -> str:
-    """Says why the last stage has no figure."""
+    """Explains why the last stage has no number."""
     trained = int((history.mix[..., -1] > 0.0).sum(axis=1).max())
     if not trained:
         return "not measured, since no arena has been on it"
@@ -149,7 +149,7 @@ def _unmeasured(history: History) -> str:
 
 
 def _all_stages(history: History) -> str:
-    """Says how many stages are learned, and which is the worst."""
+    """Counts the stages that are learned, and names the worst one."""
     mean, measured = report_rows.among(history.success[:, -1])
     good = int((mean >= GOOD).sum())
     text = f"{good} of {len(mean)} at {_percent(GOOD)} or more"
@@ -163,20 +163,20 @@ def _all_stages(history: History) -> str:
 
 
 def _counted(decisions: Sequence[Row]) -> str:
-    """Counts decisions by their reason."""
+    """Counts decisions by reason."""
     reasons = Counter(str(row.get("why")) for row in decisions)
     return ", ".join(f"{count:,} by {why}" for why, count in reasons.items()) or "none"
 
 
 def _origin(summary: Row) -> str:
-    """Says on what a run was computed, by which commit."""
+    """Names the device and the commit that computed a run."""
     if not summary:
-        return "not written down before the end of the run"
+        return "not recorded before the end of the run"
     return f"{summary.get('device')}, commit {summary.get('commit') or 'unknown'}"
 
 
 def _decisions(history: History) -> list[tuple]:
-    """Tables promotions and demotions."""
+    """Makes the table of promotions and demotions."""
     step = history.config.arenas * history.config.algo.rollout_length
     shares = ("targets_reached", "all_reached")
     return [
@@ -193,7 +193,7 @@ def _decisions(history: History) -> list[tuple]:
 
 
 def _reweighings(history: History) -> list[tuple]:
-    """Tables how often the arenas of each seed were spread anew, and how they were at last."""
+    """Makes the table of each seed's reweighings: how many, and the last weights."""
     by_seed: dict[int, list[Row]] = {}
     for row in history.decisions:
         if "weights" in row:
@@ -208,7 +208,7 @@ def _reweighings(history: History) -> list[tuple]:
 
 
 def _stages(history: History) -> list[tuple]:
-    """Tables the stages: what they are, how long they were trained on, and how they stand."""
+    """Makes the table of the stages: what they are, how long they were trained, their success."""
     last = {key: report_rows.among(values[:, -1]) for key, values in history.by_stage.items()}
     share = history.mix.mean(axis=(0, 1))
     return [
@@ -227,7 +227,7 @@ def _stages(history: History) -> list[tuple]:
 
 
 def _percent(share: float | None) -> str | None:
-    """Writes a share; None where it is null or nan."""
+    """Writes a share as a percentage; gives None where it is null or nan."""
     return None if share is None or np.isnan(share) else f"{100.0 * share:.1f} %"
 
 

@@ -1,9 +1,10 @@
-"""What a run wrote down, read back as arrays for its report. No JAX.
+"""Reads the files of a run back as arrays for its report. No JAX.
 
-Axes: N seeds, T updates, S stages. What was not measured is nan here and null in the files.
+Axes: N seeds, T updates, S stages. A missing value is nan here and null in the files.
 
-A last line without its newline is being written, or was as the run was killed: it is skipped, so
-that a run can be read at any time. Any other damage is refused, by its file, line and key.
+A run can be read at any time. A last line without its newline is still being written, or was being
+written when the run was killed, so it is skipped. Any other damage raises an error that names the
+file, line and key.
 """
 
 import math
@@ -22,7 +23,7 @@ from swarmjax.run.settings import TrainConfig, from_stored
 
 Row = dict[str, Any]
 
-# Of each stage its newest verdict, in the order of the stages.
+# Each stage's newest verdict, in the order of the stages.
 BY_STAGE = (
     "success_by_stage",
     "complete_by_stage",
@@ -32,7 +33,7 @@ BY_STAGE = (
     "episodes_by_stage",
 )
 _LISTS = ("mix", "weights", *BY_STAGE)
-# Of each stage what its curriculum over levels did, if there is one.
+# What the curriculum over levels did on each stage, if there is one.
 LEVELS = (
     "levels_fresh",
     "levels_replayed",
@@ -41,25 +42,25 @@ LEVELS = (
     "levels_success",
     "levels_score",
 )
-# Of an update as a whole; the first two over the episodes that ended in it.
+# Numbers of a whole update; the first two cover the episodes that ended in it.
 CURVES = ("return", "contacts_per_robot", "policy_loss", "value_loss", "entropy")
-MANY = 9  # stages from which on each is drawn small
+MANY = 9  # with more stages than this, each is drawn small
 SUMMARY = "summary.json"
 _NUMBERS = ("seed", "update", "arena_steps")
 _LARGEST = float(np.finfo(np.float32).max)
-# A verdict takes one cohort in which its episodes begin, and one in which the last of them end.
+# A verdict takes two cohorts: its episodes begin in the first and the last of them end in the next.
 _COHORTS_OF_A_VERDICT = 2
 
 
 class ValueKind(NamedTuple):
-    """A kind of value in a row: its name in a sentence, and whether a value is of it."""
+    """A kind of value in a row: its name in a message, and a test whether a value has this kind."""
 
     name: str
     fits: Callable[[Any], bool]
 
 
 def _is_number(value: Any, types: type | UnionType, largest: float) -> bool:
-    """Tells whether a value is a number, no larger; truth values and nan are none."""
+    """Tests whether a value is a number no larger than `largest`; booleans and nan are not."""
     return isinstance(value, types) and not isinstance(value, bool) and abs(value) <= largest
 
 
@@ -75,21 +76,21 @@ SHARES = ValueKind("shares by stage", MAP.fits)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class History:
-    """What a run came to, at the updates that all of its seeds have written down.
+    """The results of a run at the updates that all of its seeds have recorded.
 
     Attributes:
-      config: that the run was trained with.
-      seeds: [N], rising.
-      updates: [T], rising, from 0.
+      config: the run's settings.
+      seeds: [N], increasing.
+      updates: [T], increasing from 0.
       arena_steps: [T] arena control steps of one seed by the end of the update.
       mix: [N, T, S] share of the arenas that were on the stage, 0 to 1.
       weights: [N, T, S] share of the arenas that the curriculum gave the stage, 0 to 1.
-      by_stage: [N, T, S] for each name of `BY_STAGE`.
-      curves: [N, T] for each name of `CURVES`.
-      seconds: of training by the last update; None if they were not written down.
-      decisions: of the curriculum, as they were written down, by seed and update.
-      summary: of the run, as it was written down; empty before its end.
-      levels: [N, T, S] for each name of `LEVELS`; None without a curriculum over levels.
+      by_stage: [N, T, S] for each name in `BY_STAGE`.
+      curves: [N, T] for each name in `CURVES`.
+      seconds: training time up to the last update; None if it was not recorded.
+      decisions: the curriculum's decisions as recorded, sorted by seed and update.
+      summary: the run's summary as recorded; empty before the run ends.
+      levels: [N, T, S] for each name in `LEVELS`; None without a curriculum over levels.
     """
 
     config: TrainConfig
@@ -107,12 +108,12 @@ class History:
 
     @property
     def names(self) -> list[str]:
-        """Names of the stages."""
+        """The names of the stages."""
         return [stage.name for stage in self.config.stage]
 
     @property
     def success(self) -> np.ndarray:
-        """Share [N, T, S] by which the curriculum decides: of targets, or of whole episodes."""
+        """The success [N, T, S] the curriculum uses: share of targets, or of whole episodes."""
         by_targets = self.config.curriculum.success == "targets"
         return self.by_stage["success_by_stage" if by_targets else "complete_by_stage"]
 
@@ -121,7 +122,7 @@ def read(run: Path) -> History:
     """Reads a run directory.
 
     Raises:
-      ConfigError: if a file is missing or damaged, or holds no row of every seed.
+      ConfigError: if a file is missing or damaged, or a seed has no row.
     """
     trained = read_config(run)
     stages = len(trained.stage)
@@ -137,16 +138,16 @@ def read(run: Path) -> History:
 
 
 def measure(history: History) -> str:
-    """Names the share by which the curriculum decides, `success`."""
+    """Names the quantity in `success`, which the curriculum uses for its decisions."""
     by_targets = history.config.curriculum.success == "targets"
     return "targets reached" if by_targets else "episodes in which all arrived"
 
 
 def trained_lately(history: History) -> np.ndarray:
-    """Tells whether [N, T, S] a stage's newest verdict is about the networks as they are.
+    """Tells where [N, T, S] a stage's newest verdict is about the current networks.
 
-    It is until two cohorts (see `curriculum`) after the stage last had a share of the arenas: so
-    long may a verdict still come in. After that it is what the stage was left with.
+    A verdict counts as current for two cohorts (see `curriculum`) after the stage last had a share
+    of the arenas, since a new verdict may still arrive in that time.
     """
     lag = verdict_updates(history)
     updates = history.updates[None, :, None]
@@ -155,31 +156,31 @@ def trained_lately(history: History) -> np.ndarray:
 
 
 def verdict_updates(history: History) -> int:
-    """Updates from a stage's first share of the arenas to its first verdict."""
+    """Returns the updates between a stage's first share of the arenas and its first verdict."""
     task, algo = history.config.task, history.config.algo
     return _COHORTS_OF_A_VERDICT * math.ceil(task.step_limit / algo.rollout_length)
 
 
 def together(values: np.ndarray) -> np.ndarray:
-    """Interquartile mean over seeds, where all of them have a value.
+    """Takes the interquartile mean over seeds where all of them have a value.
 
-    Where some have none, those that do would be the fast ones.
+    If only some seeds have a value, these are the fast ones, and their mean would be biased.
 
     Args:
-      values: [N, ...] with nan where there is none.
+      values: [N, ...] with nan for a missing value.
 
     Returns:
-      [...] with nan where a seed has none.
+      [...] with nan where a seed has no value.
     """
     missing = np.isnan(values).any(axis=0)
     return np.where(missing, np.nan, iqm(np.where(missing, 0.0, values), axis=0))
 
 
 def among(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Interquartile mean [S] over those seeds that have a value, and how many [S] they are.
+    """Takes the interquartile mean [S] over the seeds that have a value, and counts them [S].
 
     Args:
-      values: [N, S] with nan where there is none; the mean is nan where no seed has one.
+      values: [N, S] with nan for a missing value. The mean is nan where no seed has a value.
     """
     there = ~np.isnan(values)
     mean = [iqm(v[t]) if t.any() else np.nan for v, t in zip(values.T, there.T, strict=True)]
@@ -187,7 +188,7 @@ def among(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def side_text(sides: tuple[float, float]) -> str:
-    """Writes the smallest and the largest side of a stage as one, or as a range, without unit."""
+    """Writes the side of a stage as one number or a range, without unit."""
     low, high = sides
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
@@ -198,7 +199,7 @@ def _history(
     updates: list[int],
     rest: tuple[list[Row], Row],
 ) -> History:
-    """Lays the rows out by seed and update."""
+    """Arranges the rows by seed and update."""
     seeds = sorted(by_seed)
     rows = [[by_seed[seed][update] for update in updates] for seed in seeds]
     lists = np.array([[row["lists"] for row in of_seed] for of_seed in rows])
@@ -224,16 +225,16 @@ def _history(
 
 
 def _checked(raw: Row, stages: int, where: str, *, levels: bool) -> Row:
-    """Takes out of a row what a report needs, of a curriculum over levels too if there is one.
+    """Takes the values that a report needs from a row; with `levels` also those of the levels.
 
-    Lists become one array [.., S] of float32; the curves, which may be missing, one of nan or
-    numbers.
+    Lists become one float32 array [.., S]. The curves become one array, with nan for a missing
+    one.
     """
     keys = (*_LISTS, *(LEVELS if levels else ()))
     for key in (*_NUMBERS, *keys):
         if key not in raw:
             raise ConfigError(
-                f"{where} has no {key}: the run is of a version that did not write it."
+                f"{where} has no {key}: the run is from a version that did not write it."
             )
     check(raw, _NUMBERS, WHOLE, where)
     check(raw, ("train_s", *CURVES), NUMBER_OR_NULL, where)
@@ -245,16 +246,16 @@ def _checked(raw: Row, stages: int, where: str, *, levels: bool) -> Row:
 
 
 def check(row: Mapping[str, Any], keys: Iterable[str], kind: ValueKind, where: str) -> None:
-    """Refuses a row that has something else than a kind of value.
+    """Checks that values of a row have the given kind.
 
     Args:
-      row: as it was written down.
-      keys: of the values; null stands for one that is missing.
-      kind: of them all.
-      where: names the row, for the sentence.
+      row: the row as recorded.
+      keys: keys of the values; a missing key counts as null.
+      kind: the kind that all values must have.
+      where: names the row in the message.
 
     Raises:
-      ConfigError: if one is of another kind.
+      ConfigError: if a value has another kind.
     """
     for key in keys:
         if not kind.fits(row.get(key)):
@@ -262,12 +263,12 @@ def check(row: Mapping[str, Any], keys: Iterable[str], kind: ValueKind, where: s
 
 
 def per_stage(found: object, stages: int, what: str) -> np.ndarray:
-    """Takes a finite number or null for each stage.
+    """Checks a list that holds a finite number or null for each stage.
 
     Args:
-      found: as it was written down.
-      stages: how many there are.
-      what: names it, for the sentence.
+      found: the value as recorded.
+      stages: number of stages.
+      what: names the value in the message.
 
     Returns:
       [S] float32 with nan for null.
@@ -277,7 +278,7 @@ def per_stage(found: object, stages: int, what: str) -> np.ndarray:
     """
     fits = isinstance(found, list) and len(found) == stages and all(map(NUMBER_OR_NULL.fits, found))
     if not fits:
-        raise ConfigError(f"{what} that is no list of {stages} numbers, one a stage.")
+        raise ConfigError(f"{what}, which is not a list of {stages} numbers, one per stage.")
     return np.array(found, np.float32)
 
 
@@ -285,7 +286,7 @@ def read_config(run: Path) -> TrainConfig:
     """Reads the config of a run.
 
     Raises:
-      ConfigError: if there is none, or it is refused.
+      ConfigError: if there is no config, or it is invalid.
     """
     path = run / "config.json"
     if not path.exists():
@@ -294,14 +295,14 @@ def read_config(run: Path) -> TrainConfig:
     try:
         return from_stored(stored)
     except ConfigError as error:
-        raise ConfigError(f"{path} does not fit: {error}") from None
+        raise ConfigError(f"{path} is not valid: {error}") from None
 
 
 def read_object(path: Path) -> Row:
     """Reads a file that holds one JSON object.
 
     Raises:
-      ConfigError: if it cannot be read, or holds something else.
+      ConfigError: if the file cannot be read, or holds something else.
     """
     found = reading.read_json(path)
     if not MAP.fits(found):
@@ -310,7 +311,7 @@ def read_object(path: Path) -> Row:
 
 
 def _read_decisions(run: Path) -> list[Row]:
-    """Reads the decisions of the curriculum, by seed and update."""
+    """Reads the decisions of the curriculum, sorted by seed and update."""
     found = []
     for where, row in read_lines(run, recorder.DECISIONS):
         check(row, ("seed", "update"), WHOLE, where)
@@ -323,14 +324,14 @@ def _read_decisions(run: Path) -> list[Row]:
 
 
 def read_lines(run: Path, name: str) -> Iterator[tuple[str, Row]]:
-    """Reads a file of a JSON object a line, but for a last line that has no newline.
+    """Reads a file with one JSON object per line; skips a last line without a newline.
 
     Args:
       run: the run directory.
-      name: of the file.
+      name: name of the file.
 
     Yields:
-      Words that name a line, and its object.
+      A phrase that names the line, and the line's object.
 
     Raises:
       ConfigError: if the file is missing or cannot be read, or a line holds something else.
@@ -352,5 +353,5 @@ def _object(line: bytes, where: str) -> Row:
     except (ConfigError, UnicodeDecodeError):
         found = None
     if not isinstance(found, dict):
-        raise ConfigError(f"{where} is damaged: go on with the run, or take it out.")
+        raise ConfigError(f"{where} is damaged: resume the run, or remove the line.")
     return found

@@ -15,7 +15,7 @@ def of_run(run: Path, history: History) -> list[Logger]:
     """Makes the loggers that a run's config names.
 
     Raises:
-      ConfigError: if it names none, or one that cannot be used.
+      ConfigError: if the config names no logger, or one that cannot be used.
     """
     asked = history.config.run
     weights_and_biases.check(history.config)
@@ -23,19 +23,19 @@ def of_run(run: Path, history: History) -> list[Logger]:
     found += [WandbRuns(history.config, run)] if asked.wandb else []
     if not found:
         raise ConfigError(
-            "send is true, but the run logs to nothing that takes figures: its run.tensorboard is "
-            "false and its run.wandb is null."
+            "send is true, but the run has no logger for figures: its run.tensorboard is false and "
+            "its run.wandb is null."
         )
     return found
 
 
 def send(history: History, files: Sequence[Path], loggers: Sequence[Logger]) -> None:
-    """Hands files to loggers, which are then closed; one that fails costs a sentence.
+    """Hands files to loggers and closes the loggers. A logger that fails only prints a message.
 
     Args:
-      history: of the run.
+      history: the run's history.
       files: figures, each a PNG, and pages.
-      loggers: that take them.
+      loggers: the loggers that get the files.
     """
     steps = int(history.arena_steps[-1])
     for guarded in map(Guarded, loggers):

@@ -1,7 +1,7 @@
-"""Several runs beside each other: a line for all seeds of the same settings. No JAX.
+"""Compares several runs in a table, one line per group of equal settings. No JAX.
 
-A line may hold one run with several seeds, or runs of one seed or more each, as the jobs of an
-array write them. Success is that of the last stage, its newest verdict.
+A line may hold one run with several seeds, or several runs with one or more seeds each, as the jobs
+of an array write them. Success is the last stage's newest verdict.
 """
 
 import json
@@ -23,8 +23,8 @@ from swarmjax.report.rows import History
 from swarmjax.run.directory import CONFIG, METRICS
 from swarmjax.run.settings import TrainConfig, leaves
 
-_DEEP = 2  # folders below a folder of runs in which runs are looked for
-# In what runs may differ whose seeds are counted together: in which seeds, and in how they ran.
+_DEEP = 2  # levels of subfolders that are searched for runs
+# Runs on one line may differ in these settings: which seeds they have, and how they ran.
 _APART = ("seed", "seeds", "seeds_by", "devices", "streams", "resume", "run")
 HEADS = (
     "runs",
@@ -44,13 +44,13 @@ class TableLine:
 
     Attributes:
       runs: their directories.
-      settings: in what they differ from the other lines, `key=value` words.
-      stage: name of the last one.
-      updates: that all of the runs have done, and that they are to do.
-      seeds: [N], rising.
-      success: [N] share of the last stage's newest cohort, 0 to 1; nan where there is none yet.
-      measure: what that share is of.
-      train_s: seconds of training, of all runs together; None if they were not written down.
+      settings: the settings that differ from the other lines, as `key=value` words.
+      stage: name of the last stage.
+      updates: updates that all of the runs have done, and updates that they are to do.
+      seeds: [N], increasing.
+      success: [N] success of the last stage's newest cohort, 0 to 1; nan where there is none yet.
+      measure: names the quantity in `success`.
+      train_s: training time of all runs together, s; None if it was not recorded.
     """
 
     runs: tuple[Path, ...]
@@ -64,17 +64,17 @@ class TableLine:
 
     @property
     def measured(self) -> np.ndarray:
-        """Success of the seeds that have one, [M]."""
+        """The success [M] of the seeds that have one."""
         return self.success[~np.isnan(self.success)]
 
     @property
     def mean(self) -> float:
-        """Success in the mean over seeds; nan where no seed has one."""
+        """The mean success over seeds; nan where no seed has one."""
         return float(self.measured.mean()) if len(self.measured) else math.nan
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """Ends of the mean's 95 % interval over seeds; None of fewer than three."""
+        """The ends of the mean's 95 % interval over seeds; None for fewer than three seeds."""
         if len(self.measured) < LEAST_DRAWN:
             return None
         found = bootstrap(self.measured[:, None], np.mean)
@@ -85,14 +85,14 @@ def find(text: str) -> list[Path]:
     """Finds run directories.
 
     Args:
-      text: run directories, folders of runs and patterns of either, with commas between them.
+      text: run directories, folders of runs and patterns for either, separated by commas.
 
     Returns:
-      Run directories, in the order that they are named in. What a pattern or a folder stands for
-      is in alphabetical order, without runs that have not trained yet.
+      Run directories, in the order given. The runs of a pattern or a folder come in alphabetical
+      order, without runs that have not trained yet.
 
     Raises:
-      ConfigError: if one names no run, or names one twice.
+      ConfigError: if an entry names no run, or a run is named twice.
     """
     check_text("runs", text)
     found: list[Path] = []
@@ -100,7 +100,7 @@ def find(text: str) -> list[Path]:
         named = sorted(glob(part)) if set(part) & set("*?[") else [part]
         within = [run for path in named for run in _within(Path(path), part)]
         if not part or not within:
-            raise ConfigError(f"runs is {show(text)}, and {show(part)} is and holds no run.")
+            raise ConfigError(f"runs is {show(text)}, but {show(part)} neither is nor holds a run.")
         found += within
     twice = [str(run) for run in found if found.count(run) > 1]
     if twice:
@@ -109,7 +109,7 @@ def find(text: str) -> list[Path]:
 
 
 def _within(path: Path, part: str, deep: int = _DEEP) -> Iterator[Path]:
-    """Finds the run at a path, or those in the folder there that have begun to train."""
+    """Finds the run at a path, or the runs in that folder that have begun to train."""
     if (path / CONFIG).exists():
         if _has_trained(path) or path == Path(part):
             yield path
@@ -123,13 +123,13 @@ def _has_trained(run: Path) -> bool:
 
 
 def read(runs: Sequence[Path]) -> list[TableLine]:
-    """Reads runs, those of the same settings into one line.
+    """Reads runs and joins runs with the same settings into one line.
 
     Args:
-      runs: directories.
+      runs: run directories.
 
     Raises:
-      ConfigError: if one cannot be read, or two runs of the same settings share a seed.
+      ConfigError: if a run cannot be read, or two runs of the same settings share a seed.
     """
     groups: dict[str, list[tuple[Path, History]]] = {}
     for run in runs:
@@ -143,24 +143,24 @@ def read(runs: Sequence[Path]) -> list[TableLine]:
 
 
 def read_each(labels: Mapping[Path, str]) -> list[TableLine]:
-    """Reads runs that have trained, a line each.
+    """Reads runs that have trained, one line per run.
 
     Args:
-      labels: by directory, what sets a run apart.
+      labels: what distinguishes each run, by directory.
 
     Raises:
-      ConfigError: if one cannot be read.
+      ConfigError: if a run cannot be read.
     """
     trained = {run: label for run, label in labels.items() if _has_trained(run)}
     return [join([(run, rows.read(run))], label) for run, label in trained.items()]
 
 
 def join(group: Sequence[tuple[Path, History]], settings: str) -> TableLine:
-    """Puts runs of the same settings into one line.
+    """Joins runs of the same settings into one line.
 
     Args:
-      group: directories and what they hold.
-      settings: in what they differ from other lines.
+      group: run directories and their histories.
+      settings: the settings that differ from other lines.
 
     Raises:
       ConfigError: if two of them share a seed.
@@ -192,12 +192,12 @@ def join(group: Sequence[tuple[Path, History]], settings: str) -> TableLine:
 
 
 def _settings(history: History) -> dict[str, Any]:
-    """Takes what runs must have alike for their seeds to be counted together."""
+    """Takes the settings that runs must share to be joined into one line."""
     return {key: value for key, value in to_dict(history.config).items() if key not in _APART}
 
 
 def _differences(mine: Mapping[str, Any], every: Sequence[Mapping[str, Any]]) -> str:
-    """Writes the settings that are not the same in every line, without those that follow."""
+    """Writes the settings that differ between lines, without settings that follow from others."""
     derived = {*keys(TrainConfig, derived=True), "stage"}
     differing = [
         key
@@ -209,7 +209,7 @@ def _differences(mine: Mapping[str, Any], every: Sequence[Mapping[str, Any]]) ->
 
 
 def cells(lines: Sequence[TableLine]) -> list[tuple[str, ...]]:
-    """Writes lines as text, in the columns of `HEADS`."""
+    """Writes lines as text in the columns of `HEADS`."""
     return [
         (
             _place(line.runs),
@@ -226,7 +226,7 @@ def cells(lines: Sequence[TableLine]) -> list[tuple[str, ...]]:
 
 
 def note(lines: Sequence[TableLine]) -> str:
-    """Says what the success of lines is, and the interval."""
+    """Explains the success and interval columns."""
     measures = " or ".join(sorted({line.measure for line in lines}))
     return (
         f"Success: {measures} on the last stage, of its newest whole cohort; mean over seeds and "
@@ -246,7 +246,7 @@ def text(lines: Sequence[TableLine]) -> str:
 
 
 def plain(lines: Sequence[TableLine]) -> list[dict[str, Any]]:
-    """Writes lines as plain data for JSON; what was not measured is null."""
+    """Writes lines as plain data for JSON, with null for missing values."""
     return [
         {
             "runs": [str(run) for run in line.runs],
@@ -266,14 +266,14 @@ def plain(lines: Sequence[TableLine]) -> list[dict[str, Any]]:
 
 
 def _place(runs: Sequence[Path]) -> str:
-    """Names a run, or the folder that several have in common and how many they are."""
+    """Names a run, or the common folder of several runs and their number."""
     if len(runs) == 1:
         return str(runs[0])
     return f"{len(runs)} in {os.path.commonpath(runs)}"
 
 
 def _seeds(line: TableLine) -> str:
-    """Counts seeds, and those that have a success where not all do."""
+    """Writes the number of seeds, and how many have a success if not all do."""
     of, measured = len(line.seeds), len(line.measured)
     return str(of) if measured == of else f"{of}, {measured} measured"
 

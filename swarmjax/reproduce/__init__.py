@@ -1,5 +1,5 @@
-"""The published experiment several times over: trained, judged, and held against its claims.
+"""Repeats the published experiment with several seeds and checks the paper's claims.
 
-Imports the rooms that it runs. `arms.py` trains, `judge.py` judges, `claims.py` says what the paper
-claims and when that holds, `page.py` writes the report. Start with `__main__.main`.
+Imports the packages that it runs. `arms.py` trains, `judge.py` evaluates, `claims.py` holds the
+paper's claims and their criteria, and `page.py` writes the report. Start with `__main__.main`.
 """

@@ -1,7 +1,7 @@
 """`python -m swarmjax.reproduce`: the published experiment with seeds and intervals, and a report.
 
-Trains every arm, judges what came of it and writes the report. `minutes` or Ctrl-C stop it with
-all that was computed saved; `resume=DIR` goes on.
+Trains every arm, evaluates its policies and writes the report. `minutes` or Ctrl-C stops it and
+saves everything computed so far. `resume=DIR` continues.
 """
 
 import json
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _settings(arguments: Sequence[str]) -> tuple[ReproduceConfig, Path]:
-    """Reads the command line; with `resume=` the stored config and what may be changed of it."""
+    """Reads the command line; with `resume=`, applies allowed changes to the stored config."""
     words = {key: value for key, _, value in (word.partition("=") for word in arguments)}
     resumed = words.get("resume", "null").strip("'\"")
     if resumed in ("", "null"):
@@ -85,22 +85,22 @@ def _settings(arguments: Sequence[str]) -> tuple[ReproduceConfig, Path]:
 
 
 def _read(out: Path) -> dict:
-    """Reads the settings of a reproduction that is gone on with."""
+    """Reads the settings of a reproduction that is to be continued."""
     path = out / FACTS
     section.check_text("resume", str(out))
     if not path.exists():
-        raise ConfigError(f"resume is {out}, which is no reproduction: it has no {FACTS}.")
+        raise ConfigError(f"resume is {out}, which is not a reproduction: it has no {FACTS}.")
     settings = report_rows.read_object(path).get("settings")
     if not isinstance(settings, dict):
-        raise ConfigError(f"{path} has no keys and values as settings: it is damaged.")
+        raise ConfigError(f"{path} has no settings: it is damaged.")
     return settings
 
 
 def _choose_device(device: str) -> None:
-    """Makes JAX compute on a device, before it has chosen one.
+    """Selects the device for JAX, before JAX chooses one itself.
 
     Raises:
-      ConfigError: if there is none of the kind.
+      ConfigError: if there is no such device.
     """
     if device == "auto":
         return
@@ -117,7 +117,7 @@ def _choose_device(device: str) -> None:
 
 
 def _write(out: Path, given: ReproduceConfig) -> None:
-    """Writes what has been done so far."""
+    """Writes the facts of the work done so far."""
     done = arms.summaries(out)
     facts = {
         "format": FORMAT,
@@ -135,7 +135,7 @@ def _write(out: Path, given: ReproduceConfig) -> None:
 
 
 def _replace(path: Path, found: dict) -> None:
-    """Writes a JSON file whole or not at all."""
+    """Writes a JSON file completely or not at all."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temporary:
@@ -145,7 +145,7 @@ def _replace(path: Path, found: dict) -> None:
 
 
 def _judge(out: Path, given: ReproduceConfig) -> None:
-    """Judges the arms that are not judged yet on as many episodes."""
+    """Judges the arms that have not been judged yet on this number of episodes."""
     rows = [row for row in judge.read(out) if row["episodes"] == given.episodes]
     known = {(row["arm"], row["seed"], row["stage"]) for row in rows}
     tasks = [task for task in _tasks(out, given) if (task.arm, task.seed, task.stage) not in known]
@@ -158,7 +158,7 @@ def _judge(out: Path, given: ReproduceConfig) -> None:
 
 
 def _tasks(out: Path, given: ReproduceConfig) -> list[Task]:
-    """Lists what is judged of the arms that are done."""
+    """Lists the judging tasks of the arms that are done."""
     return [
         Task(arm, seed, out / arm / POLICY.replace(".", f"-seed{seed}."), stage)
         for arm, summary in arms.summaries(out).items()
@@ -168,7 +168,7 @@ def _tasks(out: Path, given: ReproduceConfig) -> list[Task]:
 
 
 def _stopped(out: Path, given: ReproduceConfig, missing: int) -> str:
-    """Says how to go on."""
+    """Writes how to continue."""
     what = f"{missing} of {len(given.arms)} arms to train" if missing else "all arms trained"
     return f"stopped with {what}, saved; go on with: python -m swarmjax.reproduce resume={out}\n"
 

@@ -1,6 +1,7 @@
-"""The arms of a reproduction: what each one is, and its training by the ordinary trainer.
+"""Configures the arms of a reproduction and trains them with the ordinary trainer.
 
-Each has a run directory of its own in that of the reproduction, and goes on where it stopped.
+Each arm has its own run directory inside the directory of the reproduction, and continues where it
+stopped.
 """
 
 from dataclasses import replace
@@ -18,7 +19,8 @@ from swarmjax.run.signals import Stop
 
 _EXPANDED, _MODERN = "_expanded", "modern_"
 _STAGES = {"curriculum": "paper_curriculum", "baseline": "paper6"}
-# Of the default 128 arenas of 32 control steps a million of them are 244 updates; of these 1,953.
+# A million control steps are 244 updates with the default 128 arenas x 32 steps, and 1,953 with
+# these 16 x 32.
 _FEW = ("arenas=16", "algo.rollout_length=32")
 
 
@@ -26,15 +28,15 @@ def settings(given: ReproduceConfig, arm: Arm, out: Path) -> TrainConfig:
     """Makes the config of an arm.
 
     Args:
-      given: of the reproduction.
-      arm: which one.
+      given: settings of the reproduction.
+      arm: the arm.
       out: directory of the reproduction.
 
     Returns:
       The config of a new run.
 
     Raises:
-      ConfigError: if its numbers do not fit together.
+      ConfigError: if the settings contradict each other.
     """
     kind = arm.removeprefix(_MODERN).removesuffix(_EXPANDED)
     expanded = arm.endswith(_EXPANDED)
@@ -67,14 +69,14 @@ def settings(given: ReproduceConfig, arm: Arm, out: Path) -> TrainConfig:
 
 
 def run(made: TrainConfig, stop: Stop) -> bool:
-    """Trains an arm until it is done or somebody asks to stop.
+    """Trains an arm until it is done or a stop is requested.
 
     Args:
-      made: its config, as `settings` made it.
-      stop: notices signals and the time.
+      made: the arm's config, from `settings`.
+      stop: watches signals and the time limit.
 
     Returns:
-      Whether its budget is spent.
+      Whether the arm's budget is spent.
 
     Raises:
       ConfigError: if the directory holds another run, or memory is short.
@@ -92,15 +94,15 @@ def run(made: TrainConfig, stop: Stop) -> bool:
 
 
 def _go_on(made: TrainConfig, directory: Path) -> TrainConfig:
-    """Lets an arm that has begun go on; one that was killed before it saved anything begins."""
+    """Resumes an arm that has begun; an arm killed before its first checkpoint starts again."""
     if not (directory / "config.json").exists():
         return made
     stored = from_stored(read_config(directory), "stored ")
     kept = replace(made, run=replace(made.run, dir=stored.run.dir), init_from=stored.init_from)
     if kept != stored:
         raise ConfigError(
-            f"{directory} holds a run of another config than this version makes of the "
-            "reproduction's: give another out."
+            f"{directory} holds a run whose config differs from the one that this version makes: "
+            "give another out."
         )
     try:
         checkpoint.restore(directory)
@@ -110,13 +112,13 @@ def _go_on(made: TrainConfig, directory: Path) -> TrainConfig:
 
 
 def summaries(out: Path) -> dict[Arm, dict[str, Any]]:
-    """Reads what came of the arms that are done.
+    """Reads the summaries of the arms that are done.
 
     Args:
       out: directory of the reproduction.
 
     Returns:
-      The `summary.json` of each, in their order.
+      The `summary.json` of each arm, in the order of `ARMS`.
     """
     found = {}
     for arm in ARMS:

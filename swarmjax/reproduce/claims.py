@@ -1,10 +1,10 @@
-"""The claims in the paper's text, and what a reproduction says about each. No JAX.
+"""Judges the claims in the paper's text by the data of a reproduction. No JAX.
 
-What would bear a claim out, and what would contradict it, is fixed here, before any data. A claim
-has a reading for each way in which the paper can be understood (docs/paper.md); every number is an
-interquartile mean over seeds with its 95 % bootstrap interval. A claim is reproduced if it holds by
-all of its readings, and not reproduced if the data contradict it by all of them; where an interval
-straddles, readings disagree or an arm is missing it is undecidable.
+The criteria that support or contradict a claim were fixed here before any data existed. A claim
+has one reading for each way to understand the paper (docs/paper.md). Every number is an
+interquartile mean over seeds with its 95 % bootstrap interval. A claim is reproduced if it holds
+in all of its readings, and not reproduced if the data contradict all of them. It is undecidable if
+an interval straddles the limit, readings disagree or an arm is missing.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -28,29 +28,29 @@ from swarmjax.reproduce.criteria import (
 from swarmjax.reproduce.measures import NUMBER, SHARE, Axis, Measure
 from swarmjax.reproduce.rows import EXPANDED, LAST, MODERN, PAIR, TUNED, Reproduction
 
-GENERATED = 0.8  # share of targets that is the desired behaviour: what promotes from a stage, too
-FAILED = 0.5  # share of targets below which a swarm fails
+GENERATED = 0.8  # share of targets that counts as the desired behaviour; also promotes from a stage
+FAILED = 0.5  # below this share of targets a swarm fails
 _NOTE = (
     "Numbers are interquartile means over seeds, with 95 % bootstrap intervals in brackets. Of "
     "two, the first is the curriculum's and the second the baseline's."
 )
 
 type Outcome = Literal["reproduced", "not reproduced", "undecidable"]
-# What the arms of a reading came to, [N] each, to whether the claim holds, and the numbers.
+# From the values [N] of each arm of a reading to whether the claim holds, and the numbers.
 type Test = Callable[..., tuple[bool | None, str]]
-# What an arm came to by seed, [N]: a function of `measures` with its options set.
+# The value of each seed of an arm, [N]: a function of `measures` with its options set.
 type Values = Callable[[Reproduction, str], np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """One way in which a claim can be understood.
+    """One way to understand a claim.
 
     Attributes:
-      name: in words.
-      arms: finished ones that it needs.
-      values: of an arm.
-      test: of the values of the arms, in their order.
+      name: name in words.
+      arms: finished arms that the reading needs.
+      values: takes the values of an arm.
+      test: tests the values of the arms, in the order of `arms`.
     """
 
     name: str
@@ -61,12 +61,12 @@ class Reading:
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """What a reading of a claim came to.
+    """The result of a reading of a claim.
 
     Attributes:
-      reading: its name.
-      holds: whether the claim holds by it; None where that is open.
-      text: the numbers that say so.
+      reading: name of the reading.
+      holds: whether the claim holds in this reading; None if undecided.
+      text: the numbers behind the result.
     """
 
     reading: str
@@ -79,12 +79,12 @@ class Claim:
     """A claim in the paper's text.
 
     Attributes:
-      name: a key.
-      quote: of the paper, word for word.
-      where: the quote stands.
-      criterion: what bears the claim out, and what contradicts it.
-      figures: of the report, which show it.
-      readings: by all of which it must hold.
+      name: key of the claim.
+      quote: the paper's sentence, word for word.
+      where: where the paper says it.
+      criterion: what supports the claim, and what contradicts it.
+      figures: figures and tables of the report that show it.
+      readings: the readings; the claim must hold in all of them.
     """
 
     name: str
@@ -96,19 +96,19 @@ class Claim:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Arms that its readings need."""
+        """The arms that the readings need."""
         return tuple(dict.fromkeys(arm for reading in self.readings for arm in reading.arms))
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClaimVerdict:
-    """What became of a claim.
+    """The verdict on a claim.
 
     Attributes:
-      claim: that is judged.
-      outcome: of it.
-      reason: why it is undecidable; empty if it is not.
-      findings: of its readings.
+      claim: the claim.
+      outcome: the verdict.
+      reason: why the claim is undecidable; empty if it is decided.
+      findings: the results of the readings.
     """
 
     claim: Claim
@@ -140,7 +140,7 @@ def verdict(data: Reproduction, claim: Claim) -> ClaimVerdict:
 
 
 def finding(data: Reproduction, reading: Reading) -> Finding:
-    """Says what a reading comes to; it is open where an arm or an episode is missing."""
+    """Evaluates a reading; it stays open if an arm or an episode is missing."""
     lacking = data.lacking(reading.arms)
     values = [] if lacking else [reading.values(data, arm) for arm in reading.arms]
     if lacking:
@@ -153,12 +153,12 @@ def finding(data: Reproduction, reading: Reading) -> Finding:
 
 
 def goals(data: Reproduction) -> list[Finding]:
-    """Says whether the modern trainer comes to what this project set itself, by mean actions."""
+    """Tests whether the modern trainer meets this project's own goals, with mean actions."""
     return [finding(data, goal) for goal in GOALS]
 
 
 def markdown(verdicts: Sequence[ClaimVerdict]) -> str:
-    """Tables verdicts, for a page of Markdown."""
+    """Writes the verdicts as a Markdown table."""
     rows = []
     for each in verdicts:
         reason = f", {each.reason}" if each.reason else ""
@@ -175,35 +175,36 @@ HELD = {True: "holds", False: "contradicted", None: "open"}
 
 
 def _by_mean(key: str, stage: str) -> tuple[str, Values]:
-    """Final policies by their mean actions."""
+    """Makes a source of values: final policies that drive by their mean actions."""
     return "final policies, mean action", partial(measures.judged, key=key, stage=stage)
 
 
 def _by_sampling(of: Measure, stage: str) -> tuple[str, Values]:
-    """The end of training, by sampled actions."""
+    """Makes a source of values: the end of training, with sampled actions."""
     name = f"last {measures.WINDOW} episodes of training on {stage}, sampled actions"
     return name, partial(measures.late, of=of, stage=stage)
 
 
 def _called(what: str, sources: Iterable[tuple[str, Values]]) -> list[tuple[str, Values]]:
-    """Puts what is read out before the names of its sources."""
+    """Puts the name of the quantity before the names of its sources."""
     return [(f"{what}, {name}", values) for name, values in sources]
 
 
 def _readings(arms: tuple[str, ...], test: Test, *sources: tuple[str, Values]) -> tuple:
-    """A reading for each source of values, of the same arms and by the same test."""
+    """Makes one reading per source of values, all with the same arms and the same test."""
     return tuple(Reading(name=name, arms=arms, values=v, test=test) for name, v in sources)
 
 
 def steady(stage: str | None, axis: Axis) -> list[tuple[str, str, Values]]:
-    """Where success becomes steady, by either reading of success.
+    """Lists how to find where success becomes steady, for both readings of success.
 
     Args:
-      stage: whose episodes alone are looked at; None for all.
-      axis: in which it is told.
+      stage: uses only the episodes of this stage; None for all.
+      axis: counts in this unit.
 
     Returns:
-      Of each reading the goal, what is counted, and the places of an arm by seed.
+      For each reading: the goal, what is counted, and a function that finds an arm's places by
+      seed.
     """
     which = "all episodes" if stage is None else f"episodes on {stage}"
     counted = f"{which}, {measures.UNITS[axis]}"
@@ -218,7 +219,7 @@ def _steady(stage: str | None, axis: Axis) -> list[tuple[str, Values]]:
 
 
 def _rewarded() -> tuple[tuple[str, Values], ...]:
-    """Where the reward on the last stage is near its best, of robot 1 and of the swarm."""
+    """Lists how to find where the last stage's reward nears its best, for robot 1 and the swarm."""
     kinds = {"robot 1": measures.first_reward, "mean of the robots": measures.mean_reward}
     return tuple(
         (
@@ -231,7 +232,7 @@ def _rewarded() -> tuple[tuple[str, Values], ...]:
 
 
 def _expanded(test: Test, which: slice, key: str = "targets_reached") -> tuple[Reading, ...]:
-    """The 1.5 m arena, zero-shot and trained on, of some of the pair."""
+    """Makes the readings of the 1.5 m arena, zero-shot and trained on, for arms of the pair."""
     source = partial(measures.judged, key=key, stage=EXPANDED)
     return (
         Reading(name="zero-shot at 1.5 m", arms=PAIR[which], values=source, test=test),
@@ -245,9 +246,9 @@ _CONTACTS = (_by_mean("contacts_per_robot", LAST), _by_sampling(measures.contact
 _CROWDING = ("last to arrive minus first", partial(measures.crowding, stage=LAST))
 _MORE_SHARE = partial(higher, unit=SHARE)
 _STEADY_IS = (
-    f"Steady is the first episode from which on {measures.WINDOW} episodes, and all to the end of "
-    f"the run, have at least {measures.STEADY:g} of successes, and no later {measures.WINDOW} less "
-    f"than {measures.KEPT:g}."
+    f"Steady is the first episode from which {measures.WINDOW} episodes, and all to the end of the "
+    f"run, have at least {measures.STEADY:g} of successes, and no later {measures.WINDOW} episodes "
+    f"have less than {measures.KEPT:g}."
 )
 _DIFFERENCE = "The interval of the paired difference excludes 0, on the claim's side."
 
@@ -336,8 +337,8 @@ CLAIMS = (
         where="section 4, on Figure 8",
         criterion="Control steps with something within infrared range, of the last robot to arrive "
         f"minus the first one, over the last {measures.WINDOW} episodes on {LAST}, curriculum. "
-        "Contradicted if the interval does not exceed 0. More of them is what crowding would bring "
-        "about, but the data do not say what a ray met, so the claim cannot be reproduced by them.",
+        "Contradicted if the interval does not exceed 0. Crowding would cause more of them, but "
+        "the data do not show what a ray met, so they cannot reproduce the claim.",
         figures="figure 8",
         readings=_readings(("curriculum",), crowded, _CROWDING),
     ),

@@ -11,7 +11,7 @@ from swarmjax.config.section import MAX_COUNT, modernise
 _REPRODUCE_RESUME_KEYS = ("resume", "minutes", "device", "arms", "episodes", "workers")
 
 
-# The runs of a reproduction: docs/paper.md.
+# docs/paper.md describes the runs of a reproduction.
 Arm = Literal[
     "curriculum",
     "baseline",
@@ -30,34 +30,34 @@ LEAST_SEEDS = 3  # for an interval
 
 @dataclass(frozen=True, kw_only=True)
 class ReproduceConfig(Section):
-    """The published experiment, several times over.
+    """Settings to repeat the published experiment with several seeds.
 
-    What is not said here is as in `algo=paper`.
+    All other settings are as in `algo=paper`.
     """
 
     command: ClassVar[str] = "reproduce"
     renamed: ClassVar[Mapping[str, str]] = {"rollout": "rollout_length"}
 
-    seeds: int = field(default=10, metadata=about("of each arm; an interval takes 3", 1, 4096))
-    seed: int = field(default=0, metadata=about("the first of them", 0, MAX_COUNT))
+    seeds: int = field(default=10, metadata=about("seeds of each arm; at least 3", 1, 4096))
+    seed: int = field(default=0, metadata=about("the first seed", 0, MAX_COUNT))
     seeds_by: Literal["vmap", "map", "cores"] = field(
         default="cores", metadata=about("as in training")
     )
     budget: int = field(
         default=1_000_000,
-        metadata=about("control steps of a seed: 'max training timesteps'", 1, MAX_COUNT),
+        metadata=about("control steps per seed: 'max training timesteps'", 1, MAX_COUNT),
     )
     fine_tune: int = field(
-        default=250_000, metadata=about("control steps of a seed in the 1.5 m arena", 1, MAX_COUNT)
+        default=250_000, metadata=about("control steps per seed in the 1.5 m arena", 1, MAX_COUNT)
     )
     arms: tuple[Arm, ...] = field(
-        default=ARMS, metadata=about("which runs; *_expanded goes on with the one before it")
+        default=ARMS, metadata=about("which runs; *_expanded continues the arm of that name")
     )
     rollout_length: int = field(
-        default=6000, metadata=about("control steps of an update of the paper's", 1, MAX_COUNT)
+        default=6000, metadata=about("control steps per update of the paper's PPO", 1, MAX_COUNT)
     )
     epochs: int = field(
-        default=80, metadata=about("of an update of the paper's: 'PPO K epochs'", 1, MAX_COUNT)
+        default=80, metadata=about("per update of the paper's PPO: 'PPO K epochs'", 1, MAX_COUNT)
     )
     step_limit: int = field(
         default=1500, metadata=about("'Max timesteps per episode'", 1, MAX_COUNT)
@@ -66,32 +66,32 @@ class ReproduceConfig(Section):
         default="terminal", metadata=about("the paper's return at the step limit: algo.time_out")
     )
     threshold: float = field(
-        default=0.8, metadata=about("share of the targets that promotes", 0.0, 1.0)
+        default=0.8, metadata=about("share of targets reached that promotes", 0.0, 1.0)
     )
     robot: Literal["paper", "planar"] = field(
-        default="paper", metadata=about("range of the commands: printed, or of the hardware")
+        default="paper", metadata=about("speed range: as printed, or of the hardware")
     )
     impl: Literal["auto", "jax", "warp"] = field(
-        default="auto", metadata=about("who steps the physics, as sim.impl")
+        default="auto", metadata=about("what steps the physics, as in sim.impl")
     )
     device: Literal["auto", "cpu", "gpu"] = field(
-        default="auto", metadata=about("that trains; auto: a GPU if there is one")
+        default="auto", metadata=about("device for training; auto: a GPU if there is one")
     )
     minutes: float | None = field(
         default=None,
-        metadata=about("after which it saves and stops, to go on with resume", above=0.0),
+        metadata=about("save and stop after this time; resume continues", above=0.0),
     )
     episodes: int = field(
-        default=20, metadata=about("on which each policy is judged on each stage", 1, MAX_COUNT)
+        default=20, metadata=about("episodes to judge each policy on each stage", 1, MAX_COUNT)
     )
     workers: int | None = field(
-        default=None, metadata=about("processes that judge; null: one a core", 1, 1024)
+        default=None, metadata=about("processes that judge; null: one per core", 1, 1024)
     )
     out: str | None = field(
         default=None, metadata=about("directory; null: runs/<date>-<time>-reproduce")
     )
     resume: str | None = field(
-        default=None, metadata=about("directory of a reproduction to go on with")
+        default=None, metadata=about("directory of a reproduction to continue")
     )
 
     def _check(self) -> None:
@@ -112,21 +112,21 @@ class ReproduceConfig(Section):
                 raise ConfigError(f"arms names {arm} more than once: give each once.")
             first = arm.removesuffix("_expanded")
             if first not in self.arms:
-                raise ConfigError(f"arms names {arm}, but not {first}, which it goes on with.")
+                raise ConfigError(f"arms names {arm}, but not {first}, which it continues.")
 
 
 def load_reproduce(
     overrides: Sequence[str], stored: Mapping[str, Any] | None = None
 ) -> ReproduceConfig:
-    """Make the configuration of `swarmjax.reproduce` from its `key=value` words.
+    """Makes the configuration of `swarmjax.reproduce` from its `key=value` words.
 
     Args:
-        overrides: the words.
-        stored: configuration of the reproduction to go on with, as `to_dict` gave it, if any; only
-            what does not change what has been computed may then be given.
+      overrides: the words.
+      stored: configuration of the reproduction to continue, from `to_dict`, if any. The words may
+        then only change settings that do not affect what has been computed.
 
     Raises:
-        ConfigError: see the module.
+      ConfigError: if a key or a value is invalid.
     """
     if stored is None:
         return files.load(ReproduceConfig, overrides)

@@ -1,4 +1,4 @@
-"""When a claim holds: what a value, or a paired difference, must be beyond its interval."""
+"""Tests whether a claim holds: is the interval of a value or a difference beyond a limit?"""
 
 import numpy as np
 
@@ -7,13 +7,13 @@ from swarmjax.evaluate.statistics import Interval, iqm
 from swarmjax.reproduce.measures import NUMBER, PLACE, SHARE, Unit
 
 ABOUT = 0.5  # "approximately": within this share of the number
-_ROUNDING = 1e-9  # what means lose: that of 0.95, 0.95 and 0.95 is less than 0.95
+_ROUNDING = 1e-9  # rounding error of a mean: the mean of 0.95, 0.95 and 0.95 is less than 0.95
 
 
 def at_least(*values: np.ndarray, least: float) -> tuple[bool | None, str]:
-    """Tests whether all arms come to a share: their intervals lie at or above it.
+    """Tests whether all arms reach a share: their intervals lie at or above it.
 
-    One that lies below contradicts it.
+    An interval below the share contradicts the claim.
     """
     found = [_mean(each) for each in values]
     text = " and ".join(SHARE.interval(each) for each in found)
@@ -23,14 +23,14 @@ def at_least(*values: np.ndarray, least: float) -> tuple[bool | None, str]:
 
 
 def below(values: np.ndarray, *, limit: float) -> tuple[bool | None, str]:
-    """Tests whether an arm stays below a share: its interval does; one at or above contradicts."""
+    """Tests whether an arm's interval lies below a share; an interval at or above contradicts."""
     found = _mean(values)
     text = SHARE.interval(found)
     return _side(limit - found.high, limit - found.low, text, touching=True)
 
 
 def about(values: np.ndarray, *, number: float) -> tuple[bool | None, str]:
-    """Tests whether an arm's interval lies within `ABOUT` of a number; one outside contradicts."""
+    """Tests whether an arm's interval lies within `ABOUT` of a number; outside it contradicts."""
     found, low, high = _mean(values), (1 - ABOUT) * number, (1 + ABOUT) * number
     text = PLACE.interval(found)
     if low <= found.low and found.high <= high:
@@ -41,7 +41,7 @@ def about(values: np.ndarray, *, number: float) -> tuple[bool | None, str]:
 def higher(ours: np.ndarray, theirs: np.ndarray, *, unit: Unit) -> tuple[bool | None, str]:
     """Tests whether the first arm has more: the interval of the paired difference is above 0.
 
-    One that lies below 0 contradicts it.
+    An interval below 0 contradicts the claim.
     """
     more = statistics.paired(theirs[:, None], ours[:, None], iqm)
     both = f"{unit.value(float(iqm(ours)))} against {unit.value(float(iqm(theirs)))}"
@@ -56,10 +56,10 @@ def lower(ours: np.ndarray, theirs: np.ndarray, *, unit: Unit) -> tuple[bool | N
 
 
 def earlier(ours: np.ndarray, theirs: np.ndarray) -> tuple[bool | None, str]:
-    """Tests whether the first arm gets somewhere earlier, where inf is never.
+    """Tests whether the first arm reaches a goal earlier, where inf means never.
 
-    It does if the interval of the probability that a seed of it does so lies above 0.5; one that
-    lies below contradicts it.
+    It takes the probability that a seed of the first arm is earlier than a seed of the second. The
+    claim holds if the interval of this probability lies above 0.5, and is contradicted below 0.5.
     """
     chance = statistics.probability_of_improvement(theirs[:, None], ours[:, None])
     both = " against ".join(PLACE.value(float(iqm(each))) for each in (ours, theirs))
@@ -68,15 +68,15 @@ def earlier(ours: np.ndarray, theirs: np.ndarray) -> tuple[bool | None, str]:
 
 
 def above_zero(values: np.ndarray) -> tuple[bool | None, str]:
-    """Tests whether a share is not 0: its interval is above; one that is 0 contradicts it."""
+    """Tests whether the interval of a share lies above 0; a share of 0 contradicts the claim."""
     found = _mean(values)
     return _side(found.low, found.high, SHARE.interval(found), touching=True)
 
 
 def crowded(values: np.ndarray) -> tuple[bool | None, str]:
-    """Tests whether the last to arrive senses no more than the first, which contradicts crowding.
+    """Tests for crowding; contradicted if the last robot to arrive senses no more than the first.
 
-    More of it is what crowding would bring about, but no proof of it: the reading stays open.
+    If it senses more, crowding is possible but not proven, so the reading stays open.
     """
     found = _mean(values)
     text = f"{NUMBER.difference(found)} steps"
@@ -86,12 +86,12 @@ def crowded(values: np.ndarray) -> tuple[bool | None, str]:
 
 
 def _mean(values: np.ndarray) -> Interval[float]:
-    """Interquartile mean over seeds [N], with its interval."""
+    """Takes the interquartile mean over seeds [N], with its interval."""
     return statistics.bootstrap(values[:, None], iqm)
 
 
 def _side(low: float, high: float, text: str, *, touching: bool = False) -> tuple[bool | None, str]:
-    """Tells whether an interval lies above 0, below it (or at it, if `touching`), or straddles."""
+    """Tells whether an interval lies above 0, below 0 (or at 0, if `touching`), or straddles 0."""
     if low > _ROUNDING:
         return True, text
     beyond = _ROUNDING if touching else -_ROUNDING

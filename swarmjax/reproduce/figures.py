@@ -1,7 +1,7 @@
-"""The figures of a reproduction, with Matplotlib: the paper's, and those that it lacks.
+"""Draws the figures of a reproduction with Matplotlib: the paper's figures and additional ones.
 
-A figure is drawn of those of its arms that have finished. Colours are of Okabe & Ito 2008, "Color
-universal design", and arms differ in their dashes too.
+A figure shows those of its arms that have finished. Colours are from Okabe & Ito 2008, "Color
+universal design". Arms also have different dashes.
 """
 
 from collections.abc import Callable
@@ -23,8 +23,8 @@ from swarmjax.reproduce.measures import AXES, WINDOW, Axis, Measure
 from swarmjax.reproduce.raster import raster
 from swarmjax.reproduce.rows import EXPANDED, LAST, MODERN, PAIR, TUNED, Reproduction
 
-SHADES = 128  # colours of a file: a quarter of its size, each off by 23 of 255 at most
-_POINTS, _RESAMPLES = 100, 1000  # of an interval along a curve
+SHADES = 128  # colours in a file: makes it a quarter of the size; each is off by at most 23 of 255
+_POINTS, _RESAMPLES = 100, 1000  # for the interval along a curve
 COLOURS = {
     "curriculum": "#0072b2",
     "baseline": "#d55e00",
@@ -37,14 +37,14 @@ _DASHES = {"baseline": "--", "baseline_expanded": "--", "modern_baseline": "--"}
 
 
 class Plot(NamedTuple):
-    """A figure of the report: the arms that it shows, and what draws those that have finished."""
+    """A figure of the report: the arms in it, and a function that draws the finished ones."""
 
     arms: tuple[str, ...]
     make: Callable[[Reproduction, tuple[str, ...]], Figure]
 
 
 class Panel(NamedTuple):
-    """A row of curves: a measure over the episodes of a stage, or of all; shares in percent."""
+    """A row of curves: a measure over the episodes of one or all stages; shares in percent."""
 
     label: str
     of: Measure
@@ -53,7 +53,7 @@ class Panel(NamedTuple):
 
 
 def draw(data: Reproduction) -> dict[str, bytes]:
-    """Draws every figure that has a finished arm.
+    """Draws every figure with at least one finished arm.
 
     Returns:
       PNG files by name. The same reproduction gives the same files.
@@ -72,10 +72,10 @@ def curves(
     """Draws rolling means: every seed, and their interquartile mean with its interval.
 
     Args:
-      data: of the reproduction.
-      arms: finished ones, all in each panel.
-      panels: rows, from above.
-      axes: columns, from the left.
+      data: the reproduction's data.
+      arms: finished arms; every panel shows all of them.
+      panels: rows, from top to bottom.
+      axes: columns, from left to right.
     """
     height = 1.0 + 2.0 * len(panels)
     figure = Figure(figsize=(drawing.WIDTH, height), layout="constrained")
@@ -116,13 +116,13 @@ def _arm(place: Axes, data: Reproduction, arm: str, panel: Panel, axis: Axis) ->
 
 
 def _thinned(at: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Takes about as many points of a curve as the dots can show."""
+    """Thins a curve to about one point per pixel."""
     every = max(1, len(at) // 500)
     return at[::every], values[::every]
 
 
 def _explain_curves(figure: Figure, data: Reproduction, arms: tuple[str, ...]) -> None:
-    """Says above the panels which arm is which."""
+    """Adds a legend of the arms above the panels."""
     kinds = [
         Line2D([], [], color=COLOURS[arm], lw=2.0, ls=_DASHES.get(arm, "-"), label=arm)
         for arm in arms
@@ -132,7 +132,7 @@ def _explain_curves(figure: Figure, data: Reproduction, arms: tuple[str, ...]) -
 
 
 def final(data: Reproduction, arms: tuple[str, ...]) -> Figure:
-    """Draws what final policies came to on both stages: every seed, and intervals."""
+    """Draws the results of the final policies on both stages: every seed, and intervals."""
     kinds = {
         "targets_reached": "targets reached",
         "all_reached": "episodes in which all arrived",
@@ -201,7 +201,7 @@ _DEFAULT_TRAINER = (
 )
 _ALL_COLLISIONS = (*_collisions(None, _ALL_OF_THEM), *_collisions(LAST, _ON_LAST))
 
-# Their captions, in reproduce.html, say what is seen.
+# Their captions are in reproduce.html.
 PLOTS = {
     "figure6_episodes": Plot(PAIR, partial(raster, axis="episode", stage=None)),
     "figure6_steps": Plot(PAIR, partial(raster, axis="steps", stage=LAST)),

@@ -1,7 +1,7 @@
-"""Judges what a reproduction has trained, in MuJoCo's C engine: `evaluation.json`. No JAX.
+"""Judges the policies of a reproduction in MuJoCo's C engine: `evaluation.json`. No JAX.
 
-Every policy drives by its mean action on the last stage and on the 1.5 m arena, on levels that
-differ by the noise of their sensors alone.
+Every policy drives by its mean action on the last stage and in the 1.5 m arena. The levels differ
+only in their sensor noise.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ STAGES = (LAST, EXPANDED)
 
 
 class Task(NamedTuple):
-    """A policy to be judged on a stage."""
+    """A policy to judge on a stage."""
 
     arm: str
     seed: int
@@ -45,18 +45,18 @@ def judge(
     tasks: Sequence[Task],
     report: Callable[[], None] = lambda: None,
 ) -> list[Row]:
-    """Judges policies, over processes.
+    """Judges policies in several processes.
 
     Args:
-      given: of the reproduction; says how many episodes, and how many processes.
-      tasks: what to judge.
-      report: told whenever one is done.
+      given: settings of the reproduction, with the number of episodes and processes.
+      tasks: the tasks to judge.
+      report: called whenever a task is done.
 
     Returns:
-      A row of `evaluation.json` for each.
+      A row of `evaluation.json` for each task.
 
     Raises:
-      PolicyError: if a policy is unsound.
+      PolicyError: if a policy is invalid.
       ConfigError: if the physics breaks down.
     """
     workers = min(given.workers or cores(), max(1, len(tasks)))
@@ -84,7 +84,7 @@ def _judge(episodes: int, task: Task) -> Row:
     )
     levels = cells.split(cells.draw_stage(evaluation, range(episodes)).levels)
     outcome, nearer = play(evaluate_judge.load(evaluation, trained), levels)
-    weights = config.task.reward  # equation 3: it has no others
+    weights = config.task.reward  # only the terms of equation 3
     earned = weights.progress * nearer + weights.proximity * outcome.sensed
     return {
         "arm": task.arm,
@@ -101,15 +101,14 @@ def _judge(episodes: int, task: Task) -> Row:
 
 
 def play(judge: Judge, levels: Sequence[Level]) -> tuple[Outcome, np.ndarray]:
-    """Runs episodes side by side, each until all its robots have arrived or the time is out.
+    """Runs episodes side by side, each until all its robots have arrived or the time is up.
 
     Args:
-      judge: what the arenas share.
-      levels: [A] what they start from.
+      judge: everything that the arenas share.
+      levels: [A] the arenas' levels.
 
     Returns:
-      What they came to, and how much nearer to its target each robot came before it arrived,
-      [A, R] m.
+      The outcomes, and how much closer to its target each robot came before it arrived, [A, R] m.
 
     Raises:
       ConfigError: if the physics of an episode breaks down.
@@ -130,17 +129,17 @@ def play(judge: Judge, levels: Sequence[Level]) -> tuple[Outcome, np.ndarray]:
 
 
 def _distance(arenas: Arenas) -> np.ndarray:
-    """Distances [A, R] to the targets, m."""
+    """Computes the distances [A, R] to the targets, m."""
     return observation.to_target(arenas.pose, arenas.target, np)[0]
 
 
 def _keep(running: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
-    """Takes what is new of the arenas that are running, [A, ...]."""
+    """Takes new values [A, ...] for running arenas and keeps the old ones for the others."""
     return np.where(running.reshape(running.shape + (1,) * (new.ndim - 1)), new, old)
 
 
 def read(out: Path) -> list[Row]:
-    """Reads the rows that are there already.
+    """Reads the rows that already exist.
 
     Args:
       out: directory of the reproduction.
@@ -154,4 +153,4 @@ def read(out: Path) -> list[Row]:
     try:
         return [*reading.read_json(path)["rows"]]
     except (ConfigError, KeyError, TypeError) as error:
-        raise ConfigError(f"{path} cannot be read ({error}): remove it to judge anew.") from None
+        raise ConfigError(f"{path} cannot be read ({error}): remove it to judge again.") from None

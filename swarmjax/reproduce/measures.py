@@ -1,7 +1,7 @@
-"""What is read out of the episodes of a reproduction: success, its steady state, rolling means.
+"""Measures the episodes of a reproduction: success, its steady state, rolling means.
 
-Where the paper can be read in two ways (docs/paper.md), each reading is a function here. Axes as
-in `rows`. No JAX.
+Where the paper can be read in two ways (docs/paper.md), each reading has its own function here.
+Axes as in `rows`. No JAX.
 """
 
 import math
@@ -15,8 +15,8 @@ from swarmjax.evaluate.statistics import Interval
 from swarmjax.reproduce.rows import Reproduction, RunLog
 
 WINDOW = 20  # episodes of a rolling mean: "an averaging window of 20 values" (Figure 7)
-STEADY = 0.8  # share of a window that counts as success: what promotes from a stage, too
-KEPT = 0.5  # share below which a later window loses it; why it is not 0.8, `steady` says
+STEADY = 0.8  # share of successes in a steady window; the same share promotes from a stage
+KEPT = 0.5  # a later window below this share ends the steady state; `steady` explains why not 0.8
 
 type Axis = Literal["episode", "steps"]
 type Measure = Callable[[RunLog], np.ndarray]  # [E] of a log
@@ -26,37 +26,37 @@ AXES: dict[Axis, str] = {"episode": "episode of the run", "steps": "arena contro
 
 
 def first_reached(log: RunLog) -> np.ndarray:
-    """Whether [E] robot 1 reached its target: the paper's "the robot"."""
+    """Tells whether [E] robot 1 reached its target: the paper's "the robot"."""
     return log.reached[:, 0]
 
 
 def all_reached(log: RunLog) -> np.ndarray:
-    """Whether [E] every robot that took part reached its target."""
+    """Tells whether [E] every robot that was present reached its target."""
     return (log.reached | ~log.present).all(axis=1)
 
 
 def targets(log: RunLog) -> np.ndarray:
-    """Share [E] of the targets that were reached: the paper's success rate (section 3.2)."""
+    """Computes the share [E] of targets reached: the paper's success rate (section 3.2)."""
     return log.reached.sum(axis=1) / _robots(log)
 
 
 def first_reward(log: RunLog) -> np.ndarray:
-    """Cumulative reward [E] of robot 1, m: Figure 7 is "for one robot"."""
+    """Takes the cumulative reward [E] of robot 1, m: Figure 7 is "for one robot"."""
     return log.reward[:, 0]
 
 
 def mean_reward(log: RunLog) -> np.ndarray:
-    """Cumulative reward [E], mean over the robots that took part, m."""
+    """Computes the cumulative reward [E], mean over the robots that were present, m."""
     return log.reward.sum(axis=1) / _robots(log)
 
 
 def sensed_share(log: RunLog) -> np.ndarray:
-    """Share [E] of robot steps with something within infrared range: the paper's collisions."""
+    """Computes the share [E] of robot steps with something in infrared range: its collisions."""
     return log.sensed.sum(axis=1) / np.maximum(log.robot_steps.sum(axis=1), 1)
 
 
 def contacts(log: RunLog) -> np.ndarray:
-    """Contacts [E] per robot that took part."""
+    """Computes the contacts [E] per robot that was present."""
     return log.contacts.sum(axis=1) / _robots(log)
 
 
@@ -64,7 +64,7 @@ def _robots(log: RunLog) -> np.ndarray:
     return log.present.sum(axis=1)
 
 
-# What it is that "reaches the goal" in Figures 6 and 9.
+# Two readings of what "reaches the goal" in Figures 6 and 9.
 SUCCESS: dict[str, Measure] = {
     "robot 1 reached its target": first_reached,
     "all robots reached their targets": all_reached,
@@ -72,14 +72,14 @@ SUCCESS: dict[str, Measure] = {
 
 
 def rolling(values: np.ndarray, window: int = WINDOW) -> np.ndarray:
-    """Means of each value and the ones before it.
+    """Computes rolling means: each value together with the values before it.
 
     Args:
-      values: [E] of any unit.
-      window: values of a mean.
+      values: [E] in any unit.
+      window: number of values per mean.
 
     Returns:
-      [E - window + 1], the first one at value `window`; none if there are fewer values.
+      [E - window + 1], starting at value number `window`; empty if there are fewer values.
     """
     if len(values) < window:
         return np.zeros(0)
@@ -89,21 +89,23 @@ def rolling(values: np.ndarray, window: int = WINDOW) -> np.ndarray:
 def steady(success: np.ndarray, window: int = WINDOW, share: float = STEADY) -> int | None:
     """Finds where success becomes steady.
 
-    That is the first episode from which on a window of episodes has at least the share of
-    successes, so have all episodes to the end of the run, and no later window has less than `KEPT`.
+    This is the first episode that meets three conditions. The window that starts there has at least
+    `share` successes. So do all episodes from there to the end of the run, taken together. No later
+    window has less than `KEPT`.
 
-    To ask the share of every later window would measure how long a run is: a policy that succeeds
-    in nine of ten episodes has fewer than 16 in one window of 23, and so near the end of any run.
+    Later windows need not have `share`, because such a rule would measure the length of the run. A
+    policy that succeeds in nine of ten episodes has fewer than 16 successes in one window of 23, so
+    some window near the end of any run would fail.
 
     Args:
       success: [E] whether an episode succeeded.
-      window: episodes of a window.
-      share: that a window must have.
+      window: number of episodes per window.
+      share: share of successes that a window must have.
 
     Returns:
       Index of the episode; None if there is none.
     """
-    # Counts, since 16 / 20 and 0.8 are compared; the small number is for what rounding takes.
+    # Compares counts, since 16 / 20 must equal 0.8; the small number absorbs rounding.
     counts = rolling(success.astype(float), window) * window
     left = np.arange(len(success), 0, -1)
     rest = np.cumsum(success[::-1])[::-1] >= share * left - 1e-9
@@ -114,24 +116,24 @@ def steady(success: np.ndarray, window: int = WINDOW, share: float = STEADY) -> 
 
 
 def along(log: RunLog, axis: Axis) -> np.ndarray:
-    """Where [E] episodes are: their numbers in the run, or the arena steps at which they ended."""
+    """Places the episodes [E]: their numbers in the run, or the arena steps when they ended."""
     return log.number if axis == "episode" else log.arena_steps
 
 
 def steady_at(
     data: Reproduction, arm: str, *, success: Measure, axis: Axis, stage: str | None
 ) -> np.ndarray:
-    """Where success becomes steady, by seed.
+    """Finds where success becomes steady, by seed.
 
     Args:
-      data: of the reproduction.
-      arm: a finished one.
-      success: [E] of a log.
-      axis: in which it is told, counted from the beginning of the run.
-      stage: whose episodes alone are looked at; None for all.
+      data: the reproduction's data.
+      arm: a finished arm.
+      success: takes [E] successes from a log.
+      axis: counts in this unit from the beginning of the run.
+      stage: uses only the episodes of this stage; None for all.
 
     Returns:
-      [N] episode numbers or arena steps; inf for a seed that does not get there.
+      [N] episode numbers or arena steps; inf for a seed that never becomes steady.
     """
     found = []
     for log in data.logs[arm]:
@@ -142,38 +144,38 @@ def steady_at(
 
 
 def late(data: Reproduction, arm: str, *, of: Measure, stage: str) -> np.ndarray:
-    """Mean of a measure over the last episodes on a stage, by sampled actions.
+    """Averages a measure over the last training episodes on a stage, with sampled actions.
 
     Args:
-      data: of the reproduction.
-      arm: a finished one.
-      of: [E] of a log.
-      stage: whose last `WINDOW` episodes are taken.
+      data: the reproduction's data.
+      arm: a finished arm.
+      of: takes the measure [E] from a log.
+      stage: the stage; its last `WINDOW` episodes are used.
 
     Returns:
-      [N] by seed; nan for one with fewer episodes on the stage.
+      [N] by seed; nan for a seed with fewer episodes on the stage.
     """
     means = [rolling(np.asarray(of(log.on(stage)), float)) for log in data.logs[arm]]
     return np.array([each[-1] if len(each) else np.nan for each in means])
 
 
 def judged(data: Reproduction, arm: str, *, key: str, stage: str) -> np.ndarray:
-    """What [N] final policies came to on a stage, by their mean actions."""
+    """Takes a result [N] of the final policies on a stage, with their mean actions."""
     return data.judged[arm, stage][key]
 
 
 def crowding(data: Reproduction, arm: str, *, stage: str) -> np.ndarray:
-    """How many more steps the last robot to arrive sensed something than the first one.
+    """Counts how many more steps the last robot to arrive sensed something than the first one.
 
-    The first finds no other at the targets, the last finds all others that arrive.
+    The first robot finds no other robot at the targets. The last one finds all that arrived before.
 
     Args:
-      data: of the reproduction.
-      arm: a finished one.
-      stage: whose last `WINDOW` episodes are taken, those of them with two arrivals or more.
+      data: the reproduction's data.
+      arm: a finished arm.
+      stage: the stage. Of its last `WINDOW` episodes, those with two or more arrivals are used.
 
     Returns:
-      [N] robot steps a pair, mean by seed; nan for a seed without such an episode.
+      [N] robot steps per pair, mean by seed; nan for a seed without such an episode.
     """
     found = []
     for log in data.logs[arm]:
@@ -191,18 +193,18 @@ def crowding(data: Reproduction, arm: str, *, stage: str) -> np.ndarray:
 def reward_reached(
     data: Reproduction, arm: str, *, of: Measure, axis: Axis, rivals: Sequence[str], stage: str
 ) -> np.ndarray:
-    """Where the rolling mean of the reward first comes to 0.9 of the best one of all rivals.
+    """Finds where the rolling mean of the reward first reaches 0.9 of the best of all rivals.
 
     Args:
-      data: of the reproduction.
+      data: the reproduction's data.
       arm: one of the rivals.
-      of: reward [E] of a log.
-      axis: in which it is told, counted from the beginning of the run.
-      rivals: finished arms whose seeds are searched for the best.
-      stage: whose episodes alone are looked at.
+      of: takes the reward [E] from a log.
+      axis: counts in this unit from the beginning of the run.
+      rivals: finished arms; the best mean is searched over all their seeds.
+      stage: uses only the episodes of this stage.
 
     Returns:
-      [N] episode numbers or arena steps; inf for a seed that does not get there.
+      [N] episode numbers or arena steps; inf for a seed that never reaches it.
     """
     means = {rival: [rolling(of(log.on(stage))) for log in data.logs[rival]] for rival in rivals}
     best = max((m.max() for ms in means.values() for m in ms if len(m)), default=np.inf)
@@ -217,14 +219,14 @@ def reward_reached(
 def on_grid(
     curves: Sequence[tuple[np.ndarray, np.ndarray]], points: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Takes curves at points that all of them have, each holding until its next value.
+    """Samples curves at common points; a value holds until the next one.
 
     Args:
-      curves: of each seed, places [E] that do not fall and values [E].
-      points: at most.
+      curves: non-decreasing places [E] and values [E] of each seed.
+      points: maximum number of points.
 
     Returns:
-      Places [P], whole numbers, and values [N, P]; None if a curve is empty or they share no place.
+      Places [P], whole numbers, and values [N, P]; None if a curve is empty or they do not overlap.
     """
     if not all(len(at) for at, _ in curves):
         return None
@@ -238,12 +240,12 @@ def on_grid(
 
 @dataclass(frozen=True)
 class Unit:
-    """How values of a unit are written.
+    """Writes values of a unit.
 
     Attributes:
       number: writes a value without its unit.
       suffix: the unit.
-      apart: the unit of a difference of two.
+      apart: the unit of a difference of two values.
     """
 
     number: Callable[[float], str]
@@ -260,12 +262,12 @@ class Unit:
         return f"{self.value(found.estimate)} ({low} to {high})"
 
     def difference(self, found: Interval[float]) -> str:
-        """Writes a difference with its interval, each with its sign."""
+        """Writes a difference with its interval, each number with its sign."""
         estimate, low, high = map(self._signed, found)
         return f"{estimate}{self.apart} ({low} to {high})"
 
     def _signed(self, value: float) -> str:
-        """Writes a difference with its sign; none where the text is all zeros."""
+        """Writes a difference with its sign, without a sign if the text is all zeros."""
         plain = self.number(abs(value))
         if not any(digit in plain for digit in "123456789"):
             return plain
@@ -285,5 +287,5 @@ def _number(value: float) -> str:
 
 
 SHARE = Unit(_percent, " %", " points")
-PLACE = Unit(_place)  # an episode number or arena steps; inf is never
+PLACE = Unit(_place)  # an episode number or arena steps; inf means never
 NUMBER = Unit(_number)

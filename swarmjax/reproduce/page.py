@@ -1,4 +1,4 @@
-"""The report of a reproduction: one HTML file that needs nothing else, its figures and verdicts."""
+"""Builds the report of a reproduction: one self-contained HTML file with figures and verdicts."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ PAGE, VERDICTS, FIGURES = "report.html", "verdicts.md", "figures"
 _CASES = (*claims.steady(None, "episode"), *claims.steady(LAST, "steps"))
 _OUTCOMES = ("reproduced", "not reproduced", "undecidable")
 _MET = {True: "met", False: "not met", None: "open"}
-# Of the settings, what names files here or says how the work was cut up.
+# Settings that only name local files or split the work; the printed command leaves them out.
 _UNSAID = ("out", "resume", "minutes")
 _COLUMNS: dict[str, tuple[str, Unit]] = {
     "targets_reached": ("targets reached", SHARE),
@@ -33,19 +33,19 @@ _COLUMNS: dict[str, tuple[str, Unit]] = {
 
 
 def write(out: Path) -> Path:
-    """Writes the report of a reproduction beside its data.
+    """Writes the report of a reproduction next to its data.
 
     Args:
-      out: directory of the reproduction, which gets `report.html`, `verdicts.md` and `figures/`.
+      out: directory of the reproduction; gets `report.html`, `verdicts.md` and `figures/`.
 
     Returns:
-      The page.
+      Path of the page.
 
     Raises:
-      ConfigError: If what a figure shows is missing or damaged, or nothing can be written.
+      ConfigError: if data for a figure are missing or damaged, or a file cannot be written.
     """
     data = reproduce_rows.read(out)
-    # Matplotlib takes a second, which no refusal should.
+    # Importing Matplotlib takes a second. Errors above should come without that delay.
     from swarmjax.reproduce import figures as reproduce_figures
 
     figures = reproduce_figures.draw(data)
@@ -63,7 +63,7 @@ def _page(
     figures: Mapping[str, bytes],
     lacks: Mapping[str, Sequence[str]],
 ) -> str:
-    """Lays the page out, with PNG files by name, and the arms that each figure lacks."""
+    """Lays out the page, from PNG files by name and the arms that each figure lacks."""
     places = _places(data)
     outcomes = [each.outcome for each in verdicts]
     return builder.render(
@@ -96,7 +96,7 @@ def _page(
 
 
 def facts(data: Reproduction) -> list[tuple[str, str]]:
-    """Says how the data came about: what, and the words for it, a line each."""
+    """States how the data were made, one fact per line: its heading and its text."""
     found = data.facts
     return [
         ("made by", command(found["settings"])),
@@ -112,7 +112,7 @@ def facts(data: Reproduction) -> list[tuple[str, str]]:
 
 
 def command(settings: Mapping[str, Any]) -> str:
-    """Writes the command of a reproduction, without what names files or cuts the work up."""
+    """Writes the command of a reproduction, without settings that name files or split the work."""
     words = (
         f"{key}={_word(value)}"
         for key, value in leaves(settings).items()
@@ -131,7 +131,7 @@ def _word(value: object) -> str:
 
 
 def _arms(data: Reproduction) -> list[tuple[str, ...]]:
-    """Tables the arms: what they are, and how long they took."""
+    """Makes the table of the arms: what they are, and how long they took."""
     rows = []
     for arm, words in ARMS.items():
         made = ("not trained to the end", "", "")
@@ -151,7 +151,7 @@ def _seconds(value: float | None) -> str:
 
 
 def _final(data: Reproduction) -> list[tuple[str, ...]]:
-    """Tables what final policies came to, each arm on each stage."""
+    """Makes the table of the final policies' results, for each arm on each stage."""
     return [
         (arm, stage, *_judged(data, arm, stage)) for arm in data.logs for stage in (LAST, EXPANDED)
     ]
@@ -168,24 +168,27 @@ def _mean(values: np.ndarray, unit: Unit) -> str:
 
 
 def _places(data: Reproduction) -> list[tuple[str, str, str, np.ndarray]]:
-    """Goal, axis and arm, and where each seed [N] of it becomes steady."""
+    """Lists goal, axis and arm, and where each of the arm's seeds [N] becomes steady."""
     arms = [arm for arm in (*PAIR, *MODERN) if arm in data.logs]
     return [(goal, of, arm, values(data, arm)) for goal, of, values in _CASES for arm in arms]
 
 
 def _summary(places: np.ndarray) -> tuple[str, str, str]:
-    """Median, IQM and number of the seeds that get there, of places that may be inf."""
+    """Writes median and IQM of places, and how many seeds get there; inf means never."""
     there = np.isfinite(places)
     return (
         PLACE.value(float(np.median(places))),
         _mean(places, PLACE),
-        # No bootstrap here: of ten seeds that all get there it would make 100 to 100 %.
+        # No bootstrap: if all ten seeds get there, its interval would be 100 to 100 %.
         f"{there.sum()} of {len(places)}",
     )
 
 
 def _compared(data: Reproduction) -> list[tuple[str, ...]]:
-    """Tables how much earlier the curriculum is steady, seeds paired, and how likely unpaired."""
+    """Makes the table of how much earlier the curriculum is steady.
+
+    It gives the difference of paired seeds, and the probability for unpaired ones.
+    """
     rows = []
     for goal, counted, values in _CASES:
         ours, theirs = (values(data, arm)[:, None] for arm in PAIR)
@@ -198,7 +201,7 @@ def _compared(data: Reproduction) -> list[tuple[str, ...]]:
 
 
 def _expanded(data: Reproduction) -> list[tuple[str, ...]]:
-    """Tables the share of targets at 1.5 m, as they are and trained on."""
+    """Makes the table of the share of targets at 1.5 m, zero-shot and trained on."""
     kinds = (("zero-shot", ""), ("trained on", "_expanded"))
     shares = ("targets_reached", "all_reached")
     return [

@@ -1,4 +1,4 @@
-"""The raster of a reproduction: every episode of every seed."""
+"""Draws the raster of a reproduction: every episode of every seed."""
 
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
@@ -12,19 +12,19 @@ from swarmjax.reproduce.measures import AXES, Axis, Measure
 from swarmjax.reproduce.rows import Reproduction, RunLog
 
 PAPER = {"curriculum": 300, "baseline": 600}  # episodes: section 4, on Figure 6
-_COLUMNS = 700  # of a raster: about as many as the dots along it
+_COLUMNS = 700  # of a raster: about one per pixel
 _REACHED = LinearSegmentedColormap.from_list("reached", ["white", "#0b4f9e"])
 _NOTHING, _STEADY = "0.86", "#e69f00"
 
 
 def raster(data: Reproduction, arms: tuple[str, ...], *, axis: Axis, stage: str | None) -> Figure:
-    """Draws a line for each episode that reached the goal, a row a seed: Figures 6 and 9.
+    """Draws a line for each episode that reached the goal, one row per seed: Figures 6 and 9.
 
     Args:
-      data: of the reproduction.
-      arms: finished ones, two panels each, one for each reading of success.
-      axis: along which episodes are laid out.
-      stage: whose episodes alone are shown; None for all.
+      data: the reproduction's data.
+      arms: finished arms; each gets two panels, one per reading of success.
+      axis: unit of the horizontal axis.
+      stage: shows only the episodes of this stage; None for all.
     """
     kinds = [(name, success, arm) for name, success in measures.SUCCESS.items() for arm in arms]
     seeds = len(data.seeds)
@@ -61,19 +61,19 @@ def raster(data: Reproduction, arms: tuple[str, ...], *, axis: Axis, stage: str 
 def columns(
     log: RunLog, success: Measure, axis: Axis, stage: str | None, edges: np.ndarray
 ) -> np.ndarray:
-    """Shares of success in the columns of a raster.
+    """Computes the share of successes in each column of a raster.
 
-    A column in which no episode ended shows the one that was under way.
+    A column in which no episode ended shows the episode that was running.
 
     Args:
-      log: of a seed.
-      success: [E] of a log.
-      axis: along which episodes are laid out.
-      stage: whose episodes alone are shown; None for all.
-      edges: [P + 1] of the columns, rising.
+      log: log of one seed.
+      success: takes [E] successes from a log.
+      axis: unit of the horizontal axis.
+      stage: shows only the episodes of this stage; None for all.
+      edges: [P + 1] edges of the columns, increasing.
 
     Returns:
-      [P] of 0 to 1; nan where there is no episode to be shown.
+      [P] values from 0 to 1; nan where there is no episode to show.
     """
     at, shown = measures.along(log, axis), np.ones(len(log), bool)
     if stage is not None:
@@ -91,7 +91,7 @@ def columns(
 
 
 def _edges(logs: list[RunLog], axis: Axis) -> np.ndarray:
-    """Edges of the columns of a raster: one column an episode, if they are not too many."""
+    """Computes the column edges of a raster: one column per episode unless there are too many."""
     last = max(int(measures.along(log, axis)[-1]) for log in logs)
     if axis == "episode":
         return np.linspace(0, last, min(last, _COLUMNS) + 1) + 0.5
@@ -99,7 +99,7 @@ def _edges(logs: list[RunLog], axis: Axis) -> np.ndarray:
 
 
 def _explain_raster(figure: Figure, paper: bool) -> None:
-    """Says above the panels what is what."""
+    """Adds a legend above the panels."""
     kinds = [
         Patch(fc=_REACHED(1.0), label="reached"),
         Patch(fc="white", ec="0.5", lw=0.5, label="not reached"),

@@ -1,8 +1,8 @@
-"""What a reproduction of the paper wrote down, read back as arrays for its report. No JAX.
+"""Reads the files of a reproduction of the paper back as arrays for its report. No JAX.
 
-Axes: N seeds, E episodes of a seed, R robots (most of any episode). An arm is one way to train; one
-that has not finished is left out, and the report says what lacks it. A finished arm that lacks an
-episode log, a seed or its evaluation is refused, by the file and the arm.
+Axes: N seeds, E episodes of a seed, R robots (most of any episode). An arm is one way to train. An
+unfinished arm is left out, and the report names each figure that lacks it. If a finished arm lacks
+an episode log, a seed or its evaluation, an error names the file and the arm.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from swarmjax.report.rows import Row, ValueKind
 from swarmjax.run.recorder import EPISODES
 
 FACTS, EVALUATION = "reproduce.json", "evaluation.json"
-FORMAT = 2  # of both
+FORMAT = 2  # of both files
 LAST, EXPANDED = "paper6", "paper_expanded"  # the stages that policies are judged on
 ARMS = {
     "curriculum": "the paper's algorithm with its curriculum",
@@ -32,7 +32,7 @@ ARMS = {
 PAIR = ("curriculum", "baseline")
 TUNED = ("curriculum_expanded", "baseline_expanded")
 MODERN = ("modern_curriculum", "modern_baseline")
-# Of a row of the evaluation, over its episodes.
+# Keys of a row of the evaluation, each over the row's episodes.
 JUDGED = ("targets_reached", "all_reached", "sensed_share", "contacts_per_robot", "return")
 _COUNTS = ("seed", "update", "arena_steps", "steps", "robots")
 _BY_ROBOT = {
@@ -51,16 +51,18 @@ _MAPS = ("settings", "versions", "device", "commit", "seconds", "compile_s")
 class RunLog:
     """Episodes of one seed, in the order in which they ended.
 
+    For an absent robot `reached` is False and all values below it are 0.
+
     Attributes:
-      number: [E] of the episode in its run, from 1, rising.
-      arena_steps: [E] control steps over all arenas of the seed by its end.
-      stage: [E] name of its stage.
-      present: [E, R] whether the robot took part.
-      reached: [E, R] whether it reached its target; False where absent, as all below is 0.
-      reward: [E, R] sum over the episode, nothing discounted, m.
-      robot_steps: [E, R] control steps before it arrived.
-      sensed: [E, R] those with something within infrared range, the paper's rule of a collision.
-      contacts: [E, R] contacts that it began or met.
+      number: [E] number of the episode in its run, from 1, increasing.
+      arena_steps: [E] control steps over all arenas of the seed when the episode ended.
+      stage: [E] name of the stage.
+      present: [E, R] whether the robot was present.
+      reached: [E, R] whether the robot reached its target.
+      reward: [E, R] sum over the episode, undiscounted, m.
+      robot_steps: [E, R] control steps before the robot arrived.
+      sensed: [E, R] of these, steps with something in infrared range: the paper's collisions.
+      contacts: [E, R] contacts that the robot began or met.
     """
 
     number: np.ndarray
@@ -77,23 +79,23 @@ class RunLog:
         return len(self.number)
 
     def on(self, stage: str | None) -> "RunLog":
-        """The episodes of one stage, with their numbers in the whole run; None for all."""
+        """Selects the episodes of one stage, with their numbers in the whole run; None for all."""
         return self if stage is None else self.where(self.stage == stage)
 
     def where(self, chosen: np.ndarray) -> "RunLog":
-        """The episodes of a mask [E]."""
+        """Selects the episodes of a mask [E]."""
         return RunLog(**{name: values[chosen] for name, values in vars(self).items()})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Reproduction:
-    """What a reproduction came to.
+    """The results of a reproduction.
 
     Attributes:
-      facts: `reproduce.json` as it was written.
-      seeds: [N], rising.
-      logs: of each finished arm, N of them.
-      judged: of each finished arm and stage, for each name of `JUDGED`, [N].
+      facts: contents of `reproduce.json`.
+      seeds: [N], increasing.
+      logs: N logs of each finished arm.
+      judged: [N] values by finished arm and stage, for each name in `JUDGED`.
     """
 
     facts: Row
@@ -102,7 +104,7 @@ class Reproduction:
     judged: dict[tuple[str, str], dict[str, np.ndarray]]
 
     def lacking(self, arms: Sequence[str]) -> list[str]:
-        """Those of some arms that have not finished."""
+        """Lists which of the given arms have not finished."""
         return [arm for arm in arms if arm not in self.logs]
 
 
@@ -116,7 +118,7 @@ def read(out: Path) -> Reproduction:
     seeds = tuple(sorted(facts["seeds"]))
     finished = [arm for arm in ARMS if arm in facts["seconds"]]
     if not finished:
-        raise ConfigError(f"{out / FACTS} names no finished arm: go on with the reproduction.")
+        raise ConfigError(f"{out / FACTS} names no finished arm: continue the reproduction.")
     return Reproduction(
         facts=facts,
         seeds=seeds,
@@ -126,10 +128,10 @@ def read(out: Path) -> Reproduction:
 
 
 def _read_facts(out: Path) -> Row:
-    """Reads what the reproduction says about itself."""
+    """Reads `reproduce.json`, the facts of the reproduction."""
     path = out / FACTS
     if not path.exists():
-        raise ConfigError(f"{out} is no reproduction: it has no {FACTS}.")
+        raise ConfigError(f"{out} is not a reproduction: it has no {FACTS}.")
     facts = report_rows.read_object(path)
     _check_format(facts, path)
     report_rows.check(facts, ("budget", "fine_tune"), report_rows.WHOLE, str(path))
@@ -137,7 +139,7 @@ def _read_facts(out: Path) -> Row:
     seeds = facts["seeds"]
     if len(set(seeds)) < LEAST_DRAWN:
         raise ConfigError(
-            f"{path} has {len(set(seeds))} seeds: an interval takes {LEAST_DRAWN} or more."
+            f"{path} has {len(set(seeds))} seeds: an interval needs {LEAST_DRAWN} or more."
         )
     report_rows.check(facts, _MAPS, report_rows.MAP, str(path))
     for key in ("seconds", "compile_s"):
@@ -148,18 +150,20 @@ def _read_facts(out: Path) -> Row:
 
 def _check_format(found: Row, path: Path) -> None:
     if found.get("format") != FORMAT:
-        raise ConfigError(f"{path} has format {found.get('format')!r}, and {FORMAT} is read here.")
+        raise ConfigError(
+            f"{path} has format {found.get('format')!r}, but only format {FORMAT} is supported."
+        )
 
 
 def _read_logs(run: Path, seeds: Sequence[int]) -> tuple[RunLog, ...]:
     """Reads the episodes of an arm, by seed."""
     if not (run / EPISODES).exists():
-        raise ConfigError(f"{run} has no {EPISODES}: its arm is said to be finished.")
+        raise ConfigError(f"{run} has no {EPISODES}, although its arm has finished.")
     by_seed: dict[int, list[Row]] = {seed: [] for seed in seeds}
     for where, row in report_rows.read_lines(run, EPISODES):
         _check_episode(row, where)
         if row["seed"] not in by_seed:
-            raise ConfigError(f"{where} has seed {row['seed']}, which is none of {FACTS}.")
+            raise ConfigError(f"{where} has seed {row['seed']}, which is not in {FACTS}.")
         rows = by_seed[row["seed"]]
         if rows and row["update"] < rows[-1]["update"]:
             raise ConfigError(f"{where} goes back to update {row['update']}: it is damaged.")
@@ -171,18 +175,18 @@ def _read_logs(run: Path, seeds: Sequence[int]) -> tuple[RunLog, ...]:
 
 
 def _check_episode(row: Row, where: str) -> None:
-    """Refuses an episode that lacks something, or whose lists have another length."""
+    """Checks that an episode has all its values and that its lists have the right length."""
     report_rows.check(row, _COUNTS, report_rows.WHOLE, where)
     report_rows.check(row, ("stage",), report_rows.NAME, where)
     for key, kind in _BY_ROBOT.items():
         found: Any = row.get(key)
         fits = isinstance(found, list) and len(found) == row["robots"] > 0
         if not fits or not all(map(kind.fits, found)):
-            raise ConfigError(f"{where} has {key} that is no list of {row['robots']} values.")
+            raise ConfigError(f"{where} has {key}, which is not a list of {row['robots']} values.")
 
 
 def _log(rows: list[Row]) -> RunLog:
-    """Lays the episodes of a seed out, by the arena steps at which they ended."""
+    """Arranges the episodes of a seed in arrays, sorted by the arena steps when they ended."""
     rows = sorted(rows, key=lambda row: row["arena_steps"])
     robots = np.array([row["robots"] for row in rows])
     present = np.arange(robots.max()) < robots[:, None]
@@ -203,7 +207,7 @@ def _log(rows: list[Row]) -> RunLog:
 def _read_judged(
     out: Path, arms: Sequence[str], seeds: Sequence[int]
 ) -> dict[tuple[str, str], dict[str, np.ndarray]]:
-    """Reads what the final policies of finished arms came to."""
+    """Reads the results of the final policies of finished arms."""
     path = out / EVALUATION
     if not path.exists():
         raise ConfigError(f"{out} has no {EVALUATION}: its policies are not judged yet.")
@@ -226,7 +230,7 @@ def _read_judged(
 
 
 def _check_judged(row: Any, where: str) -> None:
-    """Refuses a row of the evaluation that lacks something."""
+    """Checks that a row of the evaluation has all its values."""
     if not report_rows.MAP.fits(row):
         raise ConfigError(f"{where} holds no keys and values: it is damaged.")
     report_rows.check(row, ("seed", "episodes"), report_rows.WHOLE, where)

@@ -326,9 +326,9 @@ def test_the_command_reads_files_and_draws(
     assert drawn.read_bytes()[:4] == b"\x89PNG"
     path.write_text('{"benchmark": "other"}\n')
     other = refusal(curriculum_table.main, [str(path)])
-    assert other == f"{path} in line 1 is none of the lines of benchmarks.curriculum."
+    assert other == f"{path} in line 1 is not a line of benchmarks.curriculum."
     assert "cannot be read" in refusal(curriculum_table.main, [str(tmp_path / "none.jsonl")])
-    assert "there is no file" in refusal(curriculum_table.main, [])
+    assert "no file is given" in refusal(curriculum_table.main, [])
     assert "measure is 'time'" in refusal(curriculum_table.main, [str(path), "measure=time"])
 
 

@@ -61,4 +61,4 @@ def test_lines_without_sums_are_refused(tmp_path: Path) -> None:
     lines = tmp_path / "lines.jsonl"
     lines.write_text(f"{json.dumps(LINE)}\n")
     said = refusal(devices_page.main, [f"lines={lines}", f"docs={tmp_path}"])
-    assert said.startswith("lines need some of devices_speed and all_reduce's of 65536 bytes")
+    assert said.startswith("lines must have results of devices_speed and of all_reduce with 65536 ")

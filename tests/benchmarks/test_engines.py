@@ -45,5 +45,5 @@ def test_engines_are_compared_level_by_level() -> None:
 
 
 def test_a_comparison_of_policies_is_not_one_of_engines() -> None:
-    with pytest.raises(ConfigError, match="the engines are compared"):
+    with pytest.raises(ConfigError, match="only the engines are compared"):
         engines.main(["compare=a.npz,b.npz"])

@@ -41,8 +41,8 @@ def test_brax_is_given_playgrounds_numbers(tiny_config: TrainConfig) -> None:
     [
         (
             ["trainer=brax", "settings=playground", "arenas=40"],
-            "arenas is 40: settings=playground takes a number of robots, 200 of which there are, "
-            "that 32 divides.",
+            "arenas is 40, which makes 200 robots: settings=playground needs a multiple of 32 "
+            "robots.",
         ),
         # 32 updates of 8 control steps are 12 of 20.
         (
@@ -53,15 +53,15 @@ def test_brax_is_given_playgrounds_numbers(tiny_config: TrainConfig) -> None:
                 "algo.rollout_length=8",
                 "budget=8192",
             ],
-            "points is 30, but the budget is 12 updates: give at most as many.",
+            "points is 30, but the budget is 12 updates: give at most 12.",
         ),
         (
             ["arenas=40", "budget=12800"],
-            "points is 30, but the budget is 10 updates: give at most as many.",
+            "points is 30, but the budget is 10 updates: give at most 10.",
         ),
         (
             ["stage=s1"],
-            "sim.max_robots is 5, but stage s1 has 2 robots, and Brax has no place for "
+            "sim.max_robots is 5, but stage s1 has 2 robots, and Brax does not support "
             "absent ones: give sim.max_robots=2.",
         ),
     ],

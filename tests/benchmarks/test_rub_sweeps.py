@@ -140,10 +140,10 @@ def test_sweeps_of_a_warp_are_those_of_its_slowest_arena() -> None:
 @pytest.mark.parametrize(
     ("word", "said"),
     [
-        ("designs=magic", "designs has 'magic': give of plain"),
+        ("designs=magic", "designs has 'magic': give some of plain"),
         ("arenas=104", "arenas is 104: give a multiple of 32"),
-        ("robot.hull_friction=0", "discs that rub"),
-        ("sim.solver=mjx", "discs that rub"),
+        ("robot.hull_friction=0", "discs with friction"),
+        ("sim.solver=mjx", "discs with friction"),
     ],
 )
 def test_what_cannot_be_measured_is_refused(word: str, said: str) -> None:

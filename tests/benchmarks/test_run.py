@@ -169,7 +169,7 @@ def test_a_line_that_was_cut_off_is_left_out(tmp_path: Path) -> None:
     path.write_text('{"a": 1}\n{"a"')
     assert run.read(path) == [{"a": 1}]
     path.write_text('{"a": 1}\n{"a"\n')
-    assert refusal(run.read, path) == f"{path} in line 2 is no JSON: take it out."
+    assert refusal(run.read, path) == f"{path} in line 2 is not JSON: remove it."
 
 
 # --- peers

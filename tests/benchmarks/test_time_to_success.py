@@ -53,7 +53,7 @@ def test_an_unfinished_last_line_is_skipped(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "content", "what"),
     [
-        ("metrics.jsonl", "{\n", " in line 1 is damaged: go on with the run, or take it out."),
+        ("metrics.jsonl", "{\n", " in line 1 is damaged: resume the run, or remove the line."),
         (
             "metrics.jsonl",
             json.dumps(row(0, broken_arenas=None)) + "\n",
@@ -62,7 +62,7 @@ def test_an_unfinished_last_line_is_skipped(tmp_path: Path) -> None:
         (
             "metrics.jsonl",
             json.dumps(row(0, broken_arenas=0, success_by_stage=[0.5])) + "\n",
-            " in line 1 has success_by_stage that is no list of 2 numbers, one a stage.",
+            " in line 1 has success_by_stage, which is not a list of 2 numbers, one per stage.",
         ),
         ("summary.json", "{}", " has no seeds: it is damaged."),
         ("summary.json", "[]", " holds no keys and values: it is damaged."),

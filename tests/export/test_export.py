@@ -137,11 +137,11 @@ def test_export_refuses(
         (given, "format=c", f"out={tmp_path / 'file'}"): "file, a file: give a folder.",
         (given, "format=c", f"out={tmp_path / 'file' / 'c'}"): "which cannot be written: Not a d",
         (given, f"out={tmp_path / 'file' / 'a.npz'}"): "which cannot be written: ",
-        (given, "format=c", "out=."): "out is ., which others use too: give a name of its own.",
-        (given, "format=webots", "out=a/.."): "out is a/.., which others use too: give a name ",
+        (given, "format=c", "out=."): "out is ., which has no name of its own: give another name.",
+        (given, "format=webots", "out=a/.."): "out is a/.., which has no name of its own: give ",
         **{
             (given, "format=webots", f"out={tmp_path / name}"): (
-                f"{name}, whose name is also the controller's, and that of a module that it imports"
+                f"{name}, whose name is also the controller's, but it imports a module of that name"
             )
             for name in ("policy", "controller", "numpy", "json", "random", "zipfile")
         },
@@ -203,7 +203,7 @@ def test_a_folder_is_replaced_only_as_it_was_exported(tmp_path: Path) -> None:
         == {"a": b"3"}  # fmt: skip
     assert json.loads((out / "export.json").read_text()) == {"a": hashlib.sha256(b"3").hexdigest()}
     (out / "a").write_bytes(b"changed by hand")
-    with pytest.raises(ConfigError, match=r"out, where a is not as an export left it: "):
+    with pytest.raises(ConfigError, match=r"out, where a is not as an export wrote it: "):
         export_folder.write_folder(out, {"a": b"4"})
     assert (out / "a").read_bytes() == b"changed by hand"
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
@@ -217,7 +217,7 @@ def test_a_folder_of_somebody_elses_is_left_alone(
     name: str, content: bytes, tmp_path: Path
 ) -> None:
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(ConfigError, match=rf", where {re.escape(name)} is not as an export left"):
+    with pytest.raises(ConfigError, match=rf", where {re.escape(name)} is not as an export wrote"):
         export_folder.write_folder(tmp_path, {"a": b"1"})
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {name: content}
 
@@ -228,7 +228,7 @@ def test_a_link_in_an_export_is_not_followed(tmp_path: Path) -> None:
     precious.write_bytes(b"1")
     (out / "a").unlink()
     (out / "a").symlink_to(precious)
-    with pytest.raises(ConfigError, match=r", where a is not as an export left it"):
+    with pytest.raises(ConfigError, match=r", where a is not as an export wrote it"):
         export_folder.write_folder(out, {"a": b"2"})
 
 

@@ -260,7 +260,7 @@ def test_a_robot_that_holds_drives_on_at_its_target(tmp_path: Path) -> None:
     done = _simulate(folder, steps, "action=mean")
     assert (done.returncode, done.stderr) == (0, "")
     assert (np.abs(_told(folder, len(steps))).max(axis=1) > 0).all()
-    assert "A robot drives on at its target" in (folder / "README.md").read_text()
+    assert "A robot keeps driving at its target" in (folder / "README.md").read_text()
 
 
 @pytest.mark.parametrize("learners", [1, 3])

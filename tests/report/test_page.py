@@ -61,7 +61,7 @@ def test_the_summary_says_where_the_run_stands(tmp_path: Path) -> None:
     assert page.fact("seeds") == "0 to 2"
     # 20 updates of 64 steps in all; 30 s an update.
     assert page.fact("trained") == (
-        "4 of 20 updates, 256 arena control steps of a seed, 8 arenas, 2 min 00 s"
+        "4 of 20 updates, 256 arena control steps per seed, 8 arenas, 2 min 00 s"
     )
     # Three values or fewer are not trimmed: the mean of 0.5 and 0.625 is 0.5625.
     assert page.fact("last stage") == (
@@ -70,7 +70,7 @@ def test_the_summary_says_where_the_run_stands(tmp_path: Path) -> None:
     # The first stage has 0.91 on average.
     assert page.fact("all stages") == "1 of 2 at 90.0 % or more; lowest trio with 56.2 %"
     assert page.fact("decisions") == "2 by budget, 1 by threshold"
-    assert page.fact("computed by") == "not written down before the end of the run"
+    assert page.fact("computed by") == "not recorded before the end of the run"
     assert "threshold=0.8" in page.fact("curriculum")
     assert page.fact("made by") == "make it"
 

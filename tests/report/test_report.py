@@ -60,7 +60,7 @@ def test_a_report_of_a_run_that_was_killed_leaves_its_unfinished_line_out(
     ("words", "what"),
     [
         (["run=gone"], "gone is no run directory: it has no config.json."),
-        (["run=cut"], "cut/metrics.jsonl in line 1 is damaged: go on with the run, or take it"),
+        (["run=cut"], "cut/metrics.jsonl in line 1 is damaged: resume the run, or remove"),
         (["run=text"], "text/metrics.jsonl in line 1 has no number as train_s: it is damaged."),
         (["run=empty"], "empty/metrics.jsonl has no update of every seed: train it first."),
         (["run=good", "out=file"], "out is file, which cannot be written: File exists."),
@@ -70,10 +70,10 @@ def test_a_report_of_a_run_that_was_killed_leaves_its_unfinished_line_out(
             "run and runs are given: give run=DIR, or runs=DIR,DIR,... for",
         ),
         (["run=good", "step=1"], "step is not a key: give one of run, runs, out, send."),
-        (["runs=good,gone"], "runs is 'good,gone', and 'gone' is and holds no run."),
-        (["runs=g*,none*"], "runs is 'g*,none*', and 'none*' is and holds no run."),
+        (["runs=good,gone"], "runs is 'good,gone', but 'gone' neither is nor holds a run."),
+        (["runs=g*,none*"], "runs is 'g*,none*', but 'none*' neither is nor holds a run."),
         (["runs=good,good"], "runs is 'good,good', which names good twice: give it once."),
-        (["runs=good,,cut"], "runs is 'good,,cut', and '' is and holds no run."),
+        (["runs=good,,cut"], "runs is 'good,,cut', but '' neither is nor holds a run."),
         (["runs=good,same"], "seed 0 is in good and in same, of the same settings: give one of"),
         (["runs=good,empty"], "empty/metrics.jsonl has no update of every seed: train it first."),
         (["runs=good", "out=file"], "out is file, which cannot be written: File exists."),
@@ -128,6 +128,6 @@ def test_figures_and_pages_are_sent_to_the_loggers_of_the_run(tmp_path: Path) ->
 def test_figures_of_a_run_without_loggers_are_not_sent(tmp_path: Path) -> None:
     trained = replace(CONFIG, run=RunConfig(tensorboard=False))
     run = write(tmp_path / "run", [row(0)], trained=trained)
-    with pytest.raises(ConfigError, match=r"^send is true, but the run logs to nothing"):
+    with pytest.raises(ConfigError, match=r"^send is true, but the run has no logger for figures"):
         report.main([f"run={run}", "send=true"])
     assert not (run / "report").exists()

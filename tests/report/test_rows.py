@@ -117,14 +117,14 @@ def test_a_file_that_is_not_there_is_named(file: str, what: str, tmp_path: Path)
     [
         ("metrics.jsonl", "", " has no update of every seed: train it first."),
         ("metrics.jsonl", '{"seed": 0, "upd', " has no update of every seed: train it first."),
-        ("metrics.jsonl", '{"seed": 0, "upd\n{}\n', " in line 1 is damaged: go on with the run"),
-        ("metrics.jsonl", "[]\n", " in line 1 is damaged: go on with the run, or take it out."),
-        ("metrics.jsonl", "[" * 10**5 + "\n", " in line 1 is damaged: go on with the run"),
-        ("metrics.jsonl", "9" * 5000 + "\n", " in line 1 is damaged: go on with the run"),
-        ("metrics.jsonl", "\n", " in line 1 is damaged: go on with the run, or take it out."),
+        ("metrics.jsonl", '{"seed": 0, "upd\n{}\n', " in line 1 is damaged: resume the run"),
+        ("metrics.jsonl", "[]\n", " in line 1 is damaged: resume the run, or remove the line."),
+        ("metrics.jsonl", "[" * 10**5 + "\n", " in line 1 is damaged: resume the run"),
+        ("metrics.jsonl", "9" * 5000 + "\n", " in line 1 is damaged: resume the run"),
+        ("metrics.jsonl", "\n", " in line 1 is damaged: resume the run, or remove the line."),
         ("metrics.jsonl", "\xff\xfe\n", " in line 1 is damaged: "),
         ("metrics.jsonl", '{"seed": 0, "update": 0}\n', " in line 1 has no arena_steps: the run"),
-        ("curriculum.jsonl", '{"seed": 0, "upd\n', " in line 1 is damaged: go on with the run"),
+        ("curriculum.jsonl", '{"seed": 0, "upd\n', " in line 1 is damaged: resume the run"),
         ("curriculum.jsonl", '{"seed": 0}\n', " in line 1 has no whole number as update: it is"),
         ("config.json", "{", " cannot be read: "),
         ("config.json", "[]", " holds no keys and values: it is damaged."),
@@ -148,12 +148,12 @@ def test_a_damaged_file_is_named_with_its_line(
         ({"update": True}, " has no whole number as update: it is damaged."),
         ({"train_s": "30.0"}, " has no number as train_s: it is damaged."),
         ({"train_s": NAN}, " has no number as train_s: it is damaged."),
-        ({"mix": ["8", "0"]}, " has mix that is no list of 2 numbers, one a stage."),
-        ({"mix": [8]}, " has mix that is no list of 2 numbers, one a stage."),
-        ({"weights": "x"}, " has weights that is no list of 2 numbers, one a stage."),
+        ({"mix": ["8", "0"]}, " has mix, which is not a list of 2 numbers, one per stage."),
+        ({"mix": [8]}, " has mix, which is not a list of 2 numbers, one per stage."),
+        ({"weights": "x"}, " has weights, which is not a list of 2 numbers, one per stage."),
         (
             {"success_by_stage": [[1], [2, 3]]},
-            " has success_by_stage that is no list of 2 numbers, one a stage.",
+            " has success_by_stage, which is not a list of 2 numbers, one per stage.",
         ),
     ],
 )
@@ -197,4 +197,4 @@ def test_a_config_that_is_refused_is_named(tmp_path: Path) -> None:
     write(tmp_path, [row(0)])
     (tmp_path / "config.json").write_text('{"arenas": 0}')
     sentence = refusal(report_rows.read, tmp_path)
-    assert sentence.startswith(f"{tmp_path / 'config.json'} does not fit: stage is missing")
+    assert sentence.startswith(f"{tmp_path / 'config.json'} is not valid: stage is missing")

@@ -69,7 +69,7 @@ def test_a_directory_of_another_config_is_refused(tmp_path: Path) -> None:
     other = to_dict(replace(made, budget=12_000))
     (run / "config.json").write_text(json.dumps(other))
     assert refusal(reproduce_arms.run, made, Stop()) == (
-        f"{run} holds a run of another config than this version makes of the reproduction's: "
+        f"{run} holds a run whose config differs from the one that this version makes: "
         "give another out."
     )
 

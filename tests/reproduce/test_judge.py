@@ -86,5 +86,5 @@ def test_rows_that_were_written_are_read(tmp_path: Path) -> None:
 def test_rows_that_are_damaged_are_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "evaluation.json"
     path.write_text(text)
-    with pytest.raises(ConfigError, match=r"cannot be read \(.*\): remove it to judge anew\.$"):
+    with pytest.raises(ConfigError, match=r"cannot be read \(.*\): remove it to judge again\.$"):
         reproduce_judge.read(tmp_path)

@@ -90,7 +90,7 @@ def test_another_directory_is_not_written_over(tmp_path: Path) -> None:
 
 def test_what_is_no_reproduction_is_not_gone_on_with(tmp_path: Path) -> None:
     assert refusal(reproduce.main, [f"resume={tmp_path}"]) == (
-        f"resume is {tmp_path}, which is no reproduction: it has no reproduce.json."
+        f"resume is {tmp_path}, which is not a reproduction: it has no reproduce.json."
     )
     stored = {"settings": {"seeds": 3}}
     (tmp_path / "reproduce.json").write_text(json.dumps(stored))
@@ -126,7 +126,7 @@ def test_a_device_that_is_not_there_is_refused(
          "modern_curriculum, modern_baseline."),
         (["arms=[baseline,baseline]"], "arms names baseline more than once: give each once."),
         (["arms=[baseline_expanded]"],
-         "arms names baseline_expanded, but not baseline, which it goes on with."),
+         "arms names baseline_expanded, but not baseline, which it continues."),
         (["minutes=0"], "minutes is 0: give more than 0."),
         (["device=tpu"], "device is 'tpu': give auto, cpu or gpu."),
         (["buget=1"], "buget is not a key: did you mean budget?"),

@@ -101,12 +101,12 @@ def _drop(out: Path, text: str) -> None:
 
 
 REFUSED = {
-    "no facts": (lambda out: (out / "reproduce.json").unlink(), "is no reproduction"),
+    "no facts": (lambda out: (out / "reproduce.json").unlink(), "is not a reproduction"),
     "format": (lambda out: _change(out, "reproduce.json", format=1), "has format 1"),
     "no arm": (lambda out: _change(out, "reproduce.json", seconds={}), "no finished arm"),
     "two seeds": (
         lambda out: _change(out, "reproduce.json", seeds=[0, 1]),
-        "has 2 seeds: an interval takes 3 or more",
+        "has 2 seeds: an interval needs 3 or more",
     ),
     "seeds": (lambda out: _change(out, "reproduce.json", seeds=["0"] * 3), "as seeds"),
     "budget": (lambda out: _change(out, "reproduce.json", budget=None), "as budget"),
@@ -118,7 +118,7 @@ REFUSED = {
     "a seed": (lambda out: _drop(out, '"seed": 2'), "no episode of seed 2"),
     "another seed": (lambda out: _append(out, seed=3), "has seed 3"),
     "an update": (lambda out: _append(out, seed=0, update=1), "goes back to update 1"),
-    "lengths": (lambda out: _append(out, sensed=[1]), "has sensed that is no list of 2"),
+    "lengths": (lambda out: _append(out, sensed=[1]), "has sensed, which is not a list of 2"),
     "no robots": (
         lambda out: _append(
             out, robots=0, reached=[], reward=[], robot_steps=[], sensed=[], contacts=[]

@@ -12,8 +12,8 @@ static const float SCALE[POLICY_OBSERVATIONS] = {
 $scale
 };
 
-/* Mean and deviation of the observation, the layers, and the deviation of the action: of each
- * learner in turn. A kernel has a row of inputs for each output. */
+/* For each learner: mean and deviation of the observation, the layers, and the deviation of the
+ * action. A kernel has a row of inputs for each output. */
 $arrays
 
 static float clip(float x, float limit)

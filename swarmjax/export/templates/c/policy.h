@@ -1,6 +1,6 @@
-/* A robot's policy: from what it observes to how it moves. C99, float only, no heap.
+/* A robot's policy: from its observation to its motion. C99, float only, no heap.
  *
- * Written by swarmjax.export; the same numbers as policy.npz of digest
+ * Written by swarmjax.export; has the same numbers as policy.npz with digest
  * $digest.
  * $kind
  *
@@ -25,7 +25,7 @@ $action
 #define POLICY_DIGEST "$digest"
 #define POLICY_CONTROL_STEP $control_step_f /* s */
 #define POLICY_TARGET_RADIUS $target_radius_f /* m, distance to the target that counts as arrival */
-#define POLICY_HOLDS $holds /* 1: it drives on within that distance; 0: the robot is to stop there for good */
+#define POLICY_HOLDS $holds /* 1: it keeps driving within that distance; 0: stop the robot there for good */
 
 $memory_type/* Scales quantities, in the units above, to an observation. */
 void policy_observe(const float quantity[POLICY_OBSERVATIONS],
@@ -36,9 +36,9 @@ void policy_observe(const float quantity[POLICY_OBSERVATIONS],
 void policy_action(unsigned learner, const float observation[POLICY_OBSERVATIONS],
                    ${memory_parameter}float action[POLICY_ACTIONS]);
 
-/* Draws an action from the policy, as robots do when it is judged, around its most likely one:
- * `normal` are standard normal numbers, independent of each other and of those before. Robots that
- * block each other, each doing the likeliest thing, come free by it. */
+/* Draws an action from the policy around the most likely one, as in evaluation. `normal` are
+ * standard normal numbers, independent of each other and of earlier ones. Random actions free
+ * robots that would block each other with their most likely actions. */
 void policy_sample(unsigned learner, const float normal[POLICY_ACTIONS],
                    float action[POLICY_ACTIONS]);
 

@@ -1,5 +1,5 @@
-/* Holds policy.c to what NumPy computes: 0 if all actions agree, else 1 + the number of the first
- * that does not. No input or output, so that it runs on the robot too. */
+/* Compares policy.c with the results of NumPy. Returns 0 if all actions agree, else 1 + the number
+ * of the first one that does not. It has no input or output, so it also runs on the robot. */
 #include "policy.h"
 
 #define CASES $cases
