@@ -44,7 +44,7 @@ def train_brax(given: AdapterTrainConfig) -> tuple[float, int, float]:
     """Trains with Brax's PPO.
 
     Returns:
-        The share of targets reached, robot steps, and seconds.
+      The share of targets reached, robot steps, and seconds.
     """
     ppo = peers.find("brax.training.agents.ppo.train", "the extra brax")
     adapter = peers.find("swarmjax.adapters.brax_env", "the extra brax")

@@ -50,7 +50,7 @@ class Clock(Display):
     """Records when the calls of a run end, and shows nothing.
 
     Attributes:
-        ends: For each call, seconds of `time.perf_counter` and the updates done by then.
+      ends: For each call, seconds of `time.perf_counter` and the updates done by then.
     """
 
     def __init__(self) -> None:

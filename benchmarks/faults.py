@@ -39,8 +39,8 @@ class Campaign(NamedTuple):
     """Faults of one kind.
 
     Attributes:
-        trial: tries one fault, from a seed and an empty folder; returns the entries of its line.
-        trials: the default number of trials.
+      trial: tries one fault, from a seed and an empty folder; returns the entries of its line.
+      trials: the default number of trials.
     """
 
     trial: Trial
@@ -82,10 +82,10 @@ def parse(words: Sequence[str]) -> FaultsConfig:
     """Makes the settings from `key=value` words.
 
     Args:
-        words: words of the command line.
+      words: words of the command line.
 
     Raises:
-        ConfigError: a word is invalid.
+      ConfigError: a word is invalid.
     """
     return key_value.load(FaultsConfig, words)
 
@@ -94,10 +94,10 @@ def read(out: Path) -> list[dict[str, Any]]:
     """Reads the lines of a file, and skips an incomplete last line.
 
     Args:
-        out: the file; it need not exist.
+      out: the file; it need not exist.
 
     Raises:
-        ConfigError: a line is no JSON object.
+      ConfigError: a line is no JSON object.
     """
     if not out.exists():
         return []
@@ -116,7 +116,7 @@ def run(settings: FaultsConfig) -> Iterator[dict[str, Any]]:
     """Tries the faults that the file lacks, and yields each line once it is written.
 
     Args:
-        settings: the campaign's settings.
+      settings: the campaign's settings.
     """
     out, campaign = Path(settings.out), CAMPAIGNS[settings.campaign]
     asked = (settings.campaign, settings.seed)
@@ -151,10 +151,10 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Summarises lines: for each campaign the outcomes, and the maximum of each number.
 
     Args:
-        rows: the lines of the file.
+      rows: the lines of the file.
 
     Returns:
-        A table in Markdown.
+      A table in Markdown.
     """
     lines = [
         "| campaign | commits | outcome | trials | the most of each number |",

@@ -35,11 +35,11 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
     """Disturbs a run, then lets it end.
 
     Args:
-        seed: Seed of the trial; its number chooses the fault.
-        folder: Empty folder of the trial.
+      seed: Seed of the trial; its number chooses the fault.
+      folder: Empty folder of the trial.
 
     Returns:
-        The kind of fault, how the run ended, and the outcome.
+      The kind of fault, how the run ended, and the outcome.
     """
     undisturbed()  # before the disturbed run starts, since it takes as long as a run
     number, random = seed % 1_000_000, np.random.default_rng(seed)
@@ -65,9 +65,9 @@ def _hindered(words: list[str], allowed: set[int], **given: Any) -> dict[str, An
     """Runs a command that may fail, but only with one sentence.
 
     Args:
-        words: The command.
-        allowed: Allowed exit codes.
-        given: Arguments for `subprocess.run`.
+      words: The command.
+      allowed: Allowed exit codes.
+      given: Arguments for `subprocess.run`.
     """
     began = time.perf_counter()
     try:
@@ -100,10 +100,10 @@ def _on_a_disk(folder: Path, size: int, options: str, run: Path | None = None) -
     """Trains on a separate disk, and copies the run back to `folder`/run.
 
     Args:
-        folder: Folder of the trial.
-        size: Size of the disk, bytes.
-        options: Options of the mount once `run` has been copied to the disk.
-        run: A run that the disk already holds.
+      folder: Folder of the trial.
+      size: Size of the disk, bytes.
+      options: Options of the mount once `run` has been copied to the disk.
+      run: A run that the disk already holds.
     """
     if shutil.which("unshare") is None:
         return {"missing": "unshare"}

@@ -357,11 +357,11 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
     """Lets a command read mutated words and files.
 
     Args:
-        seed: seed of the mutations.
-        folder: folder for the files.
+      seed: seed of the mutations.
+      folder: folder for the files.
 
     Returns:
-        The entries of the line.
+      The entries of the line.
     """
     draw = random.Random(seed)
     name = draw.choice(sorted(LOADERS))

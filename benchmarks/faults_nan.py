@@ -41,8 +41,8 @@ class Stand(NamedTuple):
     """A program, compiled once for all trials of a process.
 
     Attributes:
-        train: (state, n) -> (state, metrics) of n updates; it does not change the given state.
-        start: seed -> the first state.
+      train: (state, n) -> (state, metrics) of n updates; it does not change the given state.
+      start: seed -> the first state.
     """
 
     train: Callable[[TrainState, int], tuple[TrainState, dict[str, np.ndarray]]]

@@ -36,8 +36,8 @@ def write_sound(path: Path, draw: random.Random) -> None:
     """Writes a policy, shared or independent, small or of a megabyte.
 
     Args:
-        path: path of the file.
-        draw: random source for its size and numbers.
+      path: path of the file.
+      draw: random source for its size and numbers.
     """
     learners, hidden = draw.choice((1, 1, 5)), draw.choice(_SIZES)
     numbers = np.random.default_rng(draw.randrange(2**32))
@@ -58,7 +58,7 @@ def meta(learners: int) -> dict[str, Any]:
     """Returns the metadata of a policy.
 
     Args:
-        learners: number of learners; 1 for a shared policy.
+      learners: number of learners; 1 for a shared policy.
     """
     return {
         "policy": "shared" if learners == 1 else "independent",
@@ -145,8 +145,8 @@ def npy(dtype: str, shape: str) -> bytes:
     """Writes the header of an array without its data.
 
     Args:
-        dtype: type of the numbers, as NumPy writes it.
-        shape: shape, as NumPy writes it, without brackets.
+      dtype: type of the numbers, as NumPy writes it.
+      shape: shape, as NumPy writes it, without brackets.
     """
     head = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': ({shape}), }}".ljust(117) + "\n"
     return b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head.encode()
@@ -279,7 +279,7 @@ def is_sentence(text: str) -> bool:
     """Tells whether a refusal is one line that a terminal can show.
 
     Args:
-        text: text of the refusal.
+      text: text of the refusal.
     """
     return "\n" not in text and text.isprintable() and text[-1:] in (".", "?") and len(text) < 900
 
@@ -318,11 +318,11 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
     """Damages a policy file in one way and has both readers read it.
 
     Args:
-        seed: seed of the damage.
-        folder: folder for the file.
+      seed: seed of the damage.
+      folder: folder for the file.
 
     Returns:
-        The entries of the line; the outcome is `accepted` if either reader accepted the file.
+      The entries of the line; the outcome is `accepted` if either reader accepted the file.
     """
     draw, path = random.Random(seed), folder / "policy.npz"
     write_sound(path, draw)

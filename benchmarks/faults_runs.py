@@ -59,9 +59,9 @@ class Undisturbed(NamedTuple):
     """An undisturbed run.
 
     Attributes:
-        digest: Digest of the last state.
-        begins_s: Seconds from the start until the run logs its first update.
-        ends_s: Seconds from the start until the process ends.
+      digest: Digest of the last state.
+      begins_s: Seconds from the start until the run logs its first update.
+      ends_s: Seconds from the start until the process ends.
     """
 
     digest: str

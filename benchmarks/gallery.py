@@ -71,8 +71,8 @@ class Moment(NamedTuple):
     """The robots' positions at one moment.
 
     Attributes:
-        pose: [R, 3] x (m), y (m), yaw (rad).
-        arrived: [R] whether each has arrived.
+      pose: [R, 3] x (m), y (m), yaw (rad).
+      arrived: [R] whether each has arrived.
     """
 
     pose: np.ndarray
@@ -83,12 +83,12 @@ def drive(settings: GalleryConfig, cell: Cell, who: str | None) -> tuple[Level, 
     """Runs one level.
 
     Args:
-        settings: Settings of the gallery.
-        cell: Cell of the level.
-        who: Baseline that drives; None for the policy.
+      settings: Settings of the gallery.
+      cell: Cell of the level.
+      who: Baseline that drives; None for the policy.
 
     Returns:
-        The level and its moments, from the start.
+      The level and its moments, from the start.
     """
     config, trained = _evaluation(settings, who)
     mine = trials.specialise(config, cell, config.policy)
@@ -129,11 +129,11 @@ def picture(level: Level, frame: Moment) -> Image.Image:
     """Draws one moment, `SIZE` pixels wide and high.
 
     Args:
-        level: The level with everything that does not move.
-        frame: The robots' positions.
+      level: The level with everything that does not move.
+      frame: The robots' positions.
 
     Returns:
-        The picture.
+      The picture.
     """
     edge = SIZE * _FINE
     scale = edge / (float(level.side) + 2 * _MARGIN)

@@ -51,15 +51,15 @@ def sample(pid: int, run: Path) -> dict[str, float]:
     """Samples a process and the progress of its run.
 
     Args:
-        pid: Id of the process.
-        run: The run directory.
+      pid: Id of the process.
+      run: The run directory.
 
     Returns:
-        Resident memory, memory of the GPU if there is one, open descriptors, threads, processor
-        seconds since the start, and arena control steps of the run.
+      Resident memory, memory of the GPU if there is one, open descriptors, threads, processor
+      seconds since the start, and arena control steps of the run.
 
     Raises:
-        OSError: If the process has ended.
+      OSError: If the process has ended.
     """
     place = Path("/proc") / str(pid)
     status = (place / "stat").read_text().rpartition(")")[2].split()
@@ -97,8 +97,8 @@ def leg(settings: SoakConfig, words: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Trains for a while, writes samples to the file and yields them.
 
     Args:
-        settings: Settings of the soak.
-        words: Words for `swarmjax.train`.
+      settings: Settings of the soak.
+      words: Words for `swarmjax.train`.
     """
     folder = Path(settings.dir)
     folder.mkdir(parents=True, exist_ok=True)
@@ -132,11 +132,11 @@ def sum_up(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
     """Finds the median and the slope of each quantity of one leg.
 
     Args:
-        rows: Samples of the leg, in order.
+      rows: Samples of the leg, in order.
 
     Returns:
-        `median`, `slope`, `slope_low` and `slope_high` of each quantity. Slopes are in percent of
-        the median per hour. A leg that made no progress in most samples has no speeds.
+      `median`, `slope`, `slope_low` and `slope_high` of each quantity. Slopes are in percent of
+      the median per hour. A leg that made no progress in most samples has no speeds.
     """
     rows = rows[int(WARM_UP * len(rows)) :]
     hours = np.array([row["seconds"] for row in rows]) / 3600.0

@@ -42,9 +42,9 @@ def draw(chosen: Sequence[CellConfig], number: int, out: Path) -> None:
     """Draws a level of each cell.
 
     Args:
-        chosen: The cells.
-        number: Number of the level.
-        out: The file.
+      chosen: The cells.
+      number: Number of the level.
+      out: The file.
     """
     count = math.ceil(len(chosen) / COLUMNS)
     figure, axes = plt.subplots(count, COLUMNS, figsize=(2.2 * COLUMNS, 2.4 * count), squeeze=False)

@@ -194,9 +194,7 @@ def load_judge(study: Study, trained: TrainConfig) -> Judge:
 
 def results(study: Study, words: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Trains and judges all arms; yields a line each."""
-    arms: list[tuple[Arm, TrainConfig]] = [
-        (arm, load_arm(study, arm, words)) for arm in study.arms
-    ]
+    arms: list[tuple[Arm, TrainConfig]] = [(arm, load_arm(study, arm, words)) for arm in study.arms]
     for arm, trained in arms:
         at = points(study, trained)
         curves = curriculum.measure(trained, at, load_judge(study, trained))

@@ -89,7 +89,7 @@ def train(updates: int) -> tuple[float, int, float]:
     """Trains until at least TARGET of the last 200 robots reached their targets.
 
     Returns:
-        This share, robot steps, and seconds without the first step, which compiles.
+      This share, robot steps, and seconds without the first step, which compiles.
     """
     torch.manual_seed(0)
     torch.set_num_threads(1)  # for small networks more threads are slower, next to JAX's

@@ -36,10 +36,10 @@ class TrainResult(NamedTuple):
     """Result of a training run.
 
     Attributes:
-        policy: policy of the first seed.
-        policies: policies of all seeds.
-        metrics: one row per update and seed, as in `metrics.jsonl`.
-        run: the run directory.
+      policy: policy of the first seed.
+      policies: policies of all seeds.
+      metrics: one row per update and seed, as in `metrics.jsonl`.
+      run: the run directory.
     """
 
     policy: Policy
@@ -81,21 +81,21 @@ def make_env(
     `state.observation` [A, R, O] is the policy's input. Arenas start new episodes by themselves.
 
     Args:
-        stage: a name of `configs/stage/`, the path of a .yaml file, a `StageConfig`, or several of
-            these; arena i plays stage i modulo their number.
-        robot: `planar`, `wheeled` or another name of `configs/robot/`, or settings by name, as in
-            `{"hull_radius": 0.04}`.
-        task: settings by name, as in `{"step_limit": 300, "reward": {"contact": -0.1}}`.
-        realism: `ideal`, `webots`, `real`, or settings by name.
-        sim: settings by name, as in `{"solver": "mjx"}`.
-        arenas: number of arenas stepped together, A.
-        extensions: your own extension pieces: a file, a module, or a list of them.
+      stage: a name of `configs/stage/`, the path of a .yaml file, a `StageConfig`, or several of
+        these; arena i plays stage i modulo their number.
+      robot: `planar`, `wheeled` or another name of `configs/robot/`, or settings by name, as in
+        `{"hull_radius": 0.04}`.
+      task: settings by name, as in `{"step_limit": 300, "reward": {"contact": -0.1}}`.
+      realism: `ideal`, `webots`, `real`, or settings by name.
+      sim: settings by name, as in `{"solver": "mjx"}`.
+      arenas: number of arenas stepped together, A.
+      extensions: your own extension pieces: a file, a module, or a list of them.
 
     Returns:
-        The environment: `reset(key)`, `step(state, action)`, `observation_space`, `action_space`.
+      The environment: `reset(key)`, `step(state, action)`, `observation_space`, `action_space`.
 
     Raises:
-        SwarmjaxError: an argument is invalid.
+      SwarmjaxError: an argument is invalid.
     """
     from swarmjax import environment
     from swarmjax.run.settings import load_train
@@ -128,21 +128,21 @@ def train_policy(
         result = swarmjax.train_policy({"stage": "s3", "arenas": 64, "budget": 500_000})
 
     Args:
-        settings: keys of the command and their values, as `{"algo.discount": 0.995}` or
-            `["algo.discount=0.995"]`; `stage` may also be a `StageConfig` or a list of them.
-        on_update: called with each row of `metrics.jsonl`. If it returns True, the run saves and
-            stops, as it does on Ctrl-C.
-        log: a function that is also called with each row, but in its own thread, so the run does
-            not wait for it. If it raises, a warning is printed to standard error and the run
-            continues without it. Or a `Logger` of `swarmjax.run.loggers`, which also receives
-            speeds and is closed at the end. Or a list of these.
-        extensions: your own extension pieces: a file, a module, or a list of them.
+      settings: keys of the command and their values, as `{"algo.discount": 0.995}` or
+        `["algo.discount=0.995"]`; `stage` may also be a `StageConfig` or a list of them.
+      on_update: called with each row of `metrics.jsonl`. If it returns True, the run saves and
+        stops, as it does on Ctrl-C.
+      log: a function that is also called with each row, but in its own thread, so the run does
+        not wait for it. If it raises, a warning is printed to standard error and the run
+        continues without it. Or a `Logger` of `swarmjax.run.loggers`, which also receives
+        speeds and is closed at the end. Or a list of these.
+      extensions: your own extension pieces: a file, a module, or a list of them.
 
     Returns:
-        The policies, the metrics and the run directory.
+      The policies, the metrics and the run directory.
 
     Raises:
-        SwarmjaxError: a setting is invalid, or the run broke.
+      SwarmjaxError: a setting is invalid, or the run broke.
     """
     from swarmjax.run import quiet
     from swarmjax.run.settings import TrainConfig, load_run
@@ -178,19 +178,19 @@ def evaluate_policy(
     Robot, task and realism are those that the policy was trained with, on the wheeled body.
 
     Args:
-        policy: a `Policy`, the path of a policy file, or several from the same recipe.
-        suite: a name of `configs/suites/`, or a file, instead of a stage.
-        stage: a name, a path or a `StageConfig`; None: the last one it was trained on.
-        extensions: pieces that the policy needs: a file, a module, or a list of them.
-        workers: number of processes. Each additional process imports the calling script again,
-            which then needs `if __name__ == "__main__":`.
-        settings: further keys of the command, as `episodes=100`, `realism="real"`.
+      policy: a `Policy`, the path of a policy file, or several from the same recipe.
+      suite: a name of `configs/suites/`, or a file, instead of a stage.
+      stage: a name, a path or a `StageConfig`; None: the last one it was trained on.
+      extensions: pieces that the policy needs: a file, a module, or a list of them.
+      workers: number of processes. Each additional process imports the calling script again,
+        which then needs `if __name__ == "__main__":`.
+      settings: further keys of the command, as `episodes=100`, `realism="real"`.
 
     Returns:
-        The contents of `result.json` (docs/interface.md).
+      The contents of `result.json` (docs/interface.md).
 
     Raises:
-        SwarmjaxError: an argument is invalid, or does not fit the policy.
+      SwarmjaxError: an argument is invalid, or does not fit the policy.
     """
     from swarmjax.evaluate import evaluation, witness
     from swarmjax.evaluate.config import EvaluateConfig
@@ -216,11 +216,11 @@ def load_policy(path: str | Path, extensions: Any = None) -> Policy:
     """Reads and checks a policy file; `swarmjax.policy.act` runs the policy.
 
     Args:
-        path: of the file.
-        extensions: a file, module or list with the network that the policy needs, if any.
+      path: of the file.
+      extensions: a file, module or list with the network that the policy needs, if any.
 
     Raises:
-        SwarmjaxError: the file is missing, damaged or inconsistent.
+      SwarmjaxError: the file is missing, damaged or inconsistent.
     """
     return policy_file.read(path, extension.hand_over(extensions))
 

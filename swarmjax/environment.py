@@ -31,11 +31,11 @@ class Space(NamedTuple):
     """Description of one robot's observation or action.
 
     Attributes:
-        shape: shape of the array.
-        names: names of its entries.
-        units: units of its entries.
-        low: least value of each entry; None without a limit.
-        high: largest value of each entry; None without a limit.
+      shape: shape of the array.
+      names: names of its entries.
+      units: units of its entries.
+      low: least value of each entry; None without a limit.
+      high: largest value of each entry; None without a limit.
     """
 
     shape: tuple[int, ...]
@@ -50,11 +50,11 @@ class SwarmState:
     """The complete state: a JAX tree to carry through `jit`, `vmap` and `scan`.
 
     Attributes:
-        arenas: [A] the arenas; `arenas.observation` [A, R, O] is the policy's input, and
-            `arenas.level` the levels that the episodes started from.
-        waiting: [A] the episodes that begin next.
-        key: random key of future levels.
-        clock: [] control steps since `reset`, int32.
+      arenas: [A] the arenas; `arenas.observation` [A, R, O] is the policy's input, and
+        `arenas.level` the levels that the episodes started from.
+      waiting: [A] the episodes that begin next.
+      key: random key of future levels.
+      clock: [] control steps since `reset`, int32.
     """
 
     arenas: EnvState
@@ -78,9 +78,9 @@ class Swarm:
     """An environment of many arenas, created by `make_env`.
 
     Attributes:
-        config: settings of the environment.
-        world: the compiled arena.
-        stages: [S] the stages; arena i plays stage i modulo S.
+      config: settings of the environment.
+      world: the compiled arena.
+      stages: [S] the stages; arena i plays stage i modulo S.
     """
 
     config: ProgramConfig
@@ -122,10 +122,10 @@ class Swarm:
         """Starts an episode in every arena.
 
         Args:
-            key: random key, consumed.
+          key: random key, consumed.
 
         Returns:
-            The state; pass its `observation` to the policy.
+          The state; pass its `observation` to the policy.
         """
         key, first, second = jax.random.split(key, 3)
         every = jnp.arange(self.num_arenas)
@@ -145,12 +145,12 @@ class Swarm:
         episodes within 32 steps plays the same level again.
 
         Args:
-            state: before the step.
-            action: [A, R, U], clipped to -1..1, which spans the commands.
+          state: before the step.
+          action: [A, R, U], clipped to -1..1, which spans the commands.
 
         Returns:
-            The new state, and the outcome of the step: observation [A, R, O], reward, terminated,
-            truncated and valid [A, R], done and sound [A].
+          The new state, and the outcome of the step: observation [A, R, O], reward, terminated,
+          truncated and valid [A, R], done and sound [A].
         """
         unpack = partial(physics.unpack, self.world.physics)
         arenas = replace(state.arenas, sim=jax.vmap(unpack)(state.arenas.sim))
@@ -186,13 +186,13 @@ def load(config: ProgramConfig) -> Swarm:
     """Builds the environment that a config describes.
 
     Args:
-        config: provides stages, robot, task, realism, simulation, arenas and extensions.
+      config: provides stages, robot, task, realism, simulation, arenas and extensions.
 
     Returns:
-        The environment.
+      The environment.
 
     Raises:
-        ConfigError: a piece of an extension does not fit, or `task.env.load` raises it.
+      ConfigError: a piece of an extension does not fit, or `task.env.load` raises it.
     """
     world = programs.load_world(config)
     stages = task_stage.stack(config.stage, world.drawings)

@@ -160,12 +160,12 @@ def act(policy: Policy, observation: np.ndarray, normal: Any = 0.0) -> np.ndarra
     """Draws the action of each robot; without `normal` it is the most likely one.
 
     Args:
-        policy: Without memory or history, with one learner for all robots, or at least R.
-        observation: [..., R, O] as `meta["observation"]` says: (quantity - offset) / scale.
-        normal: [..., R, U] standard normal, drawn afresh at each control step.
+      policy: Without memory or history, with one learner for all robots, or at least R.
+      observation: [..., R, O] as `meta["observation"]` says: (quantity - offset) / scale.
+      normal: [..., R, U] standard normal, drawn afresh at each control step.
 
     Returns:
-        [..., R, U] float32. -1..1 spans the commands, but actions may lie beyond it.
+      [..., R, U] float32. -1..1 spans the commands, but actions may lie beyond it.
     """
     if policy.carried:
         raise PolicyError("the policy has a memory: call `begin` once an episode, then `step`.")
@@ -186,13 +186,13 @@ def step(
     """Draws actions as `act` does, and updates the memory.
 
     Args:
-        policy: With one learner for all robots, or at least R.
-        memory: [..., R, H] from `begin` or from the step before.
-        observation: As in `act`; of this control step alone, also with a history.
-        normal: As in `act`.
+      policy: With one learner for all robots, or at least R.
+      memory: [..., R, H] from `begin` or from the step before.
+      observation: As in `act`; of this control step alone, also with a history.
+      normal: As in `act`.
 
     Returns:
-        The memory after, and the action.
+      The memory after, and the action.
     """
     _check(policy, memory, observation)
     mine, limit = slice(observation.shape[-2]), policy.meta["observation"]["limit"]
@@ -257,8 +257,8 @@ def command(policy: Policy, action: np.ndarray) -> np.ndarray:
     """Scales actions [..., U], clipped to -1..1, to commands.
 
     Returns:
-        [..., U]: speed, 0..max_speed (m/s), and turn rate (rad/s, left positive). With messages,
-        these follow, within -1..1.
+      [..., U]: speed, 0..max_speed (m/s), and turn rate (rad/s, left positive). With messages,
+      these follow, within -1..1.
     """
     speed, turn, *said = np.moveaxis(np.clip(action, -1, 1), -1, 0)
     drive = [(speed + 1) * (0.5 * policy.max_speed), turn * policy.max_turn_rate]

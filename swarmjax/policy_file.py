@@ -86,16 +86,16 @@ def read(path: str | Path, extensions: str | None = None) -> Policy:
     """Reads a policy file and checks all of it.
 
     Args:
-        path: Path of the file.
-        extensions: Value of the key with that name, for a policy whose network is an extension's
-            code.
+      path: Path of the file.
+      extensions: Value of the key with that name, for a policy whose network is an extension's
+        code.
 
     Returns:
-        The policy.
+      The policy.
 
     Raises:
-        PolicyError: The file is missing, damaged, of another format or inconsistent.
-        ConfigError: Its network is not in `extensions`.
+      PolicyError: The file is missing, damaged, of another format or inconsistent.
+      ConfigError: Its network is not in `extensions`.
     """
     path = Path(path)
     content = _read_bytes(path)
@@ -113,13 +113,13 @@ def read_meta(path: str | Path) -> dict[str, Any]:
     """Reads the description in a policy file, and checks the whole file.
 
     Args:
-        path: Path of the file.
+      path: Path of the file.
 
     Returns:
-        Its `meta`.
+      Its `meta`.
 
     Raises:
-        PolicyError: The file is missing, damaged, of another format or inconsistent.
+      PolicyError: The file is missing, damaged, of another format or inconsistent.
     """
     path = Path(path)
     content = _read_bytes(path)
@@ -158,12 +158,12 @@ def write(path: str | Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str,
     """Writes a policy file, whole or not at all.
 
     Args:
-        path: Path of the file; missing folders are made.
-        arrays: All arrays of the format, by name, except `meta` and `digest`.
-        meta: All keys of the format's `meta` except `format`, which is added.
+      path: Path of the file; missing folders are made.
+      arrays: All arrays of the format, by name, except `meta` and `digest`.
+      meta: All keys of the format's `meta` except `format`, which is added.
 
     Raises:
-        PolicyError: `read` would refuse the file, or it cannot be written.
+      PolicyError: `read` would refuse the file, or it cannot be written.
     """
     path = Path(path)
     full = {**meta, "format": _format(meta)}
@@ -181,11 +181,11 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     """Refuses contents that do not make a policy.
 
     Args:
-        arrays: All arrays of a file except `meta` and `digest`.
-        meta: All of the file's `meta`.
+      arrays: All arrays of a file except `meta` and `digest`.
+      meta: All of the file's `meta`.
 
     Raises:
-        PolicyError: One sentence that names the field.
+      PolicyError: One sentence that names the field.
     """
     own = "network" in meta
     if meta.get("format") != _format(meta):
@@ -539,7 +539,7 @@ def action_layout(messages: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Returns the names and the units of the numbers of an action.
 
     Args:
-        messages: Count of numbers that a robot broadcasts.
+      messages: Count of numbers that a robot broadcasts.
     """
     said = tuple(f"message_{i}" for i in range(messages))
     return (*ACTION_NAMES, *said), (*ACTION_UNITS, *("1" for _ in said))

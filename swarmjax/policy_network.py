@@ -22,9 +22,9 @@ class PolicyNetwork:
         """Stores the weights.
 
         Args:
-            source: value of the key `extensions`.
-            name: name of the network.
-            arrays: [L, ...] its parameters, by their paths.
+          source: value of the key `extensions`.
+          name: name of the network.
+          arrays: [L, ...] its parameters, by their paths.
         """
         self._source, self._name, self._arrays = source, name, dict(arrays)
         self._apply: Callable[[np.ndarray], Any] | None = None
@@ -68,12 +68,12 @@ def features(module: Any, params: Any, x: Any) -> Any:
     """Applies a network to arenas side by side, with JAX.
 
     Args:
-        module: Flax module.
-        params: [L, ...] its parameters, of one learner for all robots or of one for each robot.
-        x: [B, R, O] normalised observations.
+      module: Flax module.
+      params: [L, ...] its parameters, of one learner for all robots or of one for each robot.
+      x: [B, R, O] normalised observations.
 
     Returns:
-        [B, R, F] features.
+      [B, R, F] features.
     """
     import jax
 

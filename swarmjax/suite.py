@@ -68,12 +68,12 @@ def choose(trial: Trial, count: int) -> np.ndarray:
     """Chooses the levels that policies fail most.
 
     Args:
-        trial: Trial of one or more policies on a pool of levels.
-        count: Number of levels to choose, at most the size of the pool.
+      trial: Trial of one or more policies on a pool of levels.
+      count: Number of levels to choose, at most the size of the pool.
 
     Returns:
-        Their numbers [count], rising. Levels with the fewest reached targets are chosen first.
-        Ties go to the level with the most contacts, then to the slowest, then to the first.
+      Their numbers [count], rising. Levels with the fewest reached targets are chosen first.
+      Ties go to the level with the most contacts, then to the slowest, then to the first.
     """
     reached, contacts, time = (
         trial.found[name].mean(axis=0)
@@ -164,10 +164,10 @@ def to_yaml(content: dict[str, Any]) -> str:
     """Formats a suite's file: a line for each key, with lists of numbers wrapped.
 
     Args:
-        content: Plain data, as from `files.read_yaml`.
+      content: Plain data, as from `files.read_yaml`.
 
     Returns:
-        The text.
+      The text.
     """
     lines = [f"{key}: {_flow(value)}" for key, value in content.items() if key != "cells"]
     lines.append("cells:")

@@ -53,10 +53,10 @@ def refused(words: list[str]) -> tuple[int, str]:
     """Runs a command in an empty folder.
 
     Args:
-        words: its name and its arguments.
+      words: its name and its arguments.
 
     Returns:
-        The exit code, and the last line on standard error without the command's name.
+      The exit code, and the last line on standard error without the command's name.
     """
     module = f"swarmjax.{words[0]}"
     with tempfile.TemporaryDirectory() as folder:

@@ -36,10 +36,10 @@ def undocumented(cls: type[Section]) -> list[tuple[Path, int, str]]:
     """Finds keys that nothing is said about.
 
     Args:
-        cls: a command's settings.
+      cls: a command's settings.
 
     Returns:
-        File and line of each field, and its key.
+      File and line of each field, and its key.
     """
     silent = [line.key for line in section.list_keys(cls) if not line.meaning.strip()]
     return [(*_place(cls, key), key) for key in silent]

@@ -23,10 +23,10 @@ def dead(page: Path) -> Iterator[tuple[int, str]]:
     """Finds links and paths of a page that lead nowhere.
 
     Args:
-        page: a Markdown file.
+      page: a Markdown file.
 
     Yields:
-        A line's number from 1, and what it leads to.
+      A line's number from 1, and what it leads to.
     """
     for number, line in enumerate(_without_code(page.read_text()), 1):
         for target in _LINK.findall(line):

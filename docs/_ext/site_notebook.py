@@ -18,10 +18,10 @@ def cells(page: str) -> list[tuple[str, str]]:
     """Takes a tutorial apart.
 
     Args:
-        page: its text.
+      page: its text.
 
     Returns:
-        Kind, `markdown` or `code`, and source of each cell.
+      Kind, `markdown` or `code`, and source of each cell.
     """
     body = page.split("---\n", 2)[2]
     parts = _CELL.split(body)
@@ -42,10 +42,10 @@ def notebook(page: str) -> dict[str, Any]:
     """Makes a notebook of a tutorial, without outputs.
 
     Args:
-        page: its text.
+      page: its text.
 
     Returns:
-        The notebook, format 4.5.
+      The notebook, format 4.5.
     """
     every = []
     for number, (kind, source) in enumerate(cells(page)):

@@ -40,15 +40,15 @@ class Cell(NamedTuple):
     """Levels of one kind.
 
     Attributes:
-        name: Name of the cell.
-        stage: Settings of the stage.
-        shape: Shape of the obstacles.
-        realism: Name of a preset, or None for the command's.
-        seed: Seed of the levels.
-        episodes: [E] numbers of the levels.
-        levels: [E] levels, with obstacles as the boxes that they consist of.
-        steps: Control steps of an episode, or None for the command's.
-        hull_friction: Friction of the robots' hulls, or None for the command's.
+      name: Name of the cell.
+      stage: Settings of the stage.
+      shape: Shape of the obstacles.
+      realism: Name of a preset, or None for the command's.
+      seed: Seed of the levels.
+      episodes: [E] numbers of the levels.
+      levels: [E] levels, with obstacles as the boxes that they consist of.
+      steps: Control steps of an episode, or None for the command's.
+      hull_friction: Friction of the robots' hulls, or None for the command's.
     """
 
     name: str
@@ -88,13 +88,13 @@ def load(config: EvaluateConfig) -> Suite:
     """Draws or reads the levels of an evaluation.
 
     Args:
-        config: Settings of the evaluation.
+      config: Settings of the evaluation.
 
     Returns:
-        The suite that the settings name, or one cell with their stage.
+      The suite that the settings name, or one cell with their stage.
 
     Raises:
-        ConfigError: The suite is unsound, or made for smaller robots or other targets.
+      ConfigError: The suite is unsound, or made for smaller robots or other targets.
     """
     if config.suite is None:
         return Suite(None, (draw_stage(config, range(config.episodes)),))
@@ -126,13 +126,13 @@ def draw(choice: str) -> Suite:
     """Draws the levels of a suite and checks their digests.
 
     Args:
-        choice: A name of configs/suites/, or the path of a .yaml file.
+      choice: A name of configs/suites/, or the path of a .yaml file.
 
     Returns:
-        The suite.
+      The suite.
 
     Raises:
-        ConfigError: The file is unsound, or a digest is missing or wrong.
+      ConfigError: The file is unsound, or a digest is missing or wrong.
     """
     file = read_suite(choice)
     found = []
@@ -151,11 +151,11 @@ def draw_stage(config: EvaluateConfig, numbers: Sequence[int]) -> Cell:
     """Draws levels of an evaluation's stage, for its robot and targets.
 
     Args:
-        config: Settings of the evaluation; its suite is ignored.
-        numbers: [E] numbers of the levels.
+      config: Settings of the evaluation; its suite is ignored.
+      numbers: [E] numbers of the levels.
 
     Returns:
-        The cell, under the stage's name.
+      The cell, under the stage's name.
     """
     stage, shape = config.stage, config.shape
     radii = (config.robot.hull_radius, config.task.target_radius)
@@ -213,11 +213,11 @@ def write(path: Path, suite: Suite) -> None:
     """Writes levels for other tools, whole or not at all; docs/evaluation.md lists the fields.
 
     Args:
-        path: Path of the .npz file.
-        suite: The levels.
+      path: Path of the .npz file.
+      suite: The levels.
 
     Raises:
-        ConfigError: The file cannot be written.
+      ConfigError: The file cannot be written.
     """
     arrays = {f"{c.name}/{name}": x for c in suite.cells for name, x in _arrays(c).items()}
     keys = ("name", "shape", "realism", "seed", "digest")
@@ -239,13 +239,13 @@ def read(path: Path) -> Suite:
     """Reads levels that `write` or another tool has written, and checks all of them.
 
     Args:
-        path: Path of the .npz file.
+      path: Path of the .npz file.
 
     Returns:
-        The suite.
+      The suite.
 
     Raises:
-        ConfigError: The file is unsound.
+      ConfigError: The file is unsound.
     """
     section.check_text("suite", str(path))
     try:

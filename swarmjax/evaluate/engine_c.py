@@ -39,19 +39,19 @@ class Arenas(NamedTuple):
     """Arenas between two control steps. MuJoCo edits `data` in place.
 
     Attributes:
-        model: [A] of `MjModel`, one for all unless robots or boxes differ between episodes.
-        data: [A] of `MjData`, positions up to date.
-        factors: [A] factors of the episodes' robots.
-        memory: [A] state of the robots' electronics.
-        target: [A, R, 2] x (m), y (m).
-        obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
-        level: [A] levels that the episodes started from.
-        seed: [A] uint32 of the levels.
-        pose: [A, R, 3] x (m), y (m), yaw (rad).
-        observation: [A, R, O].
-        apart: [A, R, 3] time since the last contact of each kind, s.
-        anchor: [A, R, 2] place near which a robot has recently stayed, m.
-        outcome: Outcome since the start.
+      model: [A] of `MjModel`, one for all unless robots or boxes differ between episodes.
+      data: [A] of `MjData`, positions up to date.
+      factors: [A] factors of the episodes' robots.
+      memory: [A] state of the robots' electronics.
+      target: [A, R, 2] x (m), y (m).
+      obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+      level: [A] levels that the episodes started from.
+      seed: [A] uint32 of the levels.
+      pose: [A, R, 3] x (m), y (m), yaw (rad).
+      observation: [A, R, O].
+      apart: [A, R, 3] time since the last contact of each kind, s.
+      anchor: [A, R, 2] place near which a robot has recently stayed, m.
+      outcome: Outcome since the start.
     """
 
     model: np.ndarray
@@ -106,7 +106,7 @@ def by_policy(judge: Judge) -> Controller:
     Its random draws depend only on the level and the clock.
 
     Args:
-        judge: Data that the arenas share.
+      judge: Data that the arenas share.
     """
     return _ByPolicy(judge)
 
@@ -119,15 +119,15 @@ def simulate(
     With `task.arrival=hold` they have arrived once all robots are within their targets.
 
     Args:
-        judge: Data that the arenas share.
-        levels: Levels to start from.
-        controller: Controller of the robots; None: the judge's policy.
+      judge: Data that the arenas share.
+      levels: Levels to start from.
+      controller: Controller of the robots; None: the judge's policy.
 
     Returns:
-        The outcomes of the episodes, in their order.
+      The outcomes of the episodes, in their order.
 
     Raises:
-        ConfigError: The physics of an episode breaks down.
+      ConfigError: The physics of an episode breaks down.
     """
     rows, arenas = np.arange(len(levels)), start(judge, levels)
     driver = by_policy(judge) if controller is None else controller
@@ -159,11 +159,11 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     """Starts episodes.
 
     Args:
-        judge: Data that the arenas share.
-        levels: [A], with the judge's numbers of robots and boxes.
+      judge: Data that the arenas share.
+      levels: [A], with the judge's numbers of robots and boxes.
 
     Returns:
-        The arenas at rest, with their first observations.
+      The arenas at rest, with their first observations.
     """
     begun = Level(*map(np.stack, zip(*levels, strict=True)))
     pose, target, obstacle = (
@@ -252,14 +252,14 @@ def place(
     """Sets an arena up, at rest.
 
     Args:
-        judge: Data that the arenas share.
-        model: Model of the arena.
-        pose: [R, 3] x (m), y (m), yaw (rad).
-        obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m; equal to the model's).
-        side: Side of the arena, m; None: the stage's.
+      judge: Data that the arenas share.
+      model: Model of the arena.
+      pose: [R, 3] x (m), y (m), yaw (rad).
+      obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m; equal to the model's).
+      side: Side of the arena, m; None: the stage's.
 
     Returns:
-        The arena, with positions up to date.
+      The arena, with positions up to date.
     """
     data = mujoco.MjData(model)
     length = np.float64(judge.stage.side if side is None else side)
@@ -275,15 +275,15 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
     """Moves arenas by one control step, by the rules of `task.env.step`.
 
     Args:
-        judge: Data that the arenas share.
-        arenas: Their state before.
-        action: [A, R, U] of the robots, -1..1; None: actions of a policy without memory.
+      judge: Data that the arenas share.
+      arenas: Their state before.
+      action: [A, R, U] of the robots, -1..1; None: actions of a policy without memory.
 
     Returns:
-        Their state after.
+      Their state after.
 
     Raises:
-        ConfigError: A position is not finite.
+      ConfigError: A position is not finite.
     """
     task, before = judge.config.task, arenas.outcome.arrived
     if action is None:
@@ -380,7 +380,7 @@ def _drive(
     """Lets the active robots drive.
 
     Returns:
-        Memory, new poses [A, R, 3], and impulses [A, R, 3] (N s) by kind of contact.
+      Memory, new poses [A, R, 3], and impulses [A, R, 3] (N s) by kind of contact.
     """
     wanted = sim_drive.command(action, judge.drive, np)
     memory, wheels = electronics.drive(
@@ -453,12 +453,12 @@ def _impulses(judge: Judge, pushes: list[_Pushes], arenas: int) -> np.ndarray:
     """Sums the impulses of contacts, [A, R, 3] N s, in the order of `gaps.KINDS`.
 
     Args:
-        judge: Data that the arenas share.
-        pushes: [A * substeps], grouped by arena.
-        arenas: A.
+      judge: Data that the arenas share.
+      pushes: [A * substeps], grouped by arena.
+      arenas: A.
 
     Returns:
-        [A, R, 3]; when two robots touch each other, both have the impulse.
+      [A, R, 3]; when two robots touch each other, both have the impulse.
     """
     counts = [len(each.force) for each in pushes]
     arena = np.repeat(np.arange(len(pushes)) // judge.substeps, counts)
@@ -478,11 +478,11 @@ def touching(judge: Judge, data: np.ndarray) -> np.ndarray:
     """Tells which robots touch anything, from MuJoCo's contacts.
 
     Args:
-        judge: Data that the arenas share.
-        data: [A] of `MjData`, positions up to date.
+      judge: Data that the arenas share.
+      data: [A] of `MjData`, positions up to date.
 
     Returns:
-        [A, R, 3] bool, in the order of `gaps.KINDS`.
+      [A, R, 3] bool, in the order of `gaps.KINDS`.
     """
     pairs = [each.contact.geom for each in data]
     arena = np.repeat(np.arange(len(data)), [len(pair) for pair in pairs])
@@ -505,15 +505,15 @@ def look(
     """Finds what the sensors can see.
 
     Args:
-        judge: Data that the arenas share.
-        data: [A] of `MjData`, positions up to date.
-        factors: [A] of the episodes.
-        pose: [A, R, 3] x (m), y (m), yaw (rad).
-        target: [A, R, 2] x (m), y (m).
-        obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+      judge: Data that the arenas share.
+      data: [A] of `MjData`, positions up to date.
+      factors: [A] of the episodes.
+      pose: [A, R, 3] x (m), y (m), yaw (rad).
+      target: [A, R, 2] x (m), y (m).
+      obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
-        The sensors' view: rays, and the target's distance and bearing.
+      The sensors' view: rays, and the target's distance and bearing.
     """
     mount, shades = electronics.mount(factors), electronics.reflectance(factors)
     ray, geom = rays.cast_rays(judge.scene, data, pose, obstacle, mount)

@@ -21,9 +21,9 @@ class Evaluation(NamedTuple):
     """The findings of an evaluation.
 
     Attributes:
-        result: Plain data for JSON; docs/interface.md lists it.
-        entrants: The policies, of both sides for a comparison.
-        trials: Results, one for each cell; rows as in `entrants`.
+      result: Plain data for JSON; docs/interface.md lists it.
+      entrants: The policies, of both sides for a comparison.
+      trials: Results, one for each cell; rows as in `entrants`.
     """
 
     result: dict[str, Any]
@@ -40,20 +40,20 @@ def evaluate(
     """Judges policies.
 
     Args:
-        settings: Settings of the evaluation.
-        progress: Progress display; None shows nothing.
-        announce: Called once all inputs are checked, before the first episode, with the number of
-            cells already judged, and the number of all cells.
-        keep: Folder to save each finished cell in, from which the same evaluation resumes; None
-            saves nothing.
+      settings: Settings of the evaluation.
+      progress: Progress display; None shows nothing.
+      announce: Called once all inputs are checked, before the first episode, with the number of
+        cells already judged, and the number of all cells.
+      keep: Folder to save each finished cell in, from which the same evaluation resumes; None
+        saves nothing.
 
     Returns:
-        The findings.
+      The findings.
 
     Raises:
-        PolicyError: A policy is unsound, or does not fit the levels.
-        ConfigError: A file is missing, a suite is unsound, the physics breaks down, or the saved
-            cells belong to another evaluation.
+      PolicyError: A policy is unsound, or does not fit the levels.
+      ConfigError: A file is missing, a suite is unsound, the physics breaks down, or the saved
+        cells belong to another evaluation.
     """
     files = _sides(settings)
     sides = [evaluate_trials.read_policies(each, settings.extensions) for each in files]
@@ -64,15 +64,15 @@ def judge_entrants(settings: EvaluateConfig, entrants: list[Entrant]) -> Evaluat
     """Judges policies that have been read already, of one recipe.
 
     Args:
-        settings: Settings of the evaluation; its `policy` is ignored.
-        entrants: The policies.
+      settings: Settings of the evaluation; its `policy` is ignored.
+      entrants: The policies.
 
     Returns:
-        The findings.
+      The findings.
 
     Raises:
-        PolicyError: A policy does not fit the levels.
-        ConfigError: A suite is unsound, or the physics breaks down.
+      PolicyError: A policy does not fit the levels.
+      ConfigError: A suite is unsound, or the physics breaks down.
     """
     return _judge(settings, [entrants], Progress(disable=True), lambda *_: None, None)
 
@@ -160,14 +160,14 @@ def list_files(key: str, text: str) -> list[str]:
     """Lists the files that a setting of the command line names.
 
     Args:
-        key: Key of the setting.
-        text: Paths and patterns such as `runs/a-seed*.npz`, separated by commas.
+      key: Key of the setting.
+      text: Paths and patterns such as `runs/a-seed*.npz`, separated by commas.
 
     Returns:
-        The paths; those of a pattern in alphabetical order.
+      The paths; those of a pattern in alphabetical order.
 
     Raises:
-        ConfigError: A pattern matches nothing, or a file is named twice.
+      ConfigError: A pattern matches nothing, or a file is named twice.
     """
     found: list[str] = []
     for part in [text] if os.path.isfile(text) else text.split(","):

@@ -21,12 +21,12 @@ def draw(result: Mapping[str, Any], trials: Sequence[Trial], limit: float) -> di
     """Draws the plots of an evaluation.
 
     Args:
-        result: Result of `summary.result`.
-        trials: Results of the policies, one for each cell.
-        limit: Length of an episode, s.
+      result: Result of `summary.result`.
+      trials: Results of the policies, one for each cell.
+      limit: Length of an episode, s.
 
     Returns:
-        PNG files by name, `measures` and `times`. The same evaluation gives the same files.
+      PNG files by name, `measures` and `times`. The same evaluation gives the same files.
     """
     files = {}
     for name, figure in (("measures", intervals(result)), ("times", times(trials, limit))):

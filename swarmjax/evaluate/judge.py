@@ -35,20 +35,20 @@ class Judge:
     """Data that all arenas of an evaluation share.
 
     Attributes:
-        config: Settings of the evaluation.
-        policy: The policy that drives.
-        stage: Stage of the levels, fields [].
-        spacing: Sizes for drawing levels.
-        drive: The robot's drive, with the range of commands that the policy was trained for.
-        electronics: The electronics between policy and world, with the observations of the policy's
-            training.
-        model: The compiled arena.
-        ids: Rows of its moving bodies.
-        scene: The scene for infrared rays.
-        geom_robot: For each geom, the robot whose contact geom it is, else -1.
-        geom_kind: For each geom, the index in `gaps.KINDS` of the thing that it belongs to.
-        substeps: Physics steps of a control step.
-        own: Observations of an extension, [A, R, E] from a view [A]; None without any.
+      config: Settings of the evaluation.
+      policy: The policy that drives.
+      stage: Stage of the levels, fields [].
+      spacing: Sizes for drawing levels.
+      drive: The robot's drive, with the range of commands that the policy was trained for.
+      electronics: The electronics between policy and world, with the observations of the policy's
+        training.
+      model: The compiled arena.
+      ids: Rows of its moving bodies.
+      scene: The scene for infrared rays.
+      geom_robot: For each geom, the robot whose contact geom it is, else -1.
+      geom_kind: For each geom, the index in `gaps.KINDS` of the thing that it belongs to.
+      substeps: Physics steps of a control step.
+      own: Observations of an extension, [A, R, E] from a view [A]; None without any.
     """
 
     config: EvaluateConfig
@@ -70,16 +70,16 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
     """Compiles the arena of a stage, with exactly its robots and obstacles.
 
     Args:
-        config: Settings of the evaluation.
-        trained: The policy to judge.
-        half: [M, 2] half edges of the boxes in the coming levels, m; None: those of the stage and
-            its `shape`.
+      config: Settings of the evaluation.
+      trained: The policy to judge.
+      half: [M, 2] half edges of the boxes in the coming levels, m; None: those of the stage and
+        its `shape`.
 
     Returns:
-        The judge.
+      The judge.
 
     Raises:
-        PolicyError: The policy has other observations, or too few learners.
+      PolicyError: The policy has other observations, or too few learners.
     """
     check_policy(config, config.stage, config.policy, trained)
     extensions = extension.load(config.extensions)
@@ -187,14 +187,14 @@ def check_policy(
     """Refuses a policy that does not fit a stage.
 
     Args:
-        config: Settings of the evaluation.
-        stage: The stage.
-        path: Path of the policy.
-        trained: The policy.
+      config: Settings of the evaluation.
+      stage: The stage.
+      path: Path of the policy.
+      trained: The policy.
 
     Raises:
-        PolicyError: It has other observations, or too few learners.
-        ConfigError: A part of an extension that it needs is missing.
+      PolicyError: It has other observations, or too few learners.
+      ConfigError: A part of an extension that it needs is missing.
     """
     extensions, needs = extension.load(config.extensions), trained.meta.get("extensions", {})
     extension.check_needs(needs, extensions, str(path), ["observation", "network"])
@@ -232,14 +232,14 @@ def draw_level(
     """Draws the level of an episode.
 
     Args:
-        stage: Fields [].
-        spacing: Sizes.
-        seed: Seed of the evaluation.
-        episode: Number of the episode.
-        drawings: An extension's ways of drawing levels, in the order of `stage.drawing`.
+      stage: Fields [].
+      spacing: Sizes.
+      seed: Seed of the evaluation.
+      episode: Number of the episode.
+      drawings: An extension's ways of drawing levels, in the order of `stage.drawing`.
 
     Returns:
-        The level, as NumPy arrays.
+      The level, as NumPy arrays.
     """
     count = level.uniform_count(spacing)
     uniforms = np.random.default_rng([seed, episode]).random(count, dtype=np.float32)

@@ -23,21 +23,21 @@ class Outcome(NamedTuple):
     """The outcomes of episodes, final or so far.
 
     Attributes:
-        clock: [A] control steps since the start.
-        arrived: [A, R] whether the robot has arrived; with `task.arrival=hold`, whether it is
-            within its target.
-        arrival: [A, R] control steps until it arrived, 0 if it has not; with `hold`, until it was
-            within its target and stayed there.
-        contacts: [A, R, 3] contacts of each kind of `gaps.KINDS`, including those after arrival.
-        touched: [A, R, 3] control steps that ended in touch, including those after arrival.
-        impulse: [A, R, 3] normal impulse of these contacts, N s; nan if the engine does not compute
-            it.
-        sensed: [A, R] control steps before arrival with an infrared ray shorter than its range.
-        moving: [A, R] control steps before arrival; with `hold`, those that began outside the
-            target.
-        path: [A, R] distance driven before arrival, m; with `hold`, in the steps of `moving`.
-        still: [A, R] control steps for which it has stayed within STILL_RADIUS of one place without
-            having arrived.
+      clock: [A] control steps since the start.
+      arrived: [A, R] whether the robot has arrived; with `task.arrival=hold`, whether it is
+        within its target.
+      arrival: [A, R] control steps until it arrived, 0 if it has not; with `hold`, until it was
+        within its target and stayed there.
+      contacts: [A, R, 3] contacts of each kind of `gaps.KINDS`, including those after arrival.
+      touched: [A, R, 3] control steps that ended in touch, including those after arrival.
+      impulse: [A, R, 3] normal impulse of these contacts, N s; nan if the engine does not compute
+        it.
+      sensed: [A, R] control steps before arrival with an infrared ray shorter than its range.
+      moving: [A, R] control steps before arrival; with `hold`, those that began outside the
+        target.
+      path: [A, R] distance driven before arrival, m; with `hold`, in the steps of `moving`.
+      still: [A, R] control steps for which it has stayed within STILL_RADIUS of one place without
+        having arrived.
     """
 
     clock: np.ndarray
@@ -56,9 +56,9 @@ class Measure(NamedTuple):
     """A figure with one number per level.
 
     Attributes:
-        label: Its name in a table.
-        unit: Unit of the number; `%` is a share of 0 to 1, shown in per cent; a count has none.
-        is_good: Whether larger numbers are better.
+      label: Its name in a table.
+      unit: Unit of the number; `%` is a share of 0 to 1, shown in per cent; a count has none.
+      is_good: Whether larger numbers are better.
     """
 
     label: str
@@ -93,14 +93,14 @@ def per_level(
     """Computes the measures of each episode.
 
     Args:
-        outcome: Outcome of finished episodes.
-        control_step: Length of a control step, s.
-        steps: Control steps until the time is out.
-        shortest: [A, R] length of the shortest way from start to target, m, inf if there is none.
-            Without `shortest` there is no path efficiency.
+      outcome: Outcome of finished episodes.
+      control_step: Length of a control step, s.
+      steps: Control steps until the time is out.
+      shortest: [A, R] length of the shortest way from start to target, m, inf if there is none.
+        Without `shortest` there is no path efficiency.
 
     Returns:
-        [A] of each of `MEASURES` that can be computed, in their order.
+      [A] of each of `MEASURES` that can be computed, in their order.
     """
     late = ~outcome.arrived
     arrival = np.where(late, steps, outcome.arrival) * control_step

@@ -26,8 +26,8 @@ class Move(NamedTuple):
     """The path of one robot.
 
     Attributes:
-        robot: Number of the robot.
-        path: [P, 2] points that it visits along straight lines, m.
+      robot: Number of the robot.
+      path: [P, 2] points that it visits along straight lines, m.
     """
 
     robot: int
@@ -38,10 +38,10 @@ class _Grid(NamedTuple):
     """Cells of an arena, [N, N] each.
 
     Attributes:
-        place: [N, N, 2] centres of the cells, m.
-        free: Whether the walls leave enough space for a hull there.
-        apart: Least distance between two robots, m.
-        reach: Distance from the target at which a robot has arrived, m.
+      place: [N, N, 2] centres of the cells, m.
+      free: Whether the walls leave enough space for a hull there.
+      apart: Least distance between two robots, m.
+      reach: Distance from the target at which a robot has arrived, m.
     """
 
     place: np.ndarray
@@ -54,12 +54,12 @@ def find(level: Level, hull_radius: float, target_radius: float) -> list[Move] |
     """Finds a plan.
 
     Args:
-        level: Level of one arena, NumPy; absent robots are ignored.
-        hull_radius: Radius of the robots, m.
-        target_radius: Radius within which a robot has arrived, m.
+      level: Level of one arena, NumPy; absent robots are ignored.
+      hull_radius: Radius of the robots, m.
+      target_radius: Radius within which a robot has arrived, m.
 
     Returns:
-        Moves in their order; None if none was found, which does not prove that none exists.
+      Moves in their order; None if none was found, which does not prove that none exists.
     """
     grid = _grid(level, hull_radius, target_radius)
     robots = np.flatnonzero(level.present)
@@ -219,13 +219,13 @@ def check(level: Level, moves: list[Move], hull_radius: float, target_radius: fl
     """Tests a plan against the exact shapes.
 
     Args:
-        level: Level of one arena.
-        moves: The plan.
-        hull_radius: Radius of the robots, m.
-        target_radius: Radius within which a robot has arrived, m.
+      level: Level of one arena.
+      moves: The plan.
+      hull_radius: Radius of the robots, m.
+      target_radius: Radius within which a robot has arrived, m.
 
     Returns:
-        The plan's fault; None if there is none.
+      The plan's fault; None if there is none.
     """
     place = level.start[:, :2].astype(np.float64)
     robots = np.flatnonzero(level.present)

@@ -20,11 +20,11 @@ class RayScene:
     """The scene that rays are cast in.
 
     Attributes:
-        model: The compiled arena.
-        ids: Rows of its moving bodies.
-        hull_radius: Radius of the hulls, m.
-        side: Side of the smallest arena, m.
-        reach: Length of the rays, m.
+      model: The compiled arena.
+      ids: Rows of its moving bodies.
+      hull_radius: Radius of the hulls, m.
+      side: Side of the smallest arena, m.
+      reach: Length of the rays, m.
     """
 
     model: mujoco.MjModel
@@ -49,15 +49,15 @@ def cast_rays(
     enter a second thing before it leaves the first.
 
     Args:
-        scene: The scene.
-        data: [A] of `MjData`, positions up to date; each model's boxes have that arena's sizes.
-        pose: [A, R, 3] x (m), y (m), yaw (rad).
-        obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
-        mount: Deviations of the sensors' positions and directions.
+      scene: The scene.
+      data: [A] of `MjData`, positions up to date; each model's boxes have that arena's sizes.
+      pose: [A, R, 3] x (m), y (m), yaw (rad).
+      obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+      mount: Deviations of the sensors' positions and directions.
 
     Returns:
-        [A, R, K] distance from the sensor's origin to the nearest surface, m, from 0 to the reach
-        of the electronics; and the geom that the ray meets, -1 if none.
+      [A, R, K] distance from the sensor's origin to the nearest surface, m, from 0 to the reach
+      of the electronics; and the geom that the ray meets, -1 if none.
     """
     limit = scene.reach
     origin, direction = infrared.rays(pose, np, mount)
@@ -88,14 +88,14 @@ def hidden(
     """Tells whether a wall or a box is between two robots' centres, with MuJoCo's rays.
 
     Args:
-        scene: The scene.
-        data: [A] of `MjData`, positions up to date; each model's boxes have that arena's sizes.
-        pose: [A, R, 3] x (m), y (m), yaw (rad).
-        obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
-        reach: Greatest distance at which two robots hear each other, m.
+      scene: The scene.
+      data: [A] of `MjData`, positions up to date; each model's boxes have that arena's sizes.
+      pose: [A, R, 3] x (m), y (m), yaw (rad).
+      obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+      reach: Greatest distance at which two robots hear each other, m.
 
     Returns:
-        [A, R, R] bool; False for pairs beyond reach.
+      [A, R, R] bool; False for pairs beyond reach.
     """
     place, half = pose[..., :2], np.linalg.norm(obstacle[..., 3:], axis=-1)
     along = place[:, None] - place[:, :, None]
@@ -121,12 +121,12 @@ def brightness(scene: RayScene, shades: infrared.Reflectance, geom: np.ndarray) 
     """Returns the brightness of the geoms that rays meet.
 
     Args:
-        scene: The scene.
-        shades: Reflectance of things, [A, ...].
-        geom: [A, R, K] from `cast_rays`.
+      scene: The scene.
+      shades: Reflectance of things, [A, ...].
+      geom: [A, R, K] from `cast_rays`.
 
     Returns:
-        [A, R, K] reflectance; 1 where a ray meets nothing.
+      [A, R, K] reflectance; 1 where a ray meets nothing.
     """
     model, table = scene.model, np.ones((len(geom), scene.model.ngeom + 1))  # the last: nothing
     obstacles = scene.ids.obstacle_geom
@@ -149,13 +149,13 @@ def _near(
     smallest arena is assumed.
 
     Args:
-        scene: The scene.
-        middle: [A, R, K, 2] middles of the rays, m.
-        place: [A, R, 2] places of the robots, m.
-        obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+      scene: The scene.
+      middle: [A, R, K, 2] middles of the rays, m.
+      place: [A, R, 2] places of the robots, m.
+      obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
-        [A, R, K].
+      [A, R, K].
     """
     myself = np.eye(place.shape[-2], dtype=bool)[:, None]
     robots = _apart(middle, place) - scene.hull_radius

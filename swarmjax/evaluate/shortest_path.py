@@ -28,9 +28,9 @@ class _Boxes(NamedTuple):
     """The boxes of an arena, with the least distance of the disc's centre.
 
     Attributes:
-        box: [M, 5] x (m), y (m), yaw (rad), half edges (m).
-        half: [2, M] the half edges, m.
-        radius: Radius of the disc, less the slack, m.
+      box: [M, 5] x (m), y (m), yaw (rad), half edges (m).
+      half: [2, M] the half edges, m.
+      radius: Radius of the disc, less the slack, m.
     """
 
     box: np.ndarray
@@ -42,10 +42,10 @@ class _Points(NamedTuple):
     """Points of an arena, with their places relative to its boxes.
 
     Attributes:
-        place: [V, 2] m.
-        local: [2, V, M] x and y in the frames of the boxes, m.
-        beyond: [V, M] the sides of each widened box that a point lies beyond, one bit for each
-            side. No line meets a box if both of its ends lie beyond the same side.
+      place: [V, 2] m.
+      local: [2, V, M] x and y in the frames of the boxes, m.
+      beyond: [V, M] the sides of each widened box that a point lies beyond, one bit for each
+        side. No line meets a box if both of its ends lie beyond the same side.
     """
 
     place: np.ndarray
@@ -66,13 +66,13 @@ class _Arena(NamedTuple):
     """The data that the robots of an arena share.
 
     Attributes:
-        inside: Half edge of the square within which the disc's centre stays, m.
-        boxes: The boxes that are not far away.
-        outline: V points around the boxes, clear of all boxes and walls.
-        legs: [V, V] lengths of the straight lines between these points, m; inf if blocked, NaN if
-            not yet tested. `_are_free` fills it in.
-        part: [V] numbers, equal for points that free lines connect; -1 if not yet known. `_divide`
-            fills it in.
+      inside: Half edge of the square within which the disc's centre stays, m.
+      boxes: The boxes that are not far away.
+      outline: V points around the boxes, clear of all boxes and walls.
+      legs: [V, V] lengths of the straight lines between these points, m; inf if blocked, NaN if
+        not yet tested. `_are_free` fills it in.
+      part: [V] numbers, equal for points that free lines connect; -1 if not yet known. `_divide`
+        fills it in.
     """
 
     inside: float
@@ -93,15 +93,15 @@ def shortest(
     """Finds the lengths of the shortest paths of robots, each alone in its arena.
 
     Args:
-        side: [A] sides of the square arenas, m.
-        start: [A, R, 2] m.
-        target: [A, R, 2] m.
-        obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m); absent ones stand far away.
-        hull_radius: Radius of the disc, m.
-        target_radius: Required distance of its centre from the target, m.
+      side: [A] sides of the square arenas, m.
+      start: [A, R, 2] m.
+      target: [A, R, 2] m.
+      obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m); absent ones stand far away.
+      hull_radius: Radius of the disc, m.
+      target_radius: Required distance of its centre from the target, m.
 
     Returns:
-        [A, R] m; inf where there is no path.
+      [A, R] m; inf where there is no path.
     """
     start, target, obstacle = (np.asarray(x, np.float64) for x in (start, target, obstacle))
     offset = target - start
@@ -227,14 +227,14 @@ def _search(
     minimum cost paths").
 
     Args:
-        arena: Arena of the points; it stores the results for the lines between them.
-        rows: [W] rows of the points.
-        first: [W] straight from the start, inf if blocked.
-        rest: [W] lower bounds of the distances to the target.
-        last: [1 + W] straight to the target from the start and from the points, inf if blocked.
+      arena: Arena of the points; it stores the results for the lines between them.
+      rows: [W] rows of the points.
+      first: [W] straight from the start, inf if blocked.
+      rest: [W] lower bounds of the distances to the target.
+      last: [1 + W] straight to the target from the start and from the points, inf if blocked.
 
     Returns:
-        The lengths. A length may be too long if no path through its point is the shortest.
+      The lengths. A length may be too long if no path through its point is the shortest.
     """
     length, least, best = first.copy(), first + rest, last[0]
     place = arena.outline.place[rows]

@@ -87,10 +87,10 @@ def read_suite(choice: str) -> SuiteFileConfig:
     """Reads the file of a suite.
 
     Args:
-        choice: A name in configs/suites/, or the path of a .yaml file.
+      choice: A name in configs/suites/, or the path of a .yaml file.
 
     Raises:
-        ConfigError: There is no such file, or it is unsound.
+      ConfigError: There is no such file, or it is unsound.
     """
     path = files.suite_path(choice)
     mapping = files.read_yaml(path)

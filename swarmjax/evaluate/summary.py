@@ -27,13 +27,13 @@ def result(
     """Collects all findings of an evaluation as plain data for JSON.
 
     Args:
-        config: Settings of the evaluation.
-        suite: Its name, or None.
-        entrants: Policies of one recipe.
-        trials: Their results, one for each cell.
+      config: Settings of the evaluation.
+      suite: Its name, or None.
+      entrants: Policies of one recipe.
+      trials: Their results, one for each cell.
 
     Returns:
-        The result; docs/interface.md lists it.
+      The result; docs/interface.md lists it.
     """
     return {
         **_about(config, suite),
@@ -54,13 +54,13 @@ def comparison(
     """Collects a comparison of two recipes on the same levels as plain data for JSON.
 
     Args:
-        config: Settings of the evaluation.
-        suite: Its name, or None.
-        entrants: Policies of the first and of the second recipe.
-        trials: Their results, one for each cell.
+      config: Settings of the evaluation.
+      suite: Its name, or None.
+      entrants: Policies of the first and of the second recipe.
+      trials: Their results, one for each cell.
 
     Returns:
-        The result; docs/interface.md lists it.
+      The result; docs/interface.md lists it.
     """
     pairs = list(zip(*trials, strict=True))
     return {
@@ -93,11 +93,11 @@ def about_cell(config: EvaluateConfig, trial: Trial) -> dict[str, Any]:
     """Describes the levels of a trial, and counts those that no robot could solve.
 
     Args:
-        config: Settings of the evaluation.
-        trial: Trial on one cell.
+      config: Settings of the evaluation.
+      trial: Trial on one cell.
 
     Returns:
-        Plain data for JSON.
+      Plain data for JSON.
     """
     cell, mine = trial.cell, specialise(config, trial.cell)
     return {
@@ -118,12 +118,12 @@ def summarize(found: Found, strata: Sequence[int] | None = None) -> dict[str, di
     """Summarises measures.
 
     Args:
-        found: [P, E] of each measure, from policies of one recipe on the same levels.
-        strata: Sizes of groups of consecutive levels; levels are drawn within each group.
+      found: [P, E] of each measure, from policies of one recipe on the same levels.
+      strata: Sizes of groups of consecutive levels; levels are drawn within each group.
 
     Returns:
-        For each measure `mean`, `iqm` and `cvar` (mean over the worst 5 % of the levels and
-        policies), each with `_interval`, null if there are too few values for one.
+      For each measure `mean`, `iqm` and `cvar` (mean over the worst 5 % of the levels and
+      policies), each with `_interval`, null if there are too few values for one.
     """
     return {name: _summary(table, MEASURES[name], strata) for name, table in found.items()}
 
@@ -185,14 +185,14 @@ def compare(a: Found, b: Found, strata: Sequence[int] | None = None) -> dict[str
     """Compares two recipes level by level.
 
     Args:
-        a: [P, E] of each measure of the first recipe.
-        b: [P, E] of the second recipe, on the same levels; the same row is the same seed.
-        strata: As in `summarize`.
+      a: [P, E] of each measure of the first recipe.
+      b: [P, E] of the second recipe, on the same levels; the same row is the same seed.
+      strata: As in `summarize`.
 
     Returns:
-        For each measure that both have: the means `a` and `b`, `difference` of the means and
-        `difference_iqm` of the interquartile means (b - a), and `improvement`, the probability that
-        b is better on a level. The last three each have `_interval`.
+      For each measure that both have: the means `a` and `b`, `difference` of the means and
+      `difference_iqm` of the interquartile means (b - a), and `improvement`, the probability that
+      b is better on a level. The last three each have `_interval`.
     """
     return {name: _comparison(name, a[name], b[name], strata) for name in a if name in b}
 

@@ -33,8 +33,8 @@ def show(console: Console, result: Mapping[str, Any]) -> None:
     """Prints a result; without styles unless the output is a terminal.
 
     Args:
-        console: Console to print on.
-        result: Result of `summary`, for policies or for a comparison.
+      console: Console to print on.
+      result: Result of `summary`, for policies or for a comparison.
     """
     cells = result["cells"]
     sides = result.get("compared", [result.get("policies")])
@@ -142,12 +142,12 @@ def write_levels(path: Path, entrants: Sequence[Entrant], trials: Sequence[Trial
     """Writes a row for each policy and level.
 
     Args:
-        path: Path of the CSV file.
-        entrants: The policies, in the order of the trials' rows.
-        trials: Their results, one for each cell.
+      path: Path of the CSV file.
+      entrants: The policies, in the order of the trials' rows.
+      trials: Their results, one for each cell.
 
     Raises:
-        ConfigError: The file cannot be written.
+      ConfigError: The file cannot be written.
     """
     names = [name for name in MEASURES if name in trials[0].found]
     try:

@@ -38,10 +38,10 @@ class Trial(NamedTuple):
     """The results of policies on the levels of a cell.
 
     Attributes:
-        cell: Cell with E levels.
-        shortest: [E, R] lengths of the shortest paths, m; inf if a target cannot be reached.
-        found: [P, E] of each measure that the engine computes.
-        arrival: [P, E, R] when robots arrived, s; inf if they did not.
+      cell: Cell with E levels.
+      shortest: [E, R] lengths of the shortest paths, m; inf if a target cannot be reached.
+      found: [P, E] of each measure that the engine computes.
+      arrival: [P, E, R] when robots arrived, s; inf if they did not.
     """
 
     cell: Cell
@@ -68,11 +68,11 @@ def read_policies(files: Sequence[str], extensions: str | None = None) -> list[E
     """Reads policy files.
 
     Args:
-        files: Their paths.
-        extensions: Value of the key with that name.
+      files: Their paths.
+      extensions: Value of the key with that name.
 
     Raises:
-        PolicyError: A file is unsound.
+      PolicyError: A file is unsound.
     """
     return [Entrant(file, policy_file.read(file, extensions)) for file in files]
 
@@ -86,17 +86,17 @@ def run(
     """Judges policies on cells.
 
     Args:
-        config: Settings of the evaluation.
-        cells: Cells with the levels.
-        entrants: The policies.
-        report: Called from time to time with the number of episodes finished since the last call.
+      config: Settings of the evaluation.
+      cells: Cells with the levels.
+      entrants: The policies.
+      report: Called from time to time with the number of episodes finished since the last call.
 
     Returns:
-        A trial for each cell.
+      A trial for each cell.
 
     Raises:
-        PolicyError: A policy does not fit a cell.
-        ConfigError: The physics breaks down.
+      PolicyError: A policy does not fit a cell.
+      ConfigError: The physics breaks down.
     """
     found = dict(run_each(config, cells, entrants, report))
     return [found[row] for row in range(len(cells))]
@@ -111,17 +111,17 @@ def run_each(
     """Judges policies on cells as `run` does, and yields each trial as soon as it is finished.
 
     Args:
-        config: Settings of the evaluation.
-        cells: Cells with the levels.
-        entrants: The policies.
-        report: Called from time to time with the number of episodes finished since the last call.
+      config: Settings of the evaluation.
+      cells: Cells with the levels.
+      entrants: The policies.
+      report: Called from time to time with the number of episodes finished since the last call.
 
     Yields:
-        The row of a cell, and the results of the policies on it.
+      The row of a cell, and the results of the policies on it.
 
     Raises:
-        PolicyError: A policy does not fit a cell.
-        ConfigError: The physics breaks down.
+      PolicyError: A policy does not fit a cell.
+      ConfigError: The physics breaks down.
     """
     for cell in cells:
         for each in entrants:
@@ -136,13 +136,13 @@ def specialise(config: EvaluateConfig, cell: Cell, path: str | None = None) -> E
     """Makes the settings for one cell, and for one policy.
 
     Args:
-        config: Settings of the evaluation.
-        cell: Cell that sets the stage, shape and seed. It also sets the realism and the hulls'
-            friction if it has them, and the step limit if it has one and `config` has none.
-        path: Path of the policy.
+      config: Settings of the evaluation.
+      cell: Cell that sets the stage, shape and seed. It also sets the realism and the hulls'
+        friction if it has them, and the step limit if it has one and `config` has none.
+      path: Path of the policy.
 
     Returns:
-        The settings.
+      The settings.
     """
     realism = config.realism
     if cell.realism is not None:
@@ -259,9 +259,9 @@ def work[Job, Result](
     """Runs jobs in order, and yields their results in the same order.
 
     Args:
-        function: Function of a module, so that other processes find it.
-        jobs: Its arguments.
-        workers: Number of processes; 1 means this process alone.
+      function: Function of a module, so that other processes find it.
+      jobs: Its arguments.
+      workers: Number of processes; 1 means this process alone.
     """
     if workers == 1:
         yield from map(function, jobs)
@@ -276,9 +276,9 @@ def work_each[Job, Result](
     """Runs jobs, and yields the number and the result of each as soon as it is done.
 
     Args:
-        function: Function of a module, so that other processes find it.
-        jobs: Its arguments; they are begun in order.
-        workers: Number of processes; 1 means this process alone.
+      function: Function of a module, so that other processes find it.
+      jobs: Its arguments; they are begun in order.
+      workers: Number of processes; 1 means this process alone.
     """
     if workers <= 1:
         yield from enumerate(map(function, jobs))
@@ -319,11 +319,11 @@ def ways(config: EvaluateConfig, levels: Level) -> np.ndarray:
     """Finds the lengths of the shortest paths from starts to targets.
 
     Args:
-        config: Settings with the radii of robots and targets.
-        levels: [E].
+      config: Settings with the radii of robots and targets.
+      levels: [E].
 
     Returns:
-        [E, R] m; inf where there is no path for any robot.
+      [E, R] m; inf where there is no path for any robot.
     """
     start, hull, reach = levels.start[..., :2], config.robot.hull_radius, config.task.target_radius
     return shortest_path.shortest(levels.side, start, levels.target, levels.obstacle, hull, reach)

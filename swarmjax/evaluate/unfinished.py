@@ -32,7 +32,7 @@ def place(out: Path) -> Path:
     """Returns the folder for a result's finished cells.
 
     Args:
-        out: Folder of the result, or its file .json.
+      out: Folder of the result, or its file .json.
     """
     return out.with_name(f"{out.name}.{_NAME}") if out.suffix == ".json" else out / _NAME
 
@@ -43,12 +43,12 @@ def about(
     """Describes an evaluation: everything that its figures depend on.
 
     Args:
-        config: Settings of the evaluation.
-        cells: Its levels.
-        entrants: The policies, in their order.
+      config: Settings of the evaluation.
+      cells: Its levels.
+      entrants: The policies, in their order.
 
     Returns:
-        Plain data for JSON.
+      Plain data for JSON.
     """
     code = None if config.extensions is None else _digest(Path(config.extensions))
     found = {
@@ -78,15 +78,15 @@ def read(folder: Path, judged: Mapping[str, Any], cells: Sequence[Cell]) -> dict
     """Reads the finished cells.
 
     Args:
-        folder: Result of `place`; it need not exist.
-        judged: Result of `about`.
-        cells: Cells of the evaluation.
+      folder: Result of `place`; it need not exist.
+      judged: Result of `about`.
+      cells: Cells of the evaluation.
 
     Returns:
-        The policies' results, by the row of their cell.
+      The policies' results, by the row of their cell.
 
     Raises:
-        ConfigError: They belong to another evaluation, or cannot be read.
+      ConfigError: They belong to another evaluation, or cannot be read.
     """
     paths = {row: _path(folder, row) for row in range(len(cells))}
     paths = {row: path for row, path in paths.items() if path.exists()}
@@ -106,13 +106,13 @@ def write(folder: Path, judged: Mapping[str, Any], row: int, trial: Trial) -> No
     """Writes a finished cell, whole or not at all.
 
     Args:
-        folder: Result of `place`; it is made if it is missing.
-        judged: Result of `about`.
-        row: Row of the cell.
-        trial: The policies' results on it.
+      folder: Result of `place`; it is made if it is missing.
+      judged: Result of `about`.
+      row: Row of the cell.
+      trial: The policies' results on it.
 
     Raises:
-        ConfigError: The files cannot be written.
+      ConfigError: The files cannot be written.
     """
     arrays = {"shortest": trial.shortest, "arrival": trial.arrival}
     arrays |= {f"found/{name}": table for name, table in trial.found.items()}

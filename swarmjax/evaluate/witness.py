@@ -31,10 +31,10 @@ class Trained(NamedTuple):
     """The conditions of a policy's training.
 
     Attributes:
-        robot: Settings of the robot.
-        task: Settings of the task that a judge needs too.
-        realism: Realism of sensors and bodies.
-        stages: Plain data of its stages in order; none if the file names none.
+      robot: Settings of the robot.
+      task: Settings of the task that a judge needs too.
+      realism: Realism of sensors and bodies.
+      stages: Plain data of its stages in order; none if the file names none.
     """
 
     robot: RobotConfig
@@ -47,11 +47,11 @@ def trained(meta: Mapping[str, Any], path: str) -> Trained:
     """Reads the conditions of training from a policy file; older files have fewer of them.
 
     Args:
-        meta: Contents of the file's `meta`.
-        path: Path of the file.
+      meta: Contents of the file's `meta`.
+      path: Path of the file.
 
     Raises:
-        ConfigError: A number is unsound.
+      ConfigError: A number is unsound.
     """
     config = {key: value for key, value in meta["config"].items() if isinstance(value, Mapping)}
     low, high = meta["action"]["low"], meta["action"]["high"]
@@ -92,17 +92,17 @@ def load[C: Section](
     """Makes the settings of a command that runs policies: as in training, unless set otherwise.
 
     Args:
-        cls: The command's dataclass, with `policy` and perhaps `compare`.
-        typed: `key=value` arguments.
-        entrants: The policies, if they have been read already; None: those that `typed` names.
-        stage: Plain data of the stage if `typed` names none; None: the policies' last stage.
+      cls: The command's dataclass, with `policy` and perhaps `compare`.
+      typed: `key=value` arguments.
+      entrants: The policies, if they have been read already; None: those that `typed` names.
+      stage: Plain data of the stage if `typed` names none; None: the policies' last stage.
 
     Returns:
-        The settings, and one line that describes what comes from the policies.
+      The settings, and one line that describes what comes from the policies.
 
     Raises:
-        ConfigError: An argument is unsound, or policies were trained differently and none decides.
-        PolicyError: A policy is unsound.
+      ConfigError: An argument is unsound, or policies were trained differently and none decides.
+      PolicyError: A policy is unsound.
     """
     if entrants is None:
         metas = {path: policy_file.read_meta(path) for path in _paths(cls, typed)}

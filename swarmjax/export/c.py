@@ -111,10 +111,10 @@ def render(trained: Policy) -> dict[str, bytes]:
     """Makes the C files of a policy.
 
     Args:
-        trained: the policy.
+      trained: the policy.
 
     Returns:
-        `policy.c`, `policy.h`, `policy_test.c`, `Makefile` and `README.md`.
+      `policy.c`, `policy.h`, `policy_test.c`, `Makefile` and `README.md`.
     """
     values = _about(trained) | _layout(trained) | _memory(trained)
     code = values | _code(trained) | _hearing(trained)
@@ -352,9 +352,9 @@ def number(value: float) -> str:
     """Writes a number as a C99 constant that C reads as exactly the same float32.
 
     Args:
-        value: the number, rounded to float32.
+      value: the number, rounded to float32.
 
     Returns:
-        The fewest digits that distinguish it from its neighbours.
+      The fewest digits that distinguish it from its neighbours.
     """
     return f"{np.format_float_scientific(np.float32(value), trim='0')}f"

@@ -14,13 +14,13 @@ def expressible(meta: Mapping[str, Any], form: str, sensors: str) -> None:
     """Checks that a form can hold a policy and that its controller can measure all inputs.
 
     Args:
-        meta: metadata of the policy.
-        form: `onnx`, `c` or `webots`.
-        sensors: sensors that the controller reads: `webots` or `real`.
+      meta: metadata of the policy.
+      form: `onnx`, `c` or `webots`.
+      sensors: sensors that the controller reads: `webots` or `real`.
 
     Raises:
-        PolicyError: if the policy's network is code, or e-pucks cannot measure its inputs.
-        ConfigError: if the policy's infrared reaches further than the sensors.
+      PolicyError: if the policy's network is code, or e-pucks cannot measure its inputs.
+      ConfigError: if the policy's infrared reaches further than the sensors.
     """
     if "network" in meta:
         raise PolicyError(

@@ -23,11 +23,11 @@ def write_file(path: Path, content: bytes) -> None:
     """Writes a file and replaces any older file at its path.
 
     Args:
-        path: path of the file; missing folders are created.
-        content: the whole content.
+      path: path of the file; missing folders are created.
+      content: the whole content.
 
     Raises:
-        ConfigError: if the file cannot be written.
+      ConfigError: if the file cannot be written.
     """
     try:
         with replacing(path) as temporary:
@@ -40,11 +40,11 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
     """Writes a folder; replaces an older export there if it is unchanged.
 
     Args:
-        path: path of the folder.
-        files: content of each file, by name.
+      path: path of the folder.
+      files: content of each file, by name.
 
     Raises:
-        ConfigError: if the folder holds anything else, or cannot be written.
+      ConfigError: if the folder holds anything else, or cannot be written.
     """
     check_folder(path)
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
@@ -71,10 +71,10 @@ def check_folder(path: Path) -> None:
     """Checks that a folder holds only an unchanged export, so that it can be replaced.
 
     Args:
-        path: path of the folder; it need not exist.
+      path: path of the folder; it need not exist.
 
     Raises:
-        ConfigError: if something in the folder would be lost.
+      ConfigError: if something in the folder would be lost.
     """
     try:
         if not path.exists() or (path.is_dir() and not any(path.iterdir())):

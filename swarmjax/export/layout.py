@@ -18,10 +18,10 @@ def entries(policy: Policy) -> list[LayoutEntry]:
     """Lists the entries of a policy's observation.
 
     Args:
-        policy: the policy.
+      policy: the policy.
 
     Returns:
-        [O] entries in order.
+      [O] entries in order.
     """
     layout = policy.meta["observation"]
     keys = ("names", "units", "offset", "scale")
@@ -32,10 +32,10 @@ def table(policy: Policy) -> str:
     """Writes the observation's layout as a table.
 
     Args:
-        policy: the policy.
+      policy: the policy.
 
     Returns:
-        A Markdown table with one row per entry, without a final newline.
+      A Markdown table with one row per entry, without a final newline.
     """
     lines = ["| entry | quantity | unit | offset | scale |", "|---|---|---|---|---|"]
     for i, entry in enumerate(entries(policy)):
@@ -48,10 +48,10 @@ def trained_as(policy: Policy) -> str:
     """Names the robot and the sensors that a policy was trained with.
 
     Args:
-        policy: the policy.
+      policy: the policy.
 
     Returns:
-        Part of a sentence.
+      Part of a sentence.
     """
     robot, sensors = policy.meta["robot"], policy.meta["sensors"]
     hull = f", hull {short(robot['hull_radius'])} m" if "hull_radius" in robot else ""
@@ -67,10 +67,10 @@ def holds(policy: Policy) -> bool:
     """Tells whether a policy was trained to keep driving within its target (`task.arrival=hold`).
 
     Args:
-        policy: the policy.
+      policy: the policy.
 
     Returns:
-        False for files without this setting, since they are older than that rule.
+      False for files without this setting, since they are older than that rule.
     """
     return policy.meta["task"].get("arrival", "latch") == "hold"
 
@@ -79,9 +79,9 @@ def short(value: float) -> str:
     """Writes a number with the digits of a float32.
 
     Args:
-        value: a finite number.
+      value: a finite number.
 
     Returns:
-        At most nine digits, enough to distinguish any float32 from its neighbours.
+      At most nine digits, enough to distinguish any float32 from its neighbours.
     """
     return f"{value:.9g}"

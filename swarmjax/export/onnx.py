@@ -51,18 +51,18 @@ def render(policy: Policy) -> bytes:
     """Makes the model of a policy.
 
     Args:
-        policy: the policy.
+      policy: the policy.
 
     Returns:
-        The bytes of an ONNX file. Its input `observation` is [B, O] for a shared policy, else
-        [B, R, O], where R is the number of learners; `meta["observation"]` of the policy describes
-        the entries. Its outputs are `action` ([..., U], as `policy.act` without `normal`) and
-        `command` (as `policy.command`: m/s and rad/s). A policy with memory has a second input
-        `memory` and a third output `memory_after`: [..., H], or [..., (k - 1) O] for a history.
-        `memory` is zero at the start of an episode.
+      The bytes of an ONNX file. Its input `observation` is [B, O] for a shared policy, else
+      [B, R, O], where R is the number of learners; `meta["observation"]` of the policy describes
+      the entries. Its outputs are `action` ([..., U], as `policy.act` without `normal`) and
+      `command` (as `policy.command`: m/s and rad/s). A policy with memory has a second input
+      `memory` and a third output `memory_after`: [..., H], or [..., (k - 1) O] for a history.
+      `memory` is zero at the start of an episode.
 
     Raises:
-        ConfigError: if the package `onnx` is not installed.
+      ConfigError: if the package `onnx` is not installed.
     """
     try:
         from onnx import TensorProto, helper

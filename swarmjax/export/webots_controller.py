@@ -41,13 +41,13 @@ def parse(words: Iterable[str]) -> Orders:
     """Reads `target=x,y`, `robot=i` and `action=mean` or `action=sampled`.
 
     Args:
-        words: words of controllerArgs or of customData.
+      words: words of controllerArgs or of customData.
 
     Returns:
-        The orders.
+      The orders.
 
     Raises:
-        ValueError: if a word is none of these.
+      ValueError: if a word is none of these.
     """
     orders = Orders()
     for word in words:
@@ -81,14 +81,14 @@ def observe(
     """Assembles an observation.
 
     Args:
-        trained: the policy.
-        sensors: contents of `sensors.json`.
-        counts: [K] counts of the infrared sensors.
-        distance: distance to the target, m.
-        bearing: direction of the target from the robot's x axis, rad, left positive.
+      trained: the policy.
+      sensors: contents of `sensors.json`.
+      counts: [K] counts of the infrared sensors.
+      distance: distance to the target, m.
+      bearing: direction of the target from the robot's x axis, rad, left positive.
 
     Returns:
-        [O] float32, scaled by the policy's layout.
+      [O] float32, scaled by the policy's layout.
     """
     layout = trained.meta["observation"]
     seen = np.asarray(counts, float)
@@ -108,11 +108,11 @@ def ray(counts: np.ndarray, sensors: dict[str, Any]) -> np.ndarray:
     """Converts counts to metres, as a robot with calibrated sensors does.
 
     Args:
-        counts: [K] counts of the sensors.
-        sensors: contents of `sensors.json`.
+      counts: [K] counts of the sensors.
+      sensors: contents of `sensors.json`.
 
     Returns:
-        [K] distances at which nominal sensors report these counts, m.
+      [K] distances at which nominal sensors report these counts, m.
     """
     if sensors["answers"] == "webots":
         return np.interp(counts, sensors["counts"][::-1], sensors["distance"][::-1])
@@ -129,13 +129,13 @@ def to_target(
     """Computes the distance and the bearing of a target from a robot.
 
     Args:
-        position: position of the robot from its GPS, x and y first, m.
-        north: direction of north in the robot's frame from its compass, x and y first. The world
-            is ENU, so north is its y axis.
-        target: x and y, m.
+      position: position of the robot from its GPS, x and y first, m.
+      north: direction of north in the robot's frame from its compass, x and y first. The world
+        is ENU, so north is its y axis.
+      target: x and y, m.
 
     Returns:
-        Distance, m, and bearing from the robot's x axis, rad, -pi to pi, left positive.
+      Distance, m, and bearing from the robot's x axis, rad, -pi to pi, left positive.
     """
     x, y = target[0] - position[0], target[1] - position[1]
     yaw = math.atan2(north[0], north[1])
@@ -147,8 +147,8 @@ def begin(trained: Policy, robot: int) -> np.ndarray | None:
     """Returns the memory of a robot with a new target; None if the policy has no memory.
 
     Args:
-        trained: the policy.
-        robot: the robot's number, from 0.
+      trained: the policy.
+      robot: the robot's number, from 0.
     """
     return policy.begin(trained, (1 if trained.is_shared else robot + 1,))
 
@@ -163,15 +163,15 @@ def wheel_speeds(
     """Computes the speeds of the wheels from an observation.
 
     Args:
-        trained: the policy.
-        observation: [O] the observation.
-        robot: the robot's number, from 0.
-        normal: [U] standard normal numbers to draw the action; 0 gives the most likely one.
-        memory: memory that `begin` or the previous call returned.
+      trained: the policy.
+      observation: [O] the observation.
+      robot: the robot's number, from 0.
+      normal: [U] standard normal numbers to draw the action; 0 gives the most likely one.
+      memory: memory that `begin` or the previous call returned.
 
     Returns:
-        [2] speeds of the left and the right wheel, rad/s, each within its own limit, and the memory
-        afterwards.
+      [2] speeds of the left and the right wheel, rad/s, each within its own limit, and the memory
+      afterwards.
     """
     # Rows of the robots before this one only ensure that it gets its own network.
     seen = np.broadcast_to(observation, (1 if trained.is_shared else robot + 1, observation.size))
@@ -196,14 +196,14 @@ def find_devices(robot: Any, period: int) -> Devices:
     """Finds a robot's devices and switches them on.
 
     Args:
-        robot: the robot object of Webots.
-        period: time between samples, ms.
+      robot: the robot object of Webots.
+      period: time between samples, ms.
 
     Returns:
-        The devices: sensors that report every `period`, and motors at rest.
+      The devices: sensors that report every `period`, and motors at rest.
 
     Raises:
-        ValueError: if a device is missing.
+      ValueError: if a device is missing.
     """
     found = {name: robot.getDevice(name) for name in (*INFRARED, "gps", "compass", *MOTORS)}
     for name, device in found.items():
@@ -229,14 +229,14 @@ def control_period(trained: Policy, basic_step: float) -> int:
     """Finds how often the policy acts.
 
     Args:
-        trained: the policy.
-        basic_step: basic time step of the world, ms.
+      trained: the policy.
+      basic_step: basic time step of the world, ms.
 
     Returns:
-        The control step that the policy was trained with, ms.
+      The control step that the policy was trained with, ms.
 
     Raises:
-        ValueError: if the control step is not a whole number of ms or a multiple of `basic_step`.
+      ValueError: if the control step is not a whole number of ms or a multiple of `basic_step`.
     """
     period = 1000 * trained.meta["task"]["control_step"]
     if abs(round(period) - period) > 1e-6 * period:
@@ -256,12 +256,12 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
     """Drives a robot until the simulation ends.
 
     Args:
-        robot: the robot object of Webots.
-        folder: folder with `policy.npz` and `sensors.json`.
-        words: words of controllerArgs.
+      robot: the robot object of Webots.
+      folder: folder with `policy.npz` and `sensors.json`.
+      words: words of controllerArgs.
 
     Raises:
-        ValueError: if the policy, the robot or the orders are invalid.
+      ValueError: if the policy, the robot or the orders are invalid.
     """
     trained = policy.load(folder / "policy.npz")
     sensors = json.loads((folder / "sensors.json").read_text())

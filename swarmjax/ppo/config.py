@@ -295,11 +295,11 @@ def resolve(config: AlgoConfig, networks: Sequence[Network]) -> str:
     """Returns the name of the network that a config means.
 
     Args:
-        config: Names a network, or leaves the choice to the extension.
-        networks: Networks of an extension.
+      config: Names a network, or leaves the choice to the extension.
+      networks: Networks of an extension.
 
     Raises:
-        ConfigError: The name is unknown, or the extension has several networks and none is named.
+      ConfigError: The name is unknown, or the extension has several networks and none is named.
     """
     names = [piece.name for piece in networks]
     if config.network is None and len(names) > 1:

@@ -35,15 +35,15 @@ def resolve(config: AlgoConfig, observation_size: int, action_size: int) -> Back
     is trained in `sequences` on any device.
 
     Args:
-        config: Settings of the learner.
-        observation_size: O.
-        action_size: U.
+      config: Settings of the learner.
+      observation_size: O.
+      action_size: U.
 
     Returns:
-        The backend for `learner.update`.
+      The backend for `learner.update`.
 
     Raises:
-        ConfigError: The config asks for `fused`, but there is no such GPU or the layers do not fit.
+      ConfigError: The config asks for `fused`, but there is no such GPU or the layers do not fit.
     """
     if config.memory != "none":  # the other faster ways handle single samples
         left = config.update_backend == "auto"
@@ -58,10 +58,10 @@ def bind_memory(config: AlgoConfig) -> AlgoConfig:
     """Gives a config the kernels that compute its memory, on a GPU that supports them.
 
     Args:
-        config: Settings of the learner.
+      config: Settings of the learner.
 
     Returns:
-        The config with the kernels; unchanged without memory, or where `resolve` avoids kernels.
+      The config with the kernels; unchanged without memory, or where `resolve` avoids kernels.
     """
     asked = config.memory != "none" and config.update_backend == "auto" and _has_fast()
     if not asked or not _has_tensor_cores() or _is_full_precision():

@@ -16,10 +16,10 @@ def levels(config: AlgoConfig) -> tuple[float, ...]:
     (nikhilbarhate99, commit 728cce8).
 
     Args:
-        config: With `exploration` scheduled.
+      config: With `exploration` scheduled.
 
     Returns:
-        At least one deviation, in action units.
+      At least one deviation, in action units.
     """
     return tuple(_fall(config))
 
@@ -42,11 +42,11 @@ def scheduled_std(config: AlgoConfig, step: jax.Array) -> jax.Array:
     """Looks up the deviation of a control step.
 
     Args:
-        config: With `exploration` scheduled.
-        step: [...], int32, how many control steps came before, at least 0.
+      config: With `exploration` scheduled.
+      step: [...], int32, how many control steps came before, at least 0.
 
     Returns:
-        The deviation, [...]: the first level for steps 0 to `std_interval` - 1, and so on.
+      The deviation, [...]: the first level for steps 0 to `std_interval` - 1, and so on.
     """
     assert config.std_interval is not None
     table = jnp.asarray(levels(config), dtype=float)

@@ -22,17 +22,17 @@ def generalized_advantages(
     after an end, NaN included, never affect steps before it.
 
     Args:
-        rewards: [T, ...], reward of step t.
-        values: [T, ...], value of the observation before step t.
-        next_values: [T, ...], value of the observation after step t, before any reset; ignored
-            where `terminated`.
-        terminated: [T, ...], bool: the task ended here and nothing more can be earned.
-        truncated: [T, ...], bool: the episode was cut here and would have gone on.
-        discount: Per step, 0..1.
-        gae_lambda: 0 (one-step temporal difference) .. 1 (Monte Carlo).
+      rewards: [T, ...], reward of step t.
+      values: [T, ...], value of the observation before step t.
+      next_values: [T, ...], value of the observation after step t, before any reset; ignored
+        where `terminated`.
+      terminated: [T, ...], bool: the task ended here and nothing more can be earned.
+      truncated: [T, ...], bool: the episode was cut here and would have gone on.
+      discount: Per step, 0..1.
+      gae_lambda: 0 (one-step temporal difference) .. 1 (Monte Carlo).
 
     Returns:
-        The advantages and the returns (advantage plus value), both [T, ...].
+      The advantages and the returns (advantage plus value), both [T, ...].
     """
     chex.assert_equal_shape([rewards, values, next_values, terminated, truncated])
     terminated = terminated.astype(bool)

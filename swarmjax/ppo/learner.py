@@ -36,12 +36,12 @@ class LearnerState:
     """The complete state of a learner.
 
     Attributes:
-        params: `{"actor": .., "critic": ..}`.
-        optimizer_state: State of the optimiser that `init` made.
-        normalizer: Moments of the valid observations of all updates so far. A learner that does not
-            normalise keeps the initial ones.
-        explored: [], int32, control steps that the schedule of exploration has counted; None if
-            exploration is learned.
+      params: `{"actor": .., "critic": ..}`.
+      optimizer_state: State of the optimiser that `init` made.
+      normalizer: Moments of the valid observations of all updates so far. A learner that does not
+        normalise keeps the initial ones.
+      explored: [], int32, control steps that the schedule of exploration has counted; None if
+        exploration is learned.
     """
 
     params: Params
@@ -55,17 +55,17 @@ class Batch:
     """The samples of one update. Invalid samples may hold anything, NaN included.
 
     Attributes:
-        observation: [G, N, O], raw.
-        action: [G, N, U], as drawn.
-        log_prob: [G, N], as `act` returned it.
-        advantage: [G, N]. If the config says so, the update normalises it over the valid samples,
-            except for Monte-Carlo returns, which are normalised already.
-        return_: [G, N], target of the critic.
-        valid: [G, N], bool or 0/1.
-        memory: [G, S, H], memory of the S robots of a group before the rollout; None without
-            memory. The N samples of a group are then ordered by step, [T S].
-        begins: [G, N], whether an episode begins with the step; None without memory.
-        state: [G, N, P], of order 1, what the critic sees in addition; None if nothing.
+      observation: [G, N, O], raw.
+      action: [G, N, U], as drawn.
+      log_prob: [G, N], as `act` returned it.
+      advantage: [G, N]. If the config says so, the update normalises it over the valid samples,
+        except for Monte-Carlo returns, which are normalised already.
+      return_: [G, N], target of the critic.
+      valid: [G, N], bool or 0/1.
+      memory: [G, S, H], memory of the S robots of a group before the rollout; None without
+        memory. The N samples of a group are then ordered by step, [T S].
+      begins: [G, N], whether an episode begins with the step; None without memory.
+      state: [G, N, P], of order 1, what the critic sees in addition; None if nothing.
     """
 
     observation: jax.Array
@@ -90,15 +90,15 @@ def init(
     """Makes a new learner.
 
     Args:
-        key: Random key, consumed.
-        config: Settings of networks and optimiser.
-        observation_size: O.
-        action_size: U.
-        updates: Number of updates of the whole run, at least 1: the learning rate's horizon.
-        state_size: P, how many numbers the critic sees in addition.
+      key: Random key, consumed.
+      config: Settings of networks and optimiser.
+      observation_size: O.
+      action_size: U.
+      updates: Number of updates of the whole run, at least 1: the learning rate's horizon.
+      state_size: P, how many numbers the critic sees in addition.
 
     Returns:
-        The learner's first state.
+      The learner's first state.
     """
     params = networks.init_params(key, config, observation_size, action_size, state_size)
     return LearnerState(
@@ -113,13 +113,13 @@ def explore(learner: LearnerState, config: AlgoConfig, steps: jax.Array | int) -
     """Moves a learner along the schedule of exploration, if there is one.
 
     Args:
-        learner: The learner before these steps.
-        config: The config that made the learner.
-        steps: [], how many control steps follow, at least 1.
+      learner: The learner before these steps.
+      config: The config that made the learner.
+      steps: [], how many control steps follow, at least 1.
 
     Returns:
-        The learner with the deviation of the last of these steps; unchanged if exploration is
-        learned.
+      The learner with the deviation of the last of these steps; unchanged if exploration is
+      learned.
     """
     if learner.explored is None:
         return learner
@@ -132,11 +132,11 @@ def explore_anew(learner: LearnerState, config: AlgoConfig) -> LearnerState:
     """Resets the policy's deviation to the initial one, and its schedule to the beginning.
 
     Args:
-        learner: The learner, with any leading axes.
-        config: The config that made the learner.
+      learner: The learner, with any leading axes.
+      config: The config that made the learner.
 
     Returns:
-        The learner with the exploration of a new one.
+      The learner with the exploration of a new one.
     """
     begun = _with_log_std(learner, math.log(config.initial_std))
     return replace(begun, explored=jax.tree.map(jnp.zeros_like, learner.explored))
@@ -159,13 +159,13 @@ def act(
     """Draws actions from a policy without memory.
 
     Args:
-        learner: The learner with the policy.
-        config: The config that made the learner.
-        observation: [..., O], raw.
-        noise: [..., U], standard normal.
+      learner: The learner with the policy.
+      config: The config that made the learner.
+      observation: [..., O], raw.
+      noise: [..., U], standard normal.
 
     Returns:
-        The action mean + std * noise, [..., U], unbounded, and its log density, [...].
+      The action mean + std * noise, [..., U], unbounded, and its log density, [...].
     """
     return recall_act(learner, config, observation, noise, None)[:2]
 
@@ -190,15 +190,15 @@ def recall_act(
     """Draws actions from the policy, and updates its memory.
 
     Args:
-        learner: The learner with the policy.
-        config: The config that made the learner.
-        observation: [..., O], raw.
-        noise: [..., U], standard normal.
-        memory: [..., H], memory of the actor before; None without memory.
+      learner: The learner with the policy.
+      config: The config that made the learner.
+      observation: [..., O], raw.
+      noise: [..., U], standard normal.
+      memory: [..., H], memory of the actor before; None without memory.
 
     Returns:
-        The action mean + std * noise, [..., U], unbounded, its log density, [...], and the memory
-        after.
+      The action mean + std * noise, [..., U], unbounded, its log density, [...], and the memory
+      after.
     """
     seen = normalize(learner, observation)
     mean, std, after = networks.recall_action(learner.params, config, seen, memory)
@@ -226,14 +226,14 @@ def recall_values(
     """Computes the critic's values, and updates its memory.
 
     Args:
-        learner: The learner with the critic.
-        config: The config that made the learner.
-        observation: [..., O], raw.
-        memory: [..., H], memory of the critic before; None without memory.
-        state: [..., P], of order 1, what the critic sees in addition; None if nothing.
+      learner: The learner with the critic.
+      config: The config that made the learner.
+      observation: [..., O], raw.
+      memory: [..., H], memory of the critic before; None without memory.
+      state: [..., P], of order 1, what the critic sees in addition; None if nothing.
 
     Returns:
-        The expected discounted return, [...], and the memory after.
+      The expected discounted return, [...], and the memory after.
     """
     seen = networks.critic_input(normalize(learner, observation), state)
     return networks.recall_value(learner.params, config, seen, memory)
@@ -256,18 +256,18 @@ def update(
     neither the parameters nor the learning rate's schedule.
 
     Args:
-        learner: The learner before the update.
-        config: The config that made the learner.
-        batch: G groups of N samples; `config.num_minibatches` divides G.
-        key: Random key, consumed.
-        updates: The value given to `init`.
-        backend: How to compute the update; `dispatch.resolve` chooses.
-        shards: How the groups are spread over devices. All devices reach the same state.
+      learner: The learner before the update.
+      config: The config that made the learner.
+      batch: G groups of N samples; `config.num_minibatches` divides G.
+      key: Random key, consumed.
+      updates: The value given to `init`.
+      backend: How to compute the update; `dispatch.resolve` chooses.
+      shards: How the groups are spread over devices. All devices reach the same state.
 
     Returns:
-        The state after, and metrics, each []. The metrics of `losses.ppo_loss` and `grad_norm`
-        (before clipping) are means over the steps taken. `skipped_steps` counts the steps that were
-        not finite. `std` is the policy's mean deviation after the update.
+      The state after, and metrics, each []. The metrics of `losses.ppo_loss` and `grad_norm`
+      (before clipping) are means over the steps taken. `skipped_steps` counts the steps that were
+      not finite. `std` is the policy's mean deviation after the update.
     """
     _check(config, batch, shards)
     counted = batch.valid.astype(bool)

@@ -18,16 +18,16 @@ class Minibatch:
     """The samples of a minibatch. Invalid ones must be finite; they do not count.
 
     Attributes:
-        observation: [B, O], normalised.
-        action: [B, U], as drawn.
-        log_prob: [B], of the action under the policy that drew it.
-        advantage: [B].
-        return_: [B], target of the critic.
-        valid: [B], bool or 0/1.
-        memory: [B', H], memory before the first step of B' sequences; None without memory. Samples
-            are then ordered by step, [T B'].
-        begins: [B], whether an episode begins with the step; None without memory.
-        state: [B, P], of order 1, what the critic sees in addition; None if nothing.
+      observation: [B, O], normalised.
+      action: [B, U], as drawn.
+      log_prob: [B], of the action under the policy that drew it.
+      advantage: [B].
+      return_: [B], target of the critic.
+      valid: [B], bool or 0/1.
+      memory: [B', H], memory before the first step of B' sequences; None without memory. Samples
+        are then ordered by step, [T B'].
+      begins: [B], whether an episode begins with the step; None without memory.
+      state: [B, P], of order 1, what the critic sees in addition; None if nothing.
     """
 
     observation: jax.Array
@@ -65,16 +65,16 @@ def ppo_loss(
     the minibatches is exactly the mean over the batch.
 
     Args:
-        params: Parameters of the actor and the critic.
-        minibatch: B samples.
-        config: Clip range and costs.
-        expected_valid: [], valid samples of the whole batch / number of minibatches; at least 1 is
-            used.
+      params: Parameters of the actor and the critic.
+      minibatch: B samples.
+      config: Clip range and costs.
+      expected_valid: [], valid samples of the whole batch / number of minibatches; at least 1 is
+        used.
 
     Returns:
-        The loss [] and its parts, each [] and weighted in the same way: `policy_loss`,
-        `value_loss`, `bound_loss`, `entropy` (nats), `approx_kl` (nats, at least 0) and
-        `clip_fraction` (0..1).
+      The loss [] and its parts, each [] and weighted in the same way: `policy_loss`,
+      `value_loss`, `bound_loss`, `entropy` (nats), `approx_kl` (nats, at least 0) and
+      `clip_fraction` (0..1).
     """
     chex.assert_rank([minibatch.observation, minibatch.action], 2)
     chex.assert_rank(
@@ -114,12 +114,12 @@ def evaluate(
     """Runs actor and critic on samples; with memory, step by step.
 
     Args:
-        params: Parameters of the actor and the critic.
-        minibatch: B samples.
-        config: The config that made `params`.
+      params: Parameters of the actor and the critic.
+      minibatch: B samples.
+      config: The config that made `params`.
 
     Returns:
-        Mean action [B, U], deviation [U] and value [B].
+      Mean action [B, U], deviation [U] and value [B].
     """
     seen, memory = minibatch.observation, minibatch.memory
     judged = networks.critic_input(seen, minibatch.state)

@@ -43,10 +43,10 @@ class Gru(nn.Module):
     """A GRU whose three gates lie side by side: reset, update, candidate.
 
     Attributes:
-        size: H.
-        uniform: Whether weights and biases begin within 1 / sqrt(H), as in PyTorch's GRU
-            (`torch.nn.RNNBase.reset_parameters`).
-        kernels: Module whose `remember` and `remember_all` compute the same on a GPU; None: XLA.
+      size: H.
+      uniform: Whether weights and biases begin within 1 / sqrt(H), as in PyTorch's GRU
+        (`torch.nn.RNNBase.reset_parameters`).
+      kernels: Module whose `remember` and `remember_all` compute the same on a GPU; None: XLA.
     """
 
     size: int
@@ -60,14 +60,14 @@ class Gru(nn.Module):
         """Updates the memory with one observation, or with a sequence of them.
 
         Args:
-            features: [B, F], or [T, B, F] of a sequence.
-            memory: [B, H] before.
-            begins: [T, B] of a sequence, whether an episode begins with this step. The memory is
-                then cleared first.
+          features: [B, F], or [T, B, F] of a sequence.
+          memory: [B, H] before.
+          begins: [T, B] of a sequence, whether an episode begins with this step. The memory is
+            then cleared first.
 
         Returns:
-            The memory [.., H] after each observation, for the heads, and the memory [B, H] after
-            the last one.
+          The memory [.., H] after each observation, for the heads, and the memory [B, H] after
+          the last one.
         """
         if self.kernels is not None and not self.is_initializing():
             return self._by_kernels(features, memory, begins)
@@ -112,12 +112,12 @@ def remember(seen: jax.Array, recalled: jax.Array, memory: jax.Array) -> jax.Arr
     """Computes the memory after an observation.
 
     Args:
-        seen: [B, 3 H], input weights times features, with their bias.
-        recalled: [B, 3 H], recurrent weights times memory, with their bias.
-        memory: [B, H] before.
+      seen: [B, 3 H], input weights times features, with their bias.
+      recalled: [B, 3 H], recurrent weights times memory, with their bias.
+      memory: [B, H] before.
 
     Returns:
-        The memory [B, H] after, within -1..1.
+      The memory [B, H] after, within -1..1.
     """
     reset, update, candidate = jnp.split(seen, 3, axis=-1)
     reset_, update_, candidate_ = jnp.split(recalled, 3, axis=-1)
@@ -137,14 +137,14 @@ def remember_all(
     fill a small part of a GPU.
 
     Args:
-        kernel: [H, 3 H], recurrent weights.
-        bias: [3 H], recurrent bias.
-        seen: [T, B, 3 H], as for `remember`.
-        begins: [T, B], whether an episode begins with the step.
-        memory: [B, H] before the first step.
+      kernel: [H, 3 H], recurrent weights.
+      bias: [3 H], recurrent bias.
+      seen: [T, B, 3 H], as for `remember`.
+      begins: [T, B], whether an episode begins with the step.
+      memory: [B, H] before the first step.
 
     Returns:
-        The memory [T, B, H] after each step.
+      The memory [T, B, H] after each step.
     """
 
     def step(memory: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:

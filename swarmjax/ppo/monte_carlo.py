@@ -17,12 +17,12 @@ def monte_carlo_returns(reward: jax.Array, boundary: jax.Array, *, discount: flo
     episode.
 
     Args:
-        reward: [T, ...], reward of step t.
-        boundary: [T, ...], bool: the return of step t ends with its reward.
-        discount: Per step, 0..1.
+      reward: [T, ...], reward of step t.
+      boundary: [T, ...], bool: the return of step t ends with its reward.
+      discount: Per step, 0..1.
 
     Returns:
-        The returns, [T, ...].
+      The returns, [T, ...].
     """
     chex.assert_equal_shape([reward, boundary])
 
@@ -45,12 +45,12 @@ def normalize(returns: jax.Array, valid: jax.Array, shards: Shards = ALONE) -> j
     The deviation is the unbiased one, which divides by N - 1, plus 1e-7.
 
     Args:
-        returns: [...].
-        valid: [...], bool or 0/1.
-        shards: How the samples are spread over devices.
+      returns: [...].
+      valid: [...], bool or 0/1.
+      shards: How the samples are spread over devices.
 
     Returns:
-        The normalised returns, [...], including those that are not valid.
+      The normalised returns, [...], including those that are not valid.
     """
     chex.assert_equal_shape([returns, valid])
     valid = valid.astype(bool)

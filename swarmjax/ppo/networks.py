@@ -138,12 +138,12 @@ def _hear(config: AlgoConfig, seen: jax.Array) -> jax.Array:
     and the number of robots therefore do not matter.
 
     Args:
-        config: Gives the neighbours' place.
-        seen: [B, O], or [B, O + P] for a critic that sees the state too.
+      config: Gives the neighbours' place.
+      seen: [B, O], or [B, O + P] for a critic that sees the state too.
 
     Returns:
-        [B, O - K W + E], or with P more. E is the width of the first hidden layer. Without
-        neighbour messages, `seen` unchanged.
+      [B, O - K W + E], or with P more. E is the width of the first hidden layer. Without
+      neighbour messages, `seen` unchanged.
     """
     hearing = config.hearing
     if hearing is None:
@@ -192,17 +192,17 @@ def init_params(
     """Draws the parameters of a new actor and a new critic.
 
     Args:
-        key: Random key, consumed.
-        config: Layers, their initialisation, and the first standard deviation.
-        observation_size: O.
-        action_size: U.
-        state_size: P, how many numbers the critic sees in addition.
+      key: Random key, consumed.
+      config: Layers, their initialisation, and the first standard deviation.
+      observation_size: O.
+      action_size: U.
+      state_size: P, how many numbers the critic sees in addition.
 
     Returns:
-        `{"actor": {"torso": {"hidden_0": ..}, "mean": .., "log_std": [U]}, "critic": {"torso":
-        {"hidden_0": ..}, "value": ..}}`. Each layer is a dict of `kernel` [in, out] and `bias`
-        [out]. With `config.memory`, each network also has `{"memory": {"input": .., "recurrent":
-        ..}}`.
+      `{"actor": {"torso": {"hidden_0": ..}, "mean": .., "log_std": [U]}, "critic": {"torso":
+      {"hidden_0": ..}, "value": ..}}`. Each layer is a dict of `kernel` [in, out] and `bias`
+      [out]. With `config.memory`, each network also has `{"memory": {"input": .., "recurrent":
+      ..}}`.
     """
     actor_key, critic_key = jax.random.split(key)
     seen, judged = (jnp.zeros(n) for n in (observation_size, observation_size + state_size))
@@ -218,11 +218,11 @@ def begin_memory(config: AlgoConfig, shape: tuple[int, ...]) -> Recall | None:
     """Returns the memory of episodes that begin.
 
     Args:
-        config: Whether there is a memory, and its size.
-        shape: Leading axes.
+      config: Whether there is a memory, and its size.
+      shape: Leading axes.
 
     Returns:
-        [*shape, H] each, or None without a memory.
+      [*shape, H] each, or None without a memory.
     """
     if config.memory == "none":
         return None
@@ -235,14 +235,14 @@ def action_distribution(
     """Computes the diagonal Gaussian of the action, for a policy without memory.
 
     Args:
-        params: Result of `init_params`.
-        config: The config that made `params`.
-        observation: [B, O], normalised.
+      params: Result of `init_params`.
+      config: The config that made `params`.
+      observation: [B, O], normalised.
 
     Returns:
-        The mean [B, U], within -1..1 if the output is tanh, otherwise unbounded, and the standard
-        deviation [U]. The deviation does not depend on the observation. If it is scheduled, it has
-        no gradient.
+      The mean [B, U], within -1..1 if the output is tanh, otherwise unbounded, and the standard
+      deviation [U]. The deviation does not depend on the observation. If it is scheduled, it has
+      no gradient.
     """
     return recall_action(params, config, observation, None)[:2]
 
@@ -251,12 +251,12 @@ def value(params: Params, config: AlgoConfig, observation: jax.Array) -> jax.Arr
     """Computes the value of an observation, for a critic without memory.
 
     Args:
-        params: Result of `init_params`.
-        config: The config that made `params`.
-        observation: [B, O + P], normalised, as in `recall_value`.
+      params: Result of `init_params`.
+      config: The config that made `params`.
+      observation: [B, O + P], normalised, as in `recall_value`.
 
     Returns:
-        The expected discounted return, [B].
+      The expected discounted return, [B].
     """
     return recall_value(params, config, observation, None)[0]
 
@@ -271,15 +271,15 @@ def recall_action(
     """Computes the diagonal Gaussian of the action, and the memory.
 
     Args:
-        params: Result of `init_params`.
-        config: The config that made `params`.
-        observation: [B, O], normalised, or [T, B, O] of sequences.
-        memory: [B, H], memory of the actor before; None without memory.
-        begins: [T, B] of sequences, whether an episode begins with the step; None for a single
-            step.
+      params: Result of `init_params`.
+      config: The config that made `params`.
+      observation: [B, O], normalised, or [T, B, O] of sequences.
+      memory: [B, H], memory of the actor before; None without memory.
+      begins: [T, B] of sequences, whether an episode begins with the step; None for a single
+        step.
 
     Returns:
-        Mean and standard deviation as in `action_distribution`, and the memory [B, H] after.
+      Mean and standard deviation as in `action_distribution`, and the memory [B, H] after.
     """
     _check_input(params["actor"], observation, config)
     actor = _Actor(config, params["actor"]["log_std"].shape[-1])
@@ -300,15 +300,15 @@ def recall_value(
     """Computes the value of an observation, and the memory.
 
     Args:
-        params: Result of `init_params`.
-        config: The config that made `params`.
-        observation: [B, O + P] or [T, B, O + P], normalised: the policy's observation, followed by
-            the state that the critic sees in addition, if any.
-        memory: [B, H], memory of the critic before; None without memory.
-        begins: As in `recall_action`.
+      params: Result of `init_params`.
+      config: The config that made `params`.
+      observation: [B, O + P] or [T, B, O + P], normalised: the policy's observation, followed by
+        the state that the critic sees in addition, if any.
+      memory: [B, H], memory of the critic before; None without memory.
+      begins: As in `recall_action`.
 
     Returns:
-        The value [B], or [T, B], and the memory [B, H] after.
+      The value [B], or [T, B], and the memory [B, H] after.
     """
     _check_input(params["critic"], observation, config)
     output = _Critic(config).apply({"params": params["critic"]}, observation, memory, begins)
@@ -319,11 +319,11 @@ def critic_input(observation: jax.Array, state: jax.Array | None) -> jax.Array:
     """Joins the critic's inputs.
 
     Args:
-        observation: [B, O], normalised.
-        state: [B, P], what the critic sees in addition; None if nothing.
+      observation: [B, O], normalised.
+      state: [B, P], what the critic sees in addition; None if nothing.
 
     Returns:
-        [B, O + P], for `recall_value`.
+      [B, O + P], for `recall_value`.
     """
     return observation if state is None else jnp.concatenate([observation, state], axis=-1)
 
@@ -332,10 +332,10 @@ def beyond_range(mean: jax.Array) -> jax.Array:
     """Computes how far a mean action lies beyond the range of commands.
 
     Args:
-        mean: [B, U], -1..1 spans the commands.
+      mean: [B, U], -1..1 spans the commands.
 
     Returns:
-        [B, U]: 0 within the range, negative below it, positive above it.
+      [B, U]: 0 within the range, negative below it, positive above it.
     """
     return mean - jnp.clip(mean, -1.0, 1.0)
 
@@ -344,12 +344,12 @@ def log_prob(mean: jax.Array, std: jax.Array, action: jax.Array) -> jax.Array:
     """Computes the log density of actions under a diagonal Gaussian.
 
     Args:
-        mean: [B, U].
-        std: [U], above 0.
-        action: [B, U], as drawn, before any clipping.
+      mean: [B, U].
+      std: [U], above 0.
+      action: [B, U], as drawn, before any clipping.
 
     Returns:
-        The log density summed over U, [B].
+      The log density summed over U, [B].
     """
     chex.assert_equal_shape([mean, action])
     chex.assert_shape(std, mean.shape[-1:])
@@ -362,10 +362,10 @@ def entropy(std: jax.Array) -> jax.Array:
     """Computes the differential entropy of a diagonal Gaussian.
 
     Args:
-        std: [U], above 0.
+      std: [U], above 0.
 
     Returns:
-        The entropy in nats, [].
+      The entropy in nats, [].
     """
     chex.assert_rank(std, 1)
     return jnp.sum(jnp.log(std) + 0.5 * math.log(2.0 * math.pi * math.e))
@@ -385,13 +385,13 @@ def bind_hearing(config: AlgoConfig, observation_size: int, count: int, width: i
     """Adds the place of neighbours in an observation, its end, to a config.
 
     Args:
-        config: Settings of the learner.
-        observation_size: O.
-        count: K, how many neighbours a robot hears; 0: robots do not hear.
-        width: W, entries for each neighbour.
+      config: Settings of the learner.
+      observation_size: O.
+      count: K, how many neighbours a robot hears; 0: robots do not hear.
+      width: W, entries for each neighbour.
 
     Returns:
-        The config with its `hearing`; unchanged if robots do not hear.
+      The config with its `hearing`; unchanged if robots do not hear.
     """
     if not count:
         return config
@@ -404,16 +404,16 @@ def bind(
     """Adds the module that a config names to the config.
 
     Args:
-        config: Names a network, or leaves the choice to the extension.
-        networks: Networks of an extension.
-        observation_size: O.
-        state_size: P, how many numbers the critic sees in addition.
+      config: Names a network, or leaves the choice to the extension.
+      networks: Networks of an extension.
+      observation_size: O.
+      state_size: P, how many numbers the critic sees in addition.
 
     Returns:
-        The config with the module as its `torso`; unchanged for `mlp`.
+      The config with the module as its `torso`; unchanged for `mlp`.
 
     Raises:
-        ConfigError: The network is missing, or does not return features.
+      ConfigError: The network is missing, or does not return features.
     """
     name = resolve(config, networks)
     found = {piece.name: piece for piece in networks}

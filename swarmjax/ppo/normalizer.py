@@ -21,10 +21,10 @@ class Normalizer:
     """Mean and variance of the observations seen so far.
 
     Attributes:
-        count: [], float32, number of observations. It rounds beyond 2**24. That is harmless: it
-            only weighs a batch against the past, and a relative error of 2**-24 is negligible.
-        mean: [O].
-        variance: [O], of the population; 1 before the first observation.
+      count: [], float32, number of observations. It rounds beyond 2**24. That is harmless: it
+        only weighs a batch against the past, and a relative error of 2**-24 is negligible.
+      mean: [O].
+      variance: [O], of the population; 1 before the first observation.
     """
 
     count: jax.Array
@@ -56,13 +56,13 @@ def update(
     which avoids subtracting large squares.
 
     Args:
-        normalizer: Moments so far.
-        observation: [..., O]; may hold anything, NaN included, where not valid.
-        valid: [...], bool or 0/1, the observations to count.
-        shards: How the observations are spread over devices.
+      normalizer: Moments so far.
+      observation: [..., O]; may hold anything, NaN included, where not valid.
+      valid: [...], bool or 0/1, the observations to count.
+      shards: How the observations are spread over devices.
 
     Returns:
-        The moments of all observations; unchanged if none is valid.
+      The moments of all observations; unchanged if none is valid.
     """
     chex.assert_shape(observation, (*valid.shape, *normalizer.mean.shape))
     axes = tuple(range(valid.ndim))
@@ -87,12 +87,12 @@ def normalize(normalizer: Normalizer, observation: jax.Array, limit: float) -> j
     """Shifts and scales observations to mean 0 and standard deviation 1.
 
     Args:
-        normalizer: Moments so far.
-        observation: [..., O].
-        limit: Bound of the result's magnitude.
+      normalizer: Moments so far.
+      observation: [..., O].
+      limit: Bound of the result's magnitude.
 
     Returns:
-        The normalised observations, [..., O], within plus or minus `limit`.
+      The normalised observations, [..., O], within plus or minus `limit`.
     """
     chex.assert_axis_dimension(observation, -1, normalizer.mean.shape[-1])
     return jnp.clip((observation - normalizer.mean) / normalizer.std, -limit, limit)

@@ -40,8 +40,8 @@ def gradient_steps(config: AlgoConfig, updates: int) -> int:
     """Counts the gradient steps of a run, including those without a valid sample.
 
     Args:
-        config: Passes over each rollout, and minibatches of each pass.
-        updates: Number of updates of the whole run.
+      config: Passes over each rollout, and minibatches of each pass.
+      updates: Number of updates of the whole run.
     """
     return updates * config.epochs * config.num_minibatches
 
@@ -53,11 +53,11 @@ def learning_rates(config: AlgoConfig, updates: int) -> dict[str, float]:
     sum of rates over the run at or below that of `_FULL_RATE_STEPS` steps that fall linearly to 0.
 
     Args:
-        config: Learning rates, or None for the rule; their schedule.
-        updates: Number of updates of the whole run.
+      config: Learning rates, or None for the rule; their schedule.
+      updates: Number of updates of the whole run.
 
     Returns:
-        The rate of the `actor` and of the `critic`.
+      The rate of the `actor` and of the `critic`.
     """
     mean = _MEAN_OF_SCHEDULE[config.learning_rate_schedule]
     most = _FULL_RATE_STEPS * _MEAN_OF_SCHEDULE["linear"]
@@ -70,11 +70,11 @@ def make(config: AlgoConfig, updates: int) -> optax.GradientTransformation:
     """Makes the optimiser: one clip over all gradients, if any, then Adam for each network.
 
     Args:
-        config: Learning rates, their schedule, and the norm at which gradients are clipped.
-        updates: Number of updates of the whole run: the learning rate's horizon.
+      config: Learning rates, their schedule, and the norm at which gradients are clipped.
+      updates: Number of updates of the whole run: the learning rate's horizon.
 
     Returns:
-        An optimiser for `{"actor": .., "critic": ..}`.
+      An optimiser for `{"actor": .., "critic": ..}`.
     """
     rates, steps = learning_rates(config, updates), gradient_steps(config, updates)
 
@@ -111,16 +111,16 @@ def take(
     would break the parameters. After some skips it also takes such a step anyway.
 
     Args:
-        config: Settings of the optimiser.
-        updates: The value given to `make`.
-        progress: Parameters and the optimiser's state before.
-        found: The gradient, and the metrics of its loss.
-        any_valid: [], whether the gradient includes a valid sample.
-        shards: How the samples are spread over devices.
+      config: Settings of the optimiser.
+      updates: The value given to `make`.
+      progress: Parameters and the optimiser's state before.
+      found: The gradient, and the metrics of its loss.
+      any_valid: [], whether the gradient includes a valid sample.
+      shards: How the samples are spread over devices.
 
     Returns:
-        Parameters and the optimiser's state after, and the metrics with `grad_norm`, `taken_steps`
-        and `skipped_steps`. In a skipped step all metrics but `skipped_steps` are zero.
+      Parameters and the optimiser's state after, and the metrics with `grad_norm`, `taken_steps`
+      and `skipped_steps`. In a skipped step all metrics but `skipped_steps` are zero.
     """
     params, optimizer_state = progress
     # One sum for all: on several devices each sum takes tens of microseconds, whatever its size.
@@ -147,11 +147,11 @@ def mean_of_taken(metrics: Metrics) -> Metrics:
     """Averages the metrics over the steps of an update.
 
     Args:
-        metrics: Metrics of its steps, any shape, from `take`.
+      metrics: Metrics of its steps, any shape, from `take`.
 
     Returns:
-        The means over the steps taken, [], and the number of `skipped_steps`. If no step was taken,
-        the means are NaN if one was skipped, and 0 otherwise.
+      The means over the steps taken, [], and the number of `skipped_steps`. If no step was taken,
+      the means are NaN if one was skipped, and 0 otherwise.
     """
     taken, skipped = jnp.sum(metrics["taken_steps"]), jnp.sum(metrics["skipped_steps"])
     # Exactly 1 if all steps of the update were taken.

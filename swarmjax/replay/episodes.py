@@ -31,17 +31,17 @@ def replay(
     """Records the requested episodes.
 
     Args:
-        settings: The replay's settings.
-        entrants: The policies that drive.
-        progress: Shows the progress.
+      settings: The replay's settings.
+      entrants: The policies that drive.
+      progress: Shows the progress.
 
     Returns:
-        The recordings of each level, in the order in which the levels were named, or the worst
-        first.
+      The recordings of each level, in the order in which the levels were named, or the worst
+      first.
 
     Raises:
-        PolicyError: If a policy does not fit a level's stage.
-        ConfigError: If there is no such level, or the physics breaks down.
+      PolicyError: If a policy does not fit a level's stage.
+      ConfigError: If there is no such level, or the physics breaks down.
     """
     chosen = _cells(settings)
     _check_worst(settings, sum(len(cell.episodes) for cell in chosen))
@@ -106,12 +106,12 @@ def worst(trials: Sequence[Trial], count: int) -> list[Pick]:
     """Chooses the episodes that went worst for the first policy.
 
     Args:
-        trials: The policy's results on each cell.
-        count: How many episodes to choose.
+      trials: The policy's results on each cell.
+      count: How many episodes to choose.
 
     Returns:
-        The worst episodes first. The order is by fewest targets reached, then by most contacts per
-        robot, then by longest duration, then by level number.
+      The worst episodes first. The order is by fewest targets reached, then by most contacts per
+      robot, then by longest duration, then by level number.
     """
     picks = [Pick(i, j) for i, each in enumerate(trials) for j in range(len(each.cell.episodes))]
     reached, contacts, time = (

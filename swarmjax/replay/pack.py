@@ -38,12 +38,12 @@ def pack(about: Mapping[str, Any], episodes: Sequence[ReplayEpisode], reach: flo
     """Packs recordings.
 
     Args:
-        about: Further entries of the header.
-        episodes: The recordings of each level.
-        reach: Length of a ray that meets nothing, m.
+      about: Further entries of the header.
+      episodes: The recordings of each level.
+      reach: Length of a ray that meets nothing, m.
 
     Returns:
-        A zlib stream.
+      A zlib stream.
     """
     listed, tables = [], []
     for episode in episodes:
@@ -66,14 +66,14 @@ def fold(name: str, table: np.ndarray) -> tuple[bytes, int]:
     """Packs one series.
 
     Args:
-        name: Name of the series.
-        table: [N, C] whole numbers of any type, with absolute values below `MOST`.
+      name: Name of the series.
+      table: [N, C] whole numbers of any type, with absolute values below `MOST`.
 
     Returns:
-        The bytes, and the number of bytes per number, 1 to 4.
+      The bytes, and the number of bytes per number, 1 to 4.
 
     Raises:
-        ConfigError: If a number is too large.
+      ConfigError: If a number is too large.
     """
     largest = np.abs(table).max()
     if not largest < MOST:
@@ -91,10 +91,10 @@ def colours(robots: int) -> list[str]:
     """Gives every robot a colour.
 
     Args:
-        robots: Number of robots.
+      robots: Number of robots.
 
     Returns:
-        One colour per robot, as #rrggbb.
+      One colour per robot, as #rrggbb.
     """
     if robots <= len(_PALETTE):
         return list(_PALETTE[:robots])
@@ -109,10 +109,10 @@ def dark(reach: float) -> int:
     """Returns the whole number that stands for a ray that meets nothing.
 
     Args:
-        reach: Length of such a ray, m.
+      reach: Length of such a ray, m.
 
     Returns:
-        A number larger than that of any shorter ray.
+      A number larger than that of any shorter ray.
     """
     return int(np.ceil(reach / RAY))
 

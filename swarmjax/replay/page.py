@@ -23,13 +23,13 @@ def page(
     """Lays out the page.
 
     Args:
-        settings: The replay's settings.
-        policies: The policies that drive.
-        episodes: The recordings of each level.
-        words: The command that makes the page.
+      settings: The replay's settings.
+      policies: The policies that drive.
+      episodes: The recordings of each level.
+      words: The command that makes the page.
 
     Returns:
-        HTML. Text about files and settings is either escaped or inside the packed data.
+      HTML. Text about files and settings is either escaped or inside the packed data.
     """
     task = settings.task
     header = {
@@ -52,11 +52,11 @@ def fill(title: str, packed: bytes) -> str:
     """Puts title and data into the template.
 
     Args:
-        title: Title of the page.
-        packed: The packed recordings, from `pack.pack`.
+      title: Title of the page.
+      packed: The packed recordings, from `pack.pack`.
 
     Returns:
-        HTML.
+      HTML.
     """
     script = "\n".join(map(builder.read, _SCRIPTS))
     return builder.render(

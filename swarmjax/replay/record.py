@@ -24,10 +24,10 @@ class ReplayScene:
     """The parts of an episode that do not move.
 
     Attributes:
-        side: Side of the arena, m.
-        target: [R, 2] x (m), y (m).
-        box: [B, 5] x (m), y (m), yaw (rad), half edges (m) of the boxes that form the obstacles.
-        sensor: [R, K, 4] origin (m) and unit direction of each infrared ray, in the robot's frame.
+      side: Side of the arena, m.
+      target: [R, 2] x (m), y (m).
+      box: [B, 5] x (m), y (m), yaw (rad), half edges (m) of the boxes that form the obstacles.
+      sensor: [R, K, 4] origin (m) and unit direction of each infrared ray, in the robot's frame.
     """
 
     side: float
@@ -41,18 +41,18 @@ class Recording:
     """A recorded episode. N is the number of control steps plus one: row 0 is the start.
 
     Attributes:
-        scene: The parts that do not move.
-        pose: [N, R, 3] x (m), y (m), yaw (rad).
-        ray: [N, R, K] length of each infrared ray, m; at most the sensor's range.
-        distance: [N, R] to the target, m.
-        reward: [N, R] weighted reward of the step that led here, by term. It is 0 at the start
-            and, with `task.arrival=latch`, after arrival.
-        touching: [N, R, 3] whether the robot touches something of each kind of `gaps.KINDS`.
-        contacts: [N, R, 3] contacts so far of each kind.
-        arrived: [N, R] whether the robot has arrived; with `task.arrival=hold`, whether it is
-            within its target.
-        arrival: [R] control steps until the robot arrived, 0 if it never did; with `hold`, until
-            it was within its target for good.
+      scene: The parts that do not move.
+      pose: [N, R, 3] x (m), y (m), yaw (rad).
+      ray: [N, R, K] length of each infrared ray, m; at most the sensor's range.
+      distance: [N, R] to the target, m.
+      reward: [N, R] weighted reward of the step that led here, by term. It is 0 at the start
+        and, with `task.arrival=latch`, after arrival.
+      touching: [N, R, 3] whether the robot touches something of each kind of `gaps.KINDS`.
+      contacts: [N, R, 3] contacts so far of each kind.
+      arrived: [N, R] whether the robot has arrived; with `task.arrival=hold`, whether it is
+        within its target.
+      arrival: [R] control steps until the robot arrived, 0 if it never did; with `hold`, until
+        it was within its target for good.
     """
 
     scene: ReplayScene
@@ -70,9 +70,9 @@ class ReplayEpisode(NamedTuple):
     """The recordings of one level.
 
     Attributes:
-        label: Name of the level for people.
-        level: Number of the level.
-        runs: One recording per policy.
+      label: Name of the level for people.
+      level: Number of the level.
+      runs: One recording per policy.
     """
 
     label: str
@@ -84,13 +84,13 @@ class Frame(NamedTuple):
     """All arenas after a control step. Several frames have a leading axis N.
 
     Attributes:
-        pose: [A, R, 3] x (m), y (m), yaw (rad).
-        ray: [A, R, K] ray lengths up to the range of the electronics, m.
-        distance: [A, R] to the target, m.
-        touching: [A, R, 3] whether the robot touches something of each kind.
-        arrived: [A, R] whether the robot has arrived; with `hold`, whether it is within its target.
-        contacts: [A, R, 3] contacts so far of each kind.
-        action: [A, R, 2] action that led here, clipped to -1..1; 0 at the start.
+      pose: [A, R, 3] x (m), y (m), yaw (rad).
+      ray: [A, R, K] ray lengths up to the range of the electronics, m.
+      distance: [A, R] to the target, m.
+      touching: [A, R, 3] whether the robot touches something of each kind.
+      arrived: [A, R] whether the robot has arrived; with `hold`, whether it is within its target.
+      contacts: [A, R, 3] contacts so far of each kind.
+      action: [A, R, 2] action that led here, clipped to -1..1; 0 at the start.
     """
 
     pose: np.ndarray
@@ -106,14 +106,14 @@ class Steps(NamedTuple):
     """The inputs of the reward of control steps, as in `task.reward.Step`; no JAX.
 
     Attributes:
-        distance_before: [..., R] to the target before the step, m.
-        distance: [..., R] to the target after the step, m.
-        infrared: [..., R, K] ray lengths after the step, m.
-        sensor_range: Range of the sensors, m.
-        arrives: [..., R] whether the robot arrived in this step; with `hold`, whether all did.
-        contact_begins: [..., R, 3] whether a contact of each kind began in this step.
-        touching: [..., R, 3] whether the robot touches something of each kind after the step.
-        outside: [..., R] whether the robot had not arrived when the step began; None: all had not.
+      distance_before: [..., R] to the target before the step, m.
+      distance: [..., R] to the target after the step, m.
+      infrared: [..., R, K] ray lengths after the step, m.
+      sensor_range: Range of the sensors, m.
+      arrives: [..., R] whether the robot arrived in this step; with `hold`, whether all did.
+      contact_begins: [..., R, 3] whether a contact of each kind began in this step.
+      touching: [..., R, 3] whether the robot touches something of each kind after the step.
+      outside: [..., R] whether the robot had not arrived when the step began; None: all had not.
     """
 
     distance_before: np.ndarray
@@ -130,11 +130,11 @@ def terms(steps: Steps, weights: RewardConfig) -> dict[str, np.ndarray]:
     """Computes the terms of the reward; the first two are those of the paper's equation 3.
 
     Args:
-        steps: Control steps.
-        weights: Weights of the terms.
+      steps: Control steps.
+      weights: Weights of the terms.
 
     Returns:
-        [..., R] by name: each term times its weight. Terms with weight 0 are left out.
+      [..., R] by name: each term times its weight. Terms with weight 0 are left out.
     """
     under_way = np.ones(steps.distance.shape) if steps.outside is None else steps.outside
     found = {
@@ -154,8 +154,8 @@ def weights(trained: Policy, task: TaskConfig) -> RewardConfig:
     """Returns the weights that a policy was trained with; those of `task` if its file has none.
 
     Raises:
-        ConfigError: If the weights in the file are invalid.
-        PolicyError: If the file's task is invalid.
+      ConfigError: If the weights in the file are invalid.
+      PolicyError: If the file's task is invalid.
     """
     stored = trained.meta["config"].get("task", {})
     if not isinstance(stored, dict):
@@ -172,16 +172,16 @@ def record(
     """Runs episodes side by side and records everything that a replay shows.
 
     Args:
-        judge: Everything that the arenas share.
-        levels: The arenas' levels.
-        report: Called after each control step with the number of steps added.
+      judge: Everything that the arenas share.
+      levels: The arenas' levels.
+      report: Called after each control step with the number of steps added.
 
     Returns:
-        Each episode up to the step in which all robots had arrived or the time was up.
+      Each episode up to the step in which all robots had arrived or the time was up.
 
     Raises:
-        ConfigError: If the physics of an episode breaks down, or the policy's weights are invalid.
-        PolicyError: If the policy's task is invalid.
+      ConfigError: If the physics of an episode breaks down, or the policy's weights are invalid.
+      PolicyError: If the policy's task is invalid.
     """
     earning = weights(judge.policy, judge.config.task)
     own = own_terms(judge.policy, judge.config.extensions, earning)
@@ -216,12 +216,12 @@ def own_terms(
     """Finds the reward terms of an extension that a policy was trained with.
 
     Args:
-        trained: The policy; its file has the digest of each term.
-        extensions: As the setting of that name.
-        earning: The policy's weights.
+      trained: The policy; its file has the digest of each term.
+      extensions: As the setting of that name.
+      earning: The policy's weights.
 
     Returns:
-        Each term whose code has not changed, with its weight. Terms with weight 0 are left out.
+      Each term whose code has not changed, with its weight. Terms with weight 0 are left out.
     """
     digests = trained.meta.get("extensions", {}).get("reward", {})
     return tuple(

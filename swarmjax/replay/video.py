@@ -43,7 +43,7 @@ def check() -> None:
     """Checks that videos can be made on this machine.
 
     Raises:
-        ConfigError: If imageio or OpenGL is missing.
+      ConfigError: If imageio or OpenGL is missing.
     """
     try:
         import imageio_ffmpeg
@@ -74,13 +74,13 @@ def write(
     """Writes a video of episodes one after the other, with two policies side by side.
 
     Args:
-        path: Path of the MP4 file.
-        settings: The replay's settings.
-        episodes: The recordings of each level.
-        report: Called after each picture with the number of pictures added.
+      path: Path of the MP4 file.
+      settings: The replay's settings.
+      episodes: The recordings of each level.
+      report: Called after each picture with the number of pictures added.
 
     Raises:
-        OSError: If the file cannot be written.
+      OSError: If the file cannot be written.
     """
     import imageio.v2 as imageio
 
@@ -96,11 +96,11 @@ def count(settings: ReplayConfig, episodes: Sequence[ReplayEpisode]) -> int:
     """Counts the pictures of a video.
 
     Args:
-        settings: The replay's settings.
-        episodes: The recordings of each level.
+      settings: The replay's settings.
+      episodes: The recordings of each level.
 
     Returns:
-        The number of pictures, at `FRAME_RATE` per second.
+      The number of pictures, at `FRAME_RATE` per second.
     """
     return sum(len(rows(settings, each.runs)) for each in episodes)
 
@@ -109,12 +109,12 @@ def rows(settings: ReplayConfig, runs: Sequence[Recording]) -> list[int]:
     """Lists which row of a level's recordings each picture shows.
 
     Args:
-        settings: The replay's settings, with the control step (s) and the speed of the video.
-        runs: Recordings of the level, one per policy, [N, ...] each; N may differ.
+      settings: The replay's settings, with the control step (s) and the speed of the video.
+      runs: Recordings of the level, one per policy, [N, ...] each; N may differ.
 
     Returns:
-        A row of the longest recording for each picture, from 0. The last row stays for `HOLD`
-        seconds.
+      A row of the longest recording for each picture, from 0. The last row stays for `HOLD`
+      seconds.
     """
     last = max(len(run.pose) for run in runs) - 1
     pace = settings.video_speed / (FRAME_RATE * settings.task.control_step)  # rows per picture
@@ -184,12 +184,12 @@ def build(settings: ReplayConfig, recording: Recording, width: int) -> mujoco.Mj
     """Describes the scene of an episode, with robots as bodies that the video places itself.
 
     Args:
-        settings: The replay's settings.
-        recording: Recording of the episode.
-        width: Width of a picture, px.
+      settings: The replay's settings.
+      recording: Recording of the episode.
+      width: Width of a picture, px.
 
     Returns:
-        The spec; robot i is the mocap body i.
+      The spec; robot i is the mocap body i.
     """
     spec = mujoco.MjSpec()
     _set_visuals(spec, width)
@@ -313,13 +313,13 @@ def camera_distance(side: float, aspect: float) -> float:
     """Computes the distance of the camera from the middle of the floor.
 
     Args:
-        side: Side of the arena, m.
-        aspect: Width of a picture divided by its height.
+      side: Side of the arena, m.
+      aspect: Width of a picture divided by its height.
 
     Returns:
-        The least distance at which the whole arena with its walls is in the picture, plus a
-        margin, m. For a corner p and the camera's axes ahead, right and up, the depth is
-        distance + p.ahead. At this depth p.right and p.up must lie within the field of view.
+      The least distance at which the whole arena with its walls is in the picture, plus a
+      margin, m. For a corner p and the camera's axes ahead, right and up, the depth is
+      distance + p.ahead. At this depth p.right and p.up must lie within the field of view.
     """
     half = 0.5 * side + 2 * _WALL
     corners = np.array(

@@ -154,13 +154,13 @@ def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, 
     """Refuses realism settings that contradict the robot or the episode length.
 
     Args:
-        realism: settings, already checked against their own bounds.
-        robot: the robot that they apply to.
-        task: provides the control step.
-        steps: control steps of an episode.
+      realism: settings, already checked against their own bounds.
+      robot: the robot that they apply to.
+      task: provides the control step.
+      steps: control steps of an episode.
 
     Raises:
-        ConfigError: a setting is too large; the message names the full key.
+      ConfigError: a setting is too large; the message names the full key.
     """
     hull, seconds = robot.hull_radius, steps * task.control_step
     for key, value, most in (

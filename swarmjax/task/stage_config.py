@@ -42,13 +42,13 @@ def complete(stage: dict[str, Any]) -> dict[str, Any]:
     """Fills in the settings of a stage that follow from its map or layout.
 
     Args:
-        stage: plain data; `map` is a text or a list of its rows.
+      stage: plain data; `map` is a text or a list of its rows.
 
     Returns:
-        The data, with `side`, `obstacles` and `level` if there is a map.
+      The data, with `side`, `obstacles` and `level` if there is a map.
 
     Raises:
-        ConfigError: the map is invalid.
+      ConfigError: the map is invalid.
     """
     text = stage.get("map")
     if not text:
@@ -300,10 +300,10 @@ def smallest_side(stage: StageConfig) -> float:
     is 0.70 of a square grid of discs. The walls reduce this further.
 
     Args:
-        stage: the stage; its `side` is not read.
+      stage: the stage; its `side` is not read.
 
     Returns:
-        The side, m.
+      The side, m.
     """
     random = stage.level != "fixed"  # an extension's drawing starts from a random level
     return _smallest_side(stage.robots, stage.obstacles, stage.obstacle_size, random=random)
@@ -313,12 +313,12 @@ def make_room(sim: SimConfig, stages: Sequence[StageConfig]) -> SimConfig:
     """Sets the numbers of robots and obstacles to compile for, unless the settings give them.
 
     Args:
-        sim: the settings.
-        stages: stages that must fit.
+      sim: the settings.
+      stages: stages that must fit.
 
     Returns:
-        The settings with both numbers: at least 5 and 4, so that a curriculum's stages share a
-        program and its checkpoints.
+      The settings with both numbers: at least 5 and 4, so that a curriculum's stages share a
+      program and its checkpoints.
     """
     robots = max([sim.robots, *(stage.robots for stage in stages)])
     obstacles = max([sim.obstacles, *(stage.obstacles for stage in stages)])

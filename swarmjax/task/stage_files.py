@@ -14,11 +14,11 @@ def expand(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
     """Returns all stages that a choice of the group `stage` names, as plain data.
 
     Args:
-        stage: data of the group, from `files.compose`.
-        choice: the name of its file.
+      stage: data of the group, from `files.compose`.
+      choice: the name of its file.
 
     Raises:
-        ConfigError: the file, its sequence or its grid is invalid, or it does not take these keys.
+      ConfigError: the file, its sequence or its grid is invalid, or it does not take these keys.
     """
     if not _is_grid(choice):
         return _listed(stage, choice)
@@ -30,11 +30,11 @@ def pick_one(stage: dict[str, Any], choice: str) -> dict[str, Any]:
     """Returns the stage that a choice of the group `stage` names, if it is a single one.
 
     Args:
-        stage: data of the group, from `files.compose`.
-        choice: the name of its file.
+      stage: data of the group, from `files.compose`.
+      choice: the name of its file.
 
     Raises:
-        ConfigError: the choice names several stages, or is invalid.
+      ConfigError: the choice names several stages, or is invalid.
     """
     if _is_grid(choice):
         raise ConfigError(f"stage is {choice}, a grid: give one stage, as in stage=s6.")
@@ -50,7 +50,7 @@ def read_stage(choice: str) -> dict[str, Any]:
     """Reads a file of configs/stage/ that is a single stage.
 
     Raises:
-        ConfigError: there is no file of this name, or it names several stages.
+      ConfigError: there is no file of this name, or it names several stages.
     """
     files.check_choice("stage", choice, "stage")
     if _is_sequence(choice) or _is_grid(choice):
@@ -64,12 +64,12 @@ def load_levels[C: Section](
     """Creates the settings of a command that plays the levels of one stage or of a suite.
 
     Args:
-        cls: the command's dataclass, with `stage` and `suite`.
-        overrides: `key=value` words.
-        stage: plain data of the default stage; None for that of the command's file.
+      cls: the command's dataclass, with `stage` and `suite`.
+      overrides: `key=value` words.
+      stage: plain data of the default stage; None for that of the command's file.
 
     Raises:
-        ConfigError: a word is invalid, or a suite is given together with a key that it sets itself.
+      ConfigError: a word is invalid, or a suite is given together with a key that it sets itself.
     """
 
     def fill_in(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:

@@ -61,10 +61,10 @@ def trajectory(state: LearnerState, config: AlgoConfig, idle: int = 0) -> Trajec
     """The golden batch as a rollout of one arena, [T, 1, 1, 1].
 
     Args:
-        state: [1], that collected it.
-        config: of the learner.
-        idle: steps for which the robot waits after each arrival, with NaN in them: they must not
-            count. The batch is then longer by that.
+      state: [1], that collected it.
+      config: of the learner.
+      idle: steps for which the robot waits after each arrival, with NaN in them: they must not
+        count. The batch is then longer by that.
     """
     drawn = inputs.draw()
     alone = jax.tree.map(lambda x: x[0], state)

@@ -111,9 +111,9 @@ def _kill_while_opening(run: Path, torn: str, monkeypatch: pytest.MonkeyPatch) -
     """Goes on with a run, and kills it while it opens one of its files.
 
     Args:
-        run: That goes on.
-        torn: Name of the file: of a text that is written in place, half is there.
-        monkeypatch: That is undone.
+      run: That goes on.
+      torn: Name of the file: of a text that is written in place, half is there.
+      monkeypatch: That is undone.
     """
     replaced, written = Path.replace, Path.write_text
 

@@ -29,8 +29,8 @@ class Blocks(NamedTuple):
     """The samples of a batch, the valid ones first.
 
     Attributes:
-        samples: [K, B, ...], B at most `BLOCK`.
-        used: [], int32, how many blocks hold a valid sample. They come first.
+      samples: [K, B, ...], B at most `BLOCK`.
+      used: [], int32, how many blocks hold a valid sample. They come first.
     """
 
     samples: Minibatch
@@ -48,14 +48,14 @@ def learn(
     """Learns from a batch: each epoch is one step on all samples, so their order does not matter.
 
     Args:
-        config: Settings with one minibatch.
-        updates: Number of updates of the whole run.
-        begun: Parameters and the optimiser's state.
-        samples: [G, N, ...], zero where not valid.
-        shards: How the samples are spread over devices.
+      config: Settings with one minibatch.
+      updates: Number of updates of the whole run.
+      begun: Parameters and the optimiser's state.
+      samples: [G, N, ...], zero where not valid.
+      shards: How the samples are spread over devices.
 
     Returns:
-        Parameters and the optimiser's state after, and the metrics of each step, [epochs].
+      Parameters and the optimiser's state after, and the metrics of each step, [epochs].
     """
     return in_turn(functools.partial(_learn, config, updates, shards))(begun, samples)
 
@@ -77,10 +77,10 @@ def arrange(samples: Minibatch) -> Blocks:
     """Puts the valid samples first and cuts all of them into blocks.
 
     Args:
-        samples: [G, N, ...], zero where not valid.
+      samples: [G, N, ...], zero where not valid.
 
     Returns:
-        The blocks; the padding of the last one is not valid.
+      The blocks; the padding of the last one is not valid.
     """
     flat = valid_first(samples)
     size = min(BLOCK, len(flat.valid))
@@ -100,13 +100,13 @@ def gradient(
     """Computes the gradient of `losses.ppo_loss` over all samples.
 
     Args:
-        params: Parameters of the actor and the critic.
-        blocks: The samples.
-        config: Clip range and costs.
-        expected_valid: [], valid samples of the batch.
+      params: Parameters of the actor and the critic.
+      blocks: The samples.
+      config: Clip range and costs.
+      expected_valid: [], valid samples of the batch.
 
     Returns:
-        The gradient, and the metrics of the loss; 0 if nothing is valid.
+      The gradient, and the metrics of the loss; 0 if nothing is valid.
     """
 
     def of_block(i: jax.Array | int) -> tuple[Params, Metrics]:
@@ -120,11 +120,11 @@ def add_up[T](count: jax.Array, part: Callable[[jax.Array | int], T]) -> T:
     """Adds up the results of several parts, such as gradients of a sum over samples.
 
     Args:
-        count: [], int32, how many parts there are.
-        part: Computes the part with a given number, as a tree of arrays.
+      count: [], int32, how many parts there are.
+      part: Computes the part with a given number, as a tree of arrays.
 
     Returns:
-        The sum; 0 if there are no parts.
+      The sum; 0 if there are no parts.
     """
 
     def add(i: jax.Array, total: T) -> T:

@@ -49,12 +49,12 @@ def fits(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
     """Tells whether the kernels support the networks.
 
     Args:
-        config: Settings of the networks.
-        observation_size: O.
-        action_size: U.
+      config: Settings of the networks.
+      observation_size: O.
+      action_size: U.
 
     Returns:
-        Whether `gradient` may be called.
+      Whether `gradient` may be called.
     """
     return kernel.fits(observation_size, config.hidden_sizes, action_size, LAUNCH.tile)
 
@@ -65,14 +65,14 @@ def choose_launch(
     """Chooses how the kernels are spread over the GPU that JAX computes on.
 
     Args:
-        config: Settings of networks that `fits` accepts.
-        observation_size: O.
-        action_size: U.
-        samples: B of the batch that minibatches are dealt from; None if the batch is one minibatch.
+      config: Settings of networks that `fits` accepts.
+      observation_size: O.
+      action_size: U.
+      samples: B of the batch that minibatches are dealt from; None if the batch is one minibatch.
 
     Returns:
-        `LARGE` if the chip has enough memory for it, and each minibatch gets at least
-        `_LEAST_TILES` tiles.
+      `LARGE` if the chip has enough memory for it, and each minibatch gets at least
+      `_LEAST_TILES` tiles.
     """
     if samples is not None and samples < _LEAST_TILES * config.num_minibatches * LARGE.tile:
         return LAUNCH
@@ -92,18 +92,18 @@ def gradient(
     """Computes what `jax.grad(losses.ppo_loss, has_aux=True)` does, up to rounding.
 
     Args:
-        params: Parameters of the actor and the critic, with layers that `fits` accepts.
-        minibatch: B samples.
-        config: Clip range and costs.
-        expected_valid: [], as `losses.ppo_loss` takes it.
-        launch: How the kernels are spread over the GPU; None: `choose_launch` decides.
-        interpret: Whether to run them as ordinary JAX, on any device.
+      params: Parameters of the actor and the critic, with layers that `fits` accepts.
+      minibatch: B samples.
+      config: Clip range and costs.
+      expected_valid: [], as `losses.ppo_loss` takes it.
+      launch: How the kernels are spread over the GPU; None: `choose_launch` decides.
+      interpret: Whether to run them as ordinary JAX, on any device.
 
     Returns:
-        The gradient, in the shape of `params`, and the metrics, each [].
+      The gradient, in the shape of `params`, and the metrics, each [].
 
     Raises:
-        ValueError: `fits` refuses the layers.
+      ValueError: `fits` refuses the layers.
     """
     sizes = minibatch.observation.shape[1], minibatch.action.shape[1]
     launch = choose_launch(config, *sizes) if launch is None else launch
@@ -127,10 +127,10 @@ def flatten(params: Params) -> Flat:
     """Lays each network out in one vector.
 
     Args:
-        params: Parameters of the actor and the critic.
+      params: Parameters of the actor and the critic.
 
     Returns:
-        The vectors, [n] and [m], by the networks' names.
+      The vectors, [n] and [m], by the networks' names.
     """
     return {name: ravel_pytree(network)[0] for name, network in params.items()}
 
@@ -139,11 +139,11 @@ def unflatten(flat: Flat, like: Params) -> Params:
     """Undoes `flatten`.
 
     Args:
-        flat: The vectors, [n] and [m], of parameters or of values with the same shapes.
-        like: Parameters with these shapes.
+      flat: The vectors, [n] and [m], of parameters or of values with the same shapes.
+      like: Parameters with these shapes.
 
     Returns:
-        The content of `flat`, in the shape of `like`.
+      The content of `flat`, in the shape of `like`.
     """
     return {name: ravel_pytree(network)[1](flat[name]) for name, network in like.items()}
 
@@ -152,10 +152,10 @@ def layouts(params: Params) -> dict[str, KernelLayout]:
     """Describes how `flatten` lays the networks out.
 
     Args:
-        params: Parameters of the actor and the critic, arrays or their shapes.
+      params: Parameters of the actor and the critic, arrays or their shapes.
 
     Returns:
-        The layouts, by the networks' names.
+      The layouts, by the networks' names.
     """
     return {
         "actor": _layout(params["actor"], "mean"),
@@ -171,14 +171,14 @@ def shuffle(
     If there are fewer such tiles than minibatches, some minibatches get none.
 
     Args:
-        keys: [E] random keys, one for each pass over the samples, consumed.
-        samples: B, the number of samples. The valid ones come first.
-        valid: [], int32, the number of valid samples.
-        minibatches: M of a pass.
-        launch: Its `tile` is the number of samples of a tile.
+      keys: [E] random keys, one for each pass over the samples, consumed.
+      samples: B, the number of samples. The valid ones come first.
+      valid: [], int32, the number of valid samples.
+      minibatches: M of a pass.
+      launch: Its `tile` is the number of samples of a tile.
 
     Returns:
-        The order of each pass, one after the other, and the span [E M, 2] of each minibatch.
+      The order of each pass, one after the other, and the span [E M, 2] of each minibatch.
     """
     count = -(-samples // launch.tile)
     used = -(-valid // launch.tile)
@@ -213,21 +213,21 @@ def flat_gradient(
     Matrix products use JAX's precision, `jax.default_matmul_precision`.
 
     Args:
-        flat: Result of `flatten`.
-        layout: Result of `layouts`, for layers that `fits` accepts.
-        samples: B samples. `valid` is float32, 0 or 1, so that no step has to convert it.
-        tiles: The minibatch, in tiles of `launch.tile` samples.
-        config: Clip range and costs.
-        expected_valid: [], as `losses.ppo_loss` takes it.
-        launch: How the kernels are spread over the GPU.
-        interpret: Whether to run them as ordinary JAX, on any device.
+      flat: Result of `flatten`.
+      layout: Result of `layouts`, for layers that `fits` accepts.
+      samples: B samples. `valid` is float32, 0 or 1, so that no step has to convert it.
+      tiles: The minibatch, in tiles of `launch.tile` samples.
+      config: Clip range and costs.
+      expected_valid: [], as `losses.ppo_loss` takes it.
+      launch: How the kernels are spread over the GPU.
+      interpret: Whether to run them as ordinary JAX, on any device.
 
     Returns:
-        The gradient, in the shape of `flat`; `METRICS`, each []; and how many samples of the tiles
-        are valid, [].
+      The gradient, in the shape of `flat`; `METRICS`, each []; and how many samples of the tiles
+      are valid, [].
 
     Raises:
-        ValueError: `fits` refuses the layers.
+      ValueError: `fits` refuses the layers.
     """
     _check(samples, layout, config)
     share = 1.0 / jnp.maximum(expected_valid, 1.0)

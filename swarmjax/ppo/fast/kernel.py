@@ -35,8 +35,8 @@ class Layer(NamedTuple):
     """An affine layer, or its gradient.
 
     Attributes:
-        kernel: [in, out].
-        bias: [out].
+      kernel: [in, out].
+      bias: [out].
     """
 
     kernel: jax.Array
@@ -47,9 +47,9 @@ class Place(NamedTuple):
     """Where an affine layer lies in the vector of its network's parameters, row by row.
 
     Attributes:
-        kernel: Index of its first number.
-        bias: Index of its first number.
-        shape: Numbers of inputs and outputs.
+      kernel: Index of its first number.
+      bias: Index of its first number.
+      shape: Numbers of inputs and outputs.
     """
 
     kernel: int
@@ -61,9 +61,9 @@ class Launch(NamedTuple):
     """How the kernel is spread over the GPU.
 
     Attributes:
-        tile: Samples of a tile, a power of two of at least `LEAST_WIDTH`.
-        programs: Programs of the grid, at most. There are never more than tiles to choose from.
-        warps: Warps of a program.
+      tile: Samples of a tile, a power of two of at least `LEAST_WIDTH`.
+      programs: Programs of the grid, at most. There are never more than tiles to choose from.
+      warps: Warps of a program.
     """
 
     tile: int
@@ -75,9 +75,9 @@ class KernelLayout(NamedTuple):
     """How the parameters of a network lie in one vector.
 
     Attributes:
-        layers: Hidden layers and output, in order.
-        vectors: Other parameters, by name: index of the first number, and width.
-        size: Length of the vector.
+      layers: Hidden layers and output, in order.
+      vectors: Other parameters, by name: index of the first number, and width.
+      size: Length of the vector.
     """
 
     layers: tuple[Place, ...]
@@ -89,9 +89,9 @@ class Tiles(NamedTuple):
     """The tiles of samples that a kernel takes. Tile i is samples i * tile to (i + 1) * tile.
 
     Attributes:
-        order: [K], int32, numbers of tiles.
-        span: [2], int32, the part of `order` to take: from the first index up to, but not
-            including, the second.
+      order: [K], int32, numbers of tiles.
+      span: [2], int32, the part of `order` to take: from the first index up to, but not
+        including, the second.
     """
 
     order: jax.Array
@@ -132,14 +132,14 @@ def fits(
     for the backward pass. It also stores a tile of observations and two of the widest hidden layer.
 
     Args:
-        inputs: Width of the observation. It is padded, and so is the output.
-        hidden: Widths of the hidden layers, powers of two.
-        outputs: Width of the output.
-        tile: Samples of a tile.
-        memory: Bytes on the chip for a program.
+      inputs: Width of the observation. It is padded, and so is the output.
+      hidden: Widths of the hidden layers, powers of two.
+      outputs: Width of the output.
+      tile: Samples of a tile.
+      memory: Bytes on the chip for a program.
 
     Returns:
-        Whether `sums` may be called.
+      Whether `sums` may be called.
     """
     if any(not LEAST_WIDTH <= width <= MOST_WIDTH or width.bit_count() != 1 for width in hidden):
         return False
@@ -162,21 +162,21 @@ def sums(
     """Sums the gradient of a loss, and the loss's other terms, over the samples of some tiles.
 
     Args:
-        parameters: [n] of a network. They are read and written without padding, and padded on the
-            chip.
-        layout: Layout of `parameters`. `padded_width` leaves the widths of the hidden layers
-            unchanged.
-        activation: Activation of the hidden layers: `tanh`, `relu` or `swish`.
-        loss: Loss of the output. Whatever must not count is 0 in all that it returns. It takes the
-            layout's vectors with padding, and returns their derivatives under their names.
-        samples: By name, each [B] or [B, width], float32. `observation` [B, O] is the network's
-            input.
-        tiles: The tiles to take, each of `launch.tile` samples.
-        launch: How the kernel is spread over the GPU.
-        interpret: Whether to run it as ordinary JAX, on any device.
+      parameters: [n] of a network. They are read and written without padding, and padded on the
+        chip.
+      layout: Layout of `parameters`. `padded_width` leaves the widths of the hidden layers
+        unchanged.
+      activation: Activation of the hidden layers: `tanh`, `relu` or `swish`.
+      loss: Loss of the output. Whatever must not count is 0 in all that it returns. It takes the
+        layout's vectors with padding, and returns their derivatives under their names.
+      samples: By name, each [B] or [B, width], float32. `observation` [B, O] is the network's
+        input.
+      tiles: The tiles to take, each of `launch.tile` samples.
+      launch: How the kernel is spread over the GPU.
+      interpret: Whether to run it as ordinary JAX, on any device.
 
     Returns:
-        The gradient [n], and the loss's other terms by name, each [].
+      The gradient [n], and the loss's other terms by name, each [].
     """
     of_tile = functools.partial(_of_tile, activation, loss)
     shapes = jax.eval_shape(of_tile, *_shapes(layout, samples, launch.tile))

@@ -39,8 +39,8 @@ class _Rows(NamedTuple):
     """The sequences of a program at a step.
 
     Attributes:
-        at: [tile], their rows in [T B, ...].
-        exist: [tile], false past the last sequence.
+      at: [tile], their rows in [T B, ...].
+      exist: [tile], false past the last sequence.
     """
 
     at: jax.Array
@@ -51,9 +51,9 @@ class _Unit(NamedTuple):
     """The weights of reset, update and candidate.
 
     Attributes:
-        kernels: [H, H] each, weights of the memory.
-        biases: [H] each, added to the memory's part.
-        biases_seen: [H] each, added to the input's part.
+      kernels: [H, H] each, weights of the memory.
+      biases: [H] each, added to the memory's part.
+      biases_seen: [H] each, added to the input's part.
     """
 
     kernels: _Three
@@ -81,10 +81,10 @@ class _Gates(NamedTuple):
     """What a step computes, [tile, H] each.
 
     Attributes:
-        reset: 0..1.
-        update: 0..1.
-        candidate: -1..1.
-        recalled: The memory's part of the candidate, before `reset` scales it.
+      reset: 0..1.
+      update: 0..1.
+      candidate: -1..1.
+      recalled: The memory's part of the candidate, before `reset` scales it.
     """
 
     reset: jax.Array
@@ -100,11 +100,11 @@ def fits(size: int, shared_memory: int) -> bool:
     backward pass. It also holds four tiles of memories and derivatives.
 
     Args:
-        size: H.
-        shared_memory: Bytes on the chip for a program.
+      size: H.
+      shared_memory: Bytes on the chip for a program.
 
     Returns:
-        Whether `remember_all` may be called.
+      Whether `remember_all` may be called.
     """
     return size in _SIZES and 4 * (2 * size * 3 * size + 4 * TILE * size) <= shared_memory
 
@@ -122,15 +122,15 @@ def remember_all(
     JAX's precision, `jax.default_matmul_precision`.
 
     Args:
-        layers: `input` and `recurrent` of the unit, each with `kernel` [F or H, 3 H] and `bias`
-            [3 H]; `fits` accepts H.
-        features: [T, B, F].
-        begins: [T, B], whether an episode begins with the step.
-        memory: [B, H] before the first step.
-        interpret: Whether to run the kernels as ordinary JAX, on any device.
+      layers: `input` and `recurrent` of the unit, each with `kernel` [F or H, 3 H] and `bias`
+        [3 H]; `fits` accepts H.
+      features: [T, B, F].
+      begins: [T, B], whether an episode begins with the step.
+      memory: [B, H] before the first step.
+      interpret: Whether to run the kernels as ordinary JAX, on any device.
 
     Returns:
-        The memory [T, B, H] after each step.
+      The memory [T, B, H] after each step.
     """
     features, kernel = (x.astype(_SEEN) for x in (features, layers["input"]["kernel"]))
     inner = layers["recurrent"]
@@ -149,13 +149,13 @@ def remember(
     """Computes the memory of `memory.Gru` after one observation, up to rounding.
 
     Args:
-        layers: As `remember_all` takes them.
-        features: [B, F].
-        memory: [B, H] before the observation.
-        interpret: Whether to run the kernel as ordinary JAX, on any device.
+      layers: As `remember_all` takes them.
+      features: [B, F].
+      memory: [B, H] before the observation.
+      interpret: Whether to run the kernel as ordinary JAX, on any device.
 
     Returns:
-        The memory [B, H] after the observation.
+      The memory [B, H] after the observation.
     """
     flat = memory.reshape(-1, memory.shape[-1])
     seen = features.reshape(1, -1, features.shape[-1])
@@ -303,8 +303,8 @@ def _slopes(slope: jax.Array, gates: _Gates, before: jax.Array) -> tuple[_Three,
     logistic function are 1 - n^2 and r (1 - r).
 
     Returns:
-        Derivatives with respect to the inputs and to the memory's part, gate by gate, and to the
-        memory before.
+      Derivatives with respect to the inputs and to the memory's part, gate by gate, and to the
+      memory before.
     """
     reset, update, candidate, recalled = gates
     by_candidate = slope * (1.0 - update) * (1.0 - candidate * candidate)

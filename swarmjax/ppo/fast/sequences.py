@@ -36,9 +36,9 @@ class Dealt(NamedTuple):
     """The useful sequences of a batch, dealt out to minibatches.
 
     Attributes:
-        order: [Q], int32, all sequences. Those of the first minibatch come first, and those without
-            a valid sample last.
-        span: [M, 2], int32, where in `order` each minibatch begins and ends.
+      order: [Q], int32, all sequences. Those of the first minibatch come first, and those without
+        a valid sample last.
+      span: [M, 2], int32, where in `order` each minibatch begins and ends.
     """
 
     order: jax.Array
@@ -56,15 +56,15 @@ def learn(
     """Learns from a batch, in minibatches of useful sequences.
 
     Args:
-        config: Settings of networks with memory.
-        updates: Number of updates of the whole run.
-        begun: Parameters and the optimiser's state.
-        samples: [G, N, ...], zero where not valid, ordered by step.
-        key: Random key, consumed.
-        shards: How the samples are spread over devices.
+      config: Settings of networks with memory.
+      updates: Number of updates of the whole run.
+      begun: Parameters and the optimiser's state.
+      samples: [G, N, ...], zero where not valid, ordered by step.
+      key: Random key, consumed.
+      shards: How the samples are spread over devices.
 
     Returns:
-        Parameters and the optimiser's state after, and the metrics of each step, [epochs, M].
+      Parameters and the optimiser's state after, and the metrics of each step, [epochs, M].
     """
     rows = arrange(samples, config.rollout_length)
     expected_valid = shards.sum(jnp.sum(samples.valid)) / config.num_minibatches
@@ -85,11 +85,11 @@ def arrange(samples: Minibatch, steps: int) -> Minibatch:
     """Lays samples out by sequence.
 
     Args:
-        samples: [G, T S, ...], and memory [G, S, H].
-        steps: T.
+      samples: [G, T S, ...], and memory [G, S, H].
+      steps: T.
 
     Returns:
-        [Q, T, ...] and memory [Q, H], with Q = G S. The robots of the first group come first.
+      [Q, T, ...] and memory [Q, H], with Q = G S. The robots of the first group come first.
     """
 
     def by_sequence(x: jax.Array) -> jax.Array:
@@ -108,13 +108,13 @@ def deal(key: jax.Array, useful: jax.Array, minibatches: int, shards: Shards = A
     than there are minibatches, the last minibatches get none of them.
 
     Args:
-        key: Random key, the same on all devices, consumed.
-        useful: [Q], bool, which sequences of this device hold a valid sample.
-        minibatches: M.
-        shards: How the sequences are spread over devices.
+      key: Random key, the same on all devices, consumed.
+      useful: [Q], bool, which sequences of this device hold a valid sample.
+      minibatches: M.
+      shards: How the sequences are spread over devices.
 
     Returns:
-        The minibatches of this device.
+      The minibatches of this device.
     """
     by_stream = useful.reshape(shards.local_streams, -1)
     size = by_stream.shape[1]
@@ -143,15 +143,15 @@ def gradient(
     """Computes the gradient of `losses.ppo_loss` over the sequences of one minibatch.
 
     Args:
-        params: Parameters of the actor and the critic.
-        rows: Result of `arrange`.
-        order: [Q], result of `deal`.
-        span: [2], int32, of the minibatch.
-        config: Clip range and costs.
-        expected_valid: [], valid samples of the whole batch / number of minibatches.
+      params: Parameters of the actor and the critic.
+      rows: Result of `arrange`.
+      order: [Q], result of `deal`.
+      span: [2], int32, of the minibatch.
+      config: Clip range and costs.
+      expected_valid: [], valid samples of the whole batch / number of minibatches.
 
     Returns:
-        The gradient, and the metrics of the loss; 0 if the span is empty.
+      The gradient, and the metrics of the loss; 0 if the span is empty.
     """
     size = tile_size(len(order), config.num_minibatches, config.rollout_length)
 
@@ -166,12 +166,12 @@ def tile_size(sequences: int, minibatches: int, steps: int) -> int:
     """Chooses how many sequences a tile has, so that few tiles fill the fullest minibatch.
 
     Args:
-        sequences: Q of the batch.
-        minibatches: M.
-        steps: T of a sequence.
+      sequences: Q of the batch.
+      minibatches: M.
+      steps: T of a sequence.
 
     Returns:
-        At least 1. On an accelerator it respects `TILE_SAMPLES`.
+      At least 1. On an accelerator it respects `TILE_SAMPLES`.
     """
     fullest = -(-sequences // minibatches)
     if jax.default_backend() == "cpu":
@@ -193,15 +193,15 @@ def take_tile(
     """Takes the sequences of a tile, step by step.
 
     Args:
-        rows: Result of `arrange`.
-        order: [Q], result of `deal`.
-        start: [], int32, index in `order` of the tile's first sequence.
-        end: [], int32, index in `order` at which the minibatch ends. Samples from there on are not
-            valid.
-        size: Sequences of the tile.
+      rows: Result of `arrange`.
+      order: [Q], result of `deal`.
+      start: [], int32, index in `order` of the tile's first sequence.
+      end: [], int32, index in `order` at which the minibatch ends. Samples from there on are not
+        valid.
+      size: Sequences of the tile.
 
     Returns:
-        [T size, ...], ordered by step, and memory [size, H].
+      [T size, ...], ordered by step, and memory [size, H].
     """
     place = start + jnp.arange(size, dtype=jnp.int32)
     which = order[jnp.minimum(place, len(order) - 1)]

@@ -39,15 +39,15 @@ def learn(
     of a minibatch would handle one of two dozen small arrays each.
 
     Args:
-        config: Settings of networks that `fused.fits` accepts.
-        updates: Number of updates of the whole run.
-        begun: Parameters and the optimiser's state.
-        samples: [G, N, ...], zero where not valid.
-        key: Random key, consumed.
-        shards: How the samples are spread over devices.
+      config: Settings of networks that `fused.fits` accepts.
+      updates: Number of updates of the whole run.
+      begun: Parameters and the optimiser's state.
+      samples: [G, N, ...], zero where not valid.
+      key: Random key, consumed.
+      shards: How the samples are spread over devices.
 
     Returns:
-        Parameters and the optimiser's state after, and the metrics of each step, [steps].
+      Parameters and the optimiser's state after, and the metrics of each step, [steps].
     """
     params, state = begun
     flat_state = _flat_state(config, updates, *begun)

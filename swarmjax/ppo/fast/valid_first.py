@@ -12,10 +12,10 @@ def valid_first(samples: Minibatch) -> Minibatch:
     """Lays all samples out along one axis, the valid ones first and in their given order.
 
     Args:
-        samples: [G, N, ...].
+      samples: [G, N, ...].
 
     Returns:
-        [G N, ...]. Behind the valid samples come copies of other samples, marked as not valid.
+      [G N, ...]. Behind the valid samples come copies of other samples, marked as not valid.
     """
     groups, each = samples.valid.shape
     within = jnp.cumsum(samples.valid, axis=1, dtype=jnp.int32)
