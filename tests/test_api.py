@@ -108,6 +108,7 @@ def test_the_same_key_gives_the_same_episodes(env: Swarm, states: list[SwarmStat
     jax.tree.map(np.testing.assert_array_equal, again.waiting, states[0].waiting)
 
 
+@pytest.mark.slow
 def test_it_runs_under_vmap_as_alone(env: Swarm, states: list[SwarmState]) -> None:
     keys = jnp.stack([jax.random.key(0), jax.random.key(1)])
     pair = jax.vmap(env.reset)(keys)
@@ -143,6 +144,7 @@ def test_every_seed_has_its_policy(tmp_path: Path) -> None:
     assert [each.meta["seed"] for each in result.policies] == [0, 1]
 
 
+@pytest.mark.slow
 def test_a_run_goes_on(tmp_path: Path) -> None:
     settings = TINY | {"run.dir": tmp_path / "run", "budget": 32}
     first = swarmjax.train_policy(settings, on_update=lambda row: row["update"] == 0)
@@ -215,7 +217,7 @@ def test_pieces_handed_over_are_trained_and_judged(tmp_path: Path) -> None:
         "cann"),
         (lambda: swarmjax.train_policy({"algo.hidden": [8]}), r"^algo\.hidden is called algo\.hid"),
         (lambda: swarmjax.train_policy("stage=s3"), r"^settings is 'stage=s3': give a list of wor"),
-        (lambda: swarmjax.train_policy({"run.dry": True}), r"^run\.dry is true, which is for"),
+        (lambda: swarmjax.train_policy({"run.dry": True}), r"^run\.dry is true, but works only on"),
         (lambda: swarmjax.evaluate_policy("no.npz"), r"^no\.npz is no file: give the path of a po"),
         (lambda: swarmjax.load_policy("no.npz"), r"^no\.npz is no file: give the path of a policy"),
     ],

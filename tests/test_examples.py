@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import extensions
+import pytest
 
 
 def _run(tmp_path: Path, name: str, *arguments: str) -> str:
@@ -26,12 +27,14 @@ def test_arenas_are_stepped_at_random_and_drawn(tmp_path: Path) -> None:
     assert (tmp_path / "random_arenas.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_own_pieces_are_trained_with_and_judged(tmp_path: Path) -> None:
     said = _run(tmp_path, "train_own_pieces.py", "4096")
     assert said.splitlines()[-1].endswith(" % of the targets on ring")
     assert len(list(tmp_path.glob("runs/*/policy.npz"))) == 1
 
 
+@pytest.mark.slow
 def test_an_arena_drawn_as_text_is_trained_and_judged(tmp_path: Path) -> None:
     words = ["arenas=8", "algo.num_minibatches=2", "budget=2048", "run.tensorboard=false"]
     stage = extensions.EXAMPLES / "two_rooms.yaml"

@@ -85,6 +85,7 @@ def test_a_job_of_an_array_is_asked_for_again_alone(tmp_path: Path) -> None:
     assert told.read_text() == "requeue 12_3\n"
 
 
+@pytest.mark.slow
 def test_a_job_is_asked_for_again_before_its_time_is_up(tmp_path: Path) -> None:
     told = _stand_in(tmp_path, "scontrol", "exit 0")
     run = tmp_path / "run"

@@ -159,6 +159,7 @@ def test_a_call_of_the_physics_makes_the_steps_that_are_counted(
     assert total == CONTROL_STEPS * arenas.sim.qpos.size
 
 
+@pytest.mark.slow
 def test_resets_fall_into_the_calls_that_are_timed(tiny_config: TrainConfig) -> None:
     prepared = steps_per_second.prepare(tiny_config)
     arenas = steps_per_second.settle(prepared)

@@ -64,6 +64,7 @@ def _stand_in(
     return asked
 
 
+@pytest.mark.slow
 def test_a_grid_is_trained_and_tabled_and_not_trained_again(tmp_path: Path) -> None:
     folder = tmp_path / "grid"
     words = [sys.executable, str(SCRIPT), f"dir={folder}", "cluster=debug", *GRID]

@@ -210,6 +210,7 @@ def _earned(deaf: bool) -> float:
     return float(earned[-10:].mean())
 
 
+@pytest.mark.slow
 def test_a_task_that_only_a_message_solves_is_learned_with_messages_alone() -> None:
     # Who hears nothing earns most by any constant within -1..1: a mean of -1, and less by its
     # exploration. Who hears is off by no more than exploration.

@@ -57,6 +57,7 @@ def test_the_policy_is_judged_by_the_command_as_printed(
     assert ("hull 0.044 m, infrared to 0.1 m" in said) == (kind == "hull")
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_goes_on_by_the_command_as_printed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

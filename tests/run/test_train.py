@@ -294,7 +294,7 @@ def test_several_seeds_resume_exactly(several: Path, tmp_path: Path) -> None:
     ("updates", "said"),
     # A step limit of 8 is two updates of 4, the least that s1 takes; half of 3 updates, rounded
     # up, is as much, half of 2 is not; and after 2 of 2 there is no update left.
-    [(3, ""), (2, "s2, the last, may never begin, where curriculum.budget_share=0.5 asks for 1")],
+    [(3, ""), (2, "s2, may never begin, but curriculum.budget_share=0.5 asks for update 1")],
 )
 def test_a_budget_too_short_for_its_stages_is_said(updates: int, said: str) -> None:
     words = [*TINY, "stage=curriculum", "stage.sequence=[s1,s2]", "task.step_limit=8"]

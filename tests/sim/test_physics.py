@@ -118,6 +118,7 @@ def _check_close(found: Path, expected: Path) -> None:
     assert place.max() <= 0.01
 
 
+@ONCE_MORE
 def test_random_commands_free_of_contact_as_in_c(engine: Engine) -> None:
     pose = _yaws(2, [(-1.0, 0.0), (0.0, 0.0), (1.0, 0.0)])
     wheels = _random_wheels(4, 200, 1)

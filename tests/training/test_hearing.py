@@ -37,7 +37,8 @@ def _run(path: Path, *words: str) -> None:
     assert train.main([*WORDS, f"run.dir={path}", *words]) == 0
 
 
-@pytest.mark.parametrize("kind", ["plain", pytest.param("both", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["plain", "both"])
+@pytest.mark.slow
 def test_a_resumed_run_is_bit_for_bit_that_of_one_go(kind: str, tmp_path: Path) -> None:
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     _run(whole, *KINDS[kind])

@@ -50,6 +50,7 @@ def _kernels(policy: Policy) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.slow
 def test_every_seed_is_the_one_that_it_is_alone(seed: int, folder: Path) -> None:
     spread, alone = (load(folder / name / f"policy-seed{seed}.npz") for name in ("spread", "alone"))
     # Fused otherwise, so sums of float32 round otherwise.
@@ -57,11 +58,13 @@ def test_every_seed_is_the_one_that_it_is_alone(seed: int, folder: Path) -> None
         np.testing.assert_allclose(mine, its, rtol=0.0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_seeds_differ(folder: Path) -> None:
     first, second = (load(folder / "spread" / f"policy-seed{seed}.npz") for seed in (0, 1))
     assert not np.array_equal(_kernels(first)[0], _kernels(second)[0])
 
 
+@pytest.mark.slow
 def test_a_checkpoint_holds_all_seeds(folder: Path) -> None:
     assert checkpoint.find(folder / "spread").leaves["update"].tolist() == [9, 9]
 
