@@ -4,8 +4,8 @@
 prints a JSON line for each adapter. It times five calls of `steps` control steps each, after one
 warm-up call, with all robots driving straight ahead. `compile_s` is the first call minus the median
 of the others. `pettingzoo` steps one arena, from the host. `jaxmarl` and `playground` map one arena
-over `arenas`. Adapters on the device loop with `scan`; all others loop step by step on the host. An
-adapter whose library is missing is left out, and the reason is printed.
+over `arenas`. Adapters on the device take all steps with `scan`; all others take them one by one on
+the host. An adapter whose library is missing is left out, and the reason is printed.
 """
 
 import statistics

@@ -2,9 +2,10 @@
 
 `python -m benchmarks.adapters_train who=brax|sb3|torch [seed=0] [arenas=64] [budget=3000000]`
 trains `s1` with the PPO of Brax, of Stable-Baselines3 or of examples/torch_ppo.py until 0.9 of the
-targets are reached, and prints a JSON line. Its seconds are training time without compiling. Brax's
-evaluator judges the policy's mean action on one episode of each robot. The other two count the last
-200 robots of training, whose policies explore. It needs the extra with the library's name.
+targets are reached, and prints a JSON line. The seconds in this line are training time without
+compiling. Brax's evaluator judges the policy's mean action on one episode of each robot. For the
+other two libraries the share is that of the last 200 robots of training, while the policy explores.
+The command needs the extra with the library's name.
 """
 
 import contextlib
@@ -97,7 +98,7 @@ def train_sb3(given: AdapterTrainConfig) -> tuple[float, int, float]:
     env.reset()
     env.step(np.zeros((env.num_envs, 2), np.float32))
     recent: list[bool] = []
-    peers.find("torch", "the extra sb3").set_num_threads(1)  # more are slower next to JAX's
+    peers.find("torch", "the extra sb3").set_num_threads(1)  # more threads are slower, beside JAX's
 
     def look(values: dict[str, Any], _: Any) -> bool:
         ended = [info for info in values["infos"] if info]

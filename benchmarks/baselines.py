@@ -83,7 +83,7 @@ def write(path: Path, ahead: Sequence[float], *sides: Sequence[float]) -> None:
     Args:
       path: path of the `policy.npz`.
       ahead: [2] action at bearing 0.
-      sides: [2] each: change of the action per radian to the left, and to the right.
+      sides: change of the action [2] per radian to the left, and per radian to the right.
     """
     split = np.zeros((1, observation.SIZE, 2), np.float32)
     split[0, observation.NAMES.index("target_bearing")] = [1.0, -1.0]

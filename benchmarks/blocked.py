@@ -31,7 +31,7 @@ STARTS = (
     (6.28, 3.0, 0.2),
     (6.28, 0.7, 0.0),
 )
-# Bodies and physics steps (s): those of training, of the judge, and finer ones.
+# Bodies and physics steps (s), as used in training and by the judge, and finer steps.
 TIMESTEPS: tuple[tuple[Literal["planar", "wheeled"], float], ...] = (
     ("planar", 0.032),
     ("wheeled", 0.016),

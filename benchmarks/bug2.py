@@ -8,8 +8,8 @@ left the line, it continues along the line.
 A point automaton knows its position. Here a robot integrates its own commands to a heading. The
 heading, distance and bearing of the target give its position.
 
-The line is infinite, not only the part between start and target. A robot may thus also leave an
-outline beyond the target, where that is closer to it.
+The line is infinite, not only the part between start and target. So a robot may leave an outline on
+the far side of the target, if the target is closer there.
 
 The paper's obstacles stand still, but robots are obstacles that move. Three rules are added:
 
@@ -81,7 +81,7 @@ class BugMemory(NamedTuple):
       mark: [..., 3] a pose on the outline (m, m, rad) that shows when the robot has gone round it.
       marked: value of `way` at the mark.
       anchor: [..., 2] position near which the robot has recently been, m.
-      waited: how long it has been there, s.
+      waited: how long the robot has been near the anchor, s.
     """
 
     heading: np.ndarray
@@ -121,7 +121,7 @@ class BugBody(NamedTuple):
 GAP = 0.012  # between hull and outline
 AHEAD = 0.025  # a shorter ray near the nose blocks the way; a wall is then 0.017 m before the hull
 ASIDE = 0.0167  # the hull would hit the end of this diagonal ray: 0.025 + 0.717 * 0.0167 = 0.037
-NEARER = 0.03  # the robot takes up the line this much closer to the target than where it left
+NEARER = 0.03  # the robot returns to the line if this much closer to the target than when it left
 ROUND = 0.03  # back at the mark: within this distance and within a right angle of its heading
 LOST = 0.33  # a full circle of the arc that seeks the outline: 2 pi (0.037 + 0.012) = 0.31
 STILL, STUCK = 0.02, 3.0  # m, s: no progress
@@ -261,7 +261,7 @@ def _follow(memory: BugMemory, senses: Senses, gap: np.ndarray, body: BugBody) -
     other = senses.other_beside - (senses.beside - gap)
     wanted = np.minimum(GAP, 0.5 * (gap + other))
     turn = BY_ANGLE * _angle(memory, senses, gap, body) + BY_GAP * (gap - wanted)
-    # The diagonal ray alone: compares it with its length along a wall at the desired gap.
+    # With the diagonal ray alone: compares its length with that along a wall at the desired gap.
     _, y, yaw = epuck.SENSOR_POSES[6]
     expected = (body.hull_radius + GAP - y) / math.sin(yaw)
     turn = np.where(senses.beside < near, turn, BY_GAP * (senses.diagonal - expected))

@@ -2,10 +2,10 @@
 
 `python -m benchmarks.checkpoint_price [every=S] [seconds=S] [key=value ...]` compiles the program
 of a config once. It then trains alternately with a checkpoint every `every` seconds, and without.
-The other words are those of `swarmjax.train`. It prints a JSON line with the arena control steps
-per second of both, and the share of the speed that checkpoints take: the median over `PAIRS` pairs
-with a 95 % interval by order statistics. `price_at_60_s` is this share for one checkpoint a minute,
-since each checkpoint costs the same time.
+All other keys are keys of `swarmjax.train`. It prints a JSON line with the arena control steps per
+second of both, and the share of the speed that checkpoints take: the median over `PAIRS` pairs with
+a 95 % interval by order statistics. `price_at_60_s` is the same share, converted to one checkpoint
+a minute; each checkpoint costs the same time.
 """
 
 import json

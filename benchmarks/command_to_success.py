@@ -54,13 +54,13 @@ def train(words: Sequence[str], run: Path, stop_at: float) -> tuple[dict[str, fl
     """Trains until the last stage reaches a share of the targets, or the budget is spent.
 
     Args:
-      words: the words for training.
+      words: `key=value` words for training.
       run: the run directory.
       stop_at: the share.
 
     Returns:
-      Seconds from the command until each of `SHARES` was measured, or None if it was not, and until
-      the policy was saved. Also the last row of the metrics.
+      Seconds from the command until the policy was saved, and until each of `SHARES` was measured
+      (None for a share that was never measured). Also the last row of the metrics.
     """
     watched, row = Watched(words, run, {}), {}
     found: dict[str, float | None] = dict.fromkeys((f"seconds_to_{x:.2f}" for x in SHARES), None)

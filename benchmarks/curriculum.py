@@ -5,11 +5,11 @@ the keys of `curriculum_arms.StudyConfig` and of `swarmjax.train`, except `stage
 `curriculum.mode`, which the arms set. `seeds` is 10 by default.
 
 Each arm trains all its seeds in one program. It stops at points that are evenly spaced over the
-logarithm of the arena steps, and judges the policies of every seed on the device. All arms use the
-same levels: of the goal, of the 1.5 m arena that no arm trains on (with 5 robots compiled in), and
-of the first stage of the goal's curriculum, whether the arm has trained on it or not. It prints a
-JSON line for each arm and policy as soon as it is done. `benchmarks.curriculum_table` makes tables
-and plots from the lines.
+logarithm of the arena steps, and judges the policies of every seed on the device. All arms are
+judged on the same levels of three stages: the goal, the 1.5 m arena that no arm trains on (with 5
+robots compiled in), and the first stage of the goal's curriculum, even for an arm that has not
+trained on it. It prints a JSON line for each arm and policy as soon as it is done.
+`benchmarks.curriculum_table` makes tables and plots from the lines.
 
 The baseline `final` trains on the goal alone. To compare options of one mode, run one arm at a time
 and label it: `arms=adaptive label=progress curriculum.score=progress`.
@@ -56,8 +56,8 @@ def load_judge(study: StudyConfig, trained: TrainConfig, judged: dict[str, Stage
       judged: the stages, by role.
 
     Returns:
-      A function from learners [N, L] to the mean [N] over levels of each of the `Outcomes`, by
-      role.
+      A function that takes learners [N, L] and returns, by role, each of the `Outcomes` as its mean
+      [N] over the levels.
     """
     stages, arenas = tuple(judged.values()), len(judged) * study.levels
     world = env.load(

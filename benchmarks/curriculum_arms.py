@@ -80,8 +80,8 @@ def load_arm(study: StudyConfig, arm: str, policy: str, words: Sequence[str]) ->
 
     Args:
       study: the study.
-      arm: one of its arms.
-      policy: one of its policies.
+      arm: one of the study's arms.
+      policy: one of the study's policies.
       words: `key=value` words for training.
 
     Returns:

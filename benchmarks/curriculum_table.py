@@ -87,8 +87,8 @@ def tables(lines: Sequence[Line]) -> dict[Key, dict[str, Line]]:
       The arms of each table.
 
     Raises:
-      ConfigError: if an arm appears twice, or arms of a table were judged differently. A role that
-        only some arms have is no difference.
+      ConfigError: if an arm appears twice, or arms of a table were judged differently. Arms may
+        have different roles; only the roles that they share must agree.
     """
     found: dict[Key, dict[str, Line]] = {}
     for line in sorted(lines, key=lambda line: line["arm"] != BASELINE):
@@ -141,8 +141,8 @@ def table(key: Key, arms: dict[str, Line], measure: str) -> str:
     """Writes the table of some arms.
 
     Args:
-      key: the settings that they share.
-      arms: their lines, by name.
+      key: the settings that the arms share.
+      arms: the line of each arm, by its name.
       measure: one of `MEASURES`.
 
     Returns:
@@ -204,8 +204,8 @@ def draw(key: Key, arms: dict[str, Line], measure: str, path: Path) -> None:
     """Draws the learning curves of some arms, with their bands.
 
     Args:
-      key: the settings that they share.
-      arms: their lines, by name.
+      key: the settings that the arms share.
+      arms: the line of each arm, by its name.
       measure: one of `MEASURES`.
       path: path of the picture.
     """

@@ -30,7 +30,8 @@ Line = dict[str, Any]
 PAGE, FIGURE = "scaling.md", "figures/devices.png"
 EXPECTED_MAX = {1: 0.0, 2: 0.564, 8: 1.424, 64: 2.34, 512: 3.05}
 # Sums per update: one for each of 8 minibatches, and 5 for advantages, observations and tallies, as
-# in the compiled program (tests/training/test_mesh.py). Each line also has its own number.
+# in the compiled program (tests/training/test_mesh.py). Each line also states how many sums its
+# program has.
 REDUCES = 13
 _HOST = 8  # devices per host
 _HOP_US = 15.0  # added to a sum by each doubling of hosts; assumed, not measured
@@ -82,9 +83,10 @@ def predict(one_ms: float, devices: int, measured_us: float, deviation_ms: float
 
 
 def deviation_ms(line: Line, measured_us: float) -> float:
-    """Estimates the deviation of update times from the loss of two devices beyond their sums.
+    """Estimates the standard deviation of update times, from the time that two devices lose.
 
-    It attributes this loss to waiting. It is 0 if the devices lose less than their sums take.
+    The loss that the sums over devices do not explain is attributed to waiting. The estimate is 0
+    if the devices lose less time than their sums take.
 
     Args:
       line: line of a weak comparison of two devices.

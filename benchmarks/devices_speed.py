@@ -123,7 +123,7 @@ def _updates(alone: Arm | None) -> int:
 
 
 def _speed(arm: Arm | None, updates: int) -> float:
-    """Times one call in arena steps per second; processes without the arm only wait for it."""
+    """Returns the arena steps per second of one call; processes without the arm only wait."""
     if hosts.count() > 1:
         multihost_utils.sync_global_devices("before a call")
     if arm is None:

@@ -41,7 +41,7 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
     Returns:
       The kind of fault, how the run ended, and the outcome.
     """
-    undisturbed()  # before the disturbed run starts, since it takes as long as a run
+    undisturbed()  # called first, since this call takes as long as a run
     number, random = seed % 1_000_000, np.random.default_rng(seed)
     if number < SIZES:
         return _judge("full disk", _full(number, folder), folder / "run")

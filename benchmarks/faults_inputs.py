@@ -43,8 +43,8 @@ MOST_SECONDS = 10.0
 _MOST_WAITING = 60.0  # s by the clock; a trial that takes longer hangs
 _MOST_MEMORY = 2**31  # bytes that a trial may take in addition to this process
 _PROCESS_MEMORY = 2**34  # bytes of address space; JAX reserves more than it uses
-_PROCESS_SECONDS = 180.0  # for a process that runs, on a machine with other work
-_EVERY = 10  # one of this many trials is a process
+_PROCESS_SECONDS = 180.0  # limit for a whole process, on a machine with other work
+_EVERY = 10  # one of this many trials starts a separate process
 _ROOT = Path(__file__).resolve().parents[1]
 _PYTHONPATH = os.pathsep.join([str(_ROOT), os.environ.get("PYTHONPATH", "")])
 Words = Sequence[str]
@@ -117,7 +117,7 @@ _SOUND: dict[str, list[str]] = {
     "suite": ["suite=suite.yaml", "suite=dev", "suite=suite.yaml write=true"],
     "reproduce": ["seeds=3 budget=6000 fine_tune=6000", "arms=[baseline] minutes=1", "resume=run"],
 }
-# Appended so that a process that runs has very little work; the last word for a key counts.
+# Words appended to give a process very little work: the last word for a key counts.
 _TINY: dict[str, list[str]] = {
     "train": ["run.dry=true", "arenas=8", "algo.rollout_length=2", "task.step_limit=4"],
     "evaluate": ["episodes=1", "steps=2", "workers=1"],
@@ -302,7 +302,7 @@ def _in_process(name: str, words: list[str], folder: Path) -> tuple[str, str]:
         return "HANG", ""
     except MemoryError:
         return "TOO MUCH MEMORY", ""
-    except OSError as error:  # `command.run` makes a sentence of it if it names a file
+    except OSError as error:  # `command.run` turns the error into a sentence if it names a file
         return ("refused" if error.filename is not None else "TRACEBACK"), repr(error)
     except Exception as error:
         return "TRACEBACK", repr(error)

@@ -28,7 +28,7 @@ STAGES = ("s1", "s3")
 ARENAS, ROLLOUT, UPDATES = 64, 32, 100
 LAST = 20  # updates over which success is measured
 SEEDS = 4  # seeds of the undisturbed runs; the trials are spread over them
-SHARES = (0.01, 0.1, 1.0)  # of the arenas, or of a network's numbers
+SHARES = (0.01, 0.1, 1.0)  # shares of the arenas, or of a network's numbers, that are spoilt
 VALUES = {"nan": np.nan, "inf": np.inf, "-inf": -np.inf}
 HUGE = 1e30  # m; the reward stays finite, but its gradient does not
 # Targets of a fault in some arenas; `gradient` is spoilt by a reward whose square is infinite.

@@ -167,7 +167,7 @@ def _bomb(content: bytes, draw: random.Random) -> bytes:
         data = npy("<f4", f"{size // 4},") + bytes(size)
         return _pack([*_members(content).items(), (_BIAS, data)], zipfile.ZIP_DEFLATED)
     found, entry = bytearray(content), content.index(b"PK\x01\x02")
-    for at in draw.choice(((24,), (20, 24))):  # the sizes in the list of members
+    for at in draw.choice(((24,), (20, 24))):  # offsets of the sizes in the list of members
         found[entry + at : entry + at + 4] = size.to_bytes(4, "little")
     return bytes(found)
 

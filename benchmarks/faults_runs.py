@@ -39,7 +39,7 @@ WORDS = (
     "resume=auto",
 )
 INTERVAL = UPDATES // 10  # updates between two checkpoints
-KILLS = 4  # per run, before it may end
+KILLS = 4  # kills per run, before it may end
 _POLL = 0.002  # s
 
 
@@ -113,14 +113,14 @@ def kills(seed: int, folder: Path) -> dict[str, Any]:
     One kill comes at any moment, one during training, one while a checkpoint is written, and one
     within the first second after a resume.
     """
-    undisturbed()  # before a run starts, since it takes as long as a run
+    undisturbed()  # called before the first start, since this call takes as long as a run
     random, run = np.random.default_rng(seed), folder / "run"
     moments, repeated = [], []
     for number in range(KILLS):
         how = ("any", "save", "training", "resume")[number % 4]
         process = start(run)
         _MOMENTS[how](process, run, random)
-        if process.poll() is None:  # else the run ended before the kill
+        if process.poll() is None:  # otherwise the run ended before the kill
             moments.append(how)
         process.kill()
         process.communicate()
@@ -154,7 +154,7 @@ def _while_training(process: subprocess.Popen[str], run: Path, random: np.random
 
 
 def _while_saving(process: subprocess.Popen[str], run: Path, random: np.random.Generator) -> None:
-    """Waits until a random one of the next checkpoints is begun, and a little longer."""
+    """Waits until the writing of a randomly chosen later checkpoint begins, and a little longer."""
     left = int(random.integers(1, 4))
     seen: set[str] = set()
     while left and process.poll() is None:
@@ -204,7 +204,7 @@ def terms(seed: int, folder: Path) -> dict[str, Any]:
     Two of three runs are asked while they train. The others are asked at any moment, most of them
     while Python starts and the program is compiled.
     """
-    undisturbed()  # before the run starts, since it takes as long as a run
+    undisturbed()  # called before the run starts, since this call takes as long as a run
     random, run = np.random.default_rng(seed), folder / "run"
     number = (signal.SIGTERM, signal.SIGUSR1, signal.SIGINT)[seed % 3]
     moment = "any" if seed // 3 % 3 == 0 else "training"
@@ -239,7 +239,7 @@ def terms(seed: int, folder: Path) -> dict[str, Any]:
 
 @functools.cache
 def _template() -> Path:
-    """Makes three runs, two of them with one config, with several checkpoints each; keeps them."""
+    """Makes and keeps three runs with several checkpoints each; two of them share a config."""
     folder = Path(tempfile.mkdtemp(prefix="faults-"))
     more = ("run.keep_checkpoints=5",)
     for name, changed in (("mine", ()), ("twin", ()), ("other", ("algo.discount=0.9",))):

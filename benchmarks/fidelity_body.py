@@ -108,8 +108,8 @@ def _inertia(both: Sequence[Rig]) -> list[Row]:
     model, unit = both[1].model, "kg m²"
     chassis, wheel = model.body(BODY), model.body(f"{BODY}_left").inertia
     about, whole = chassis.inertia, centre(both[1])
-    # Sum of the body about z and two wheels of 5 g, each 0.026 m off the axis and with its own
-    # 5.1e-7.
+    # Sum of the body's moment about z and those of two wheels: each has 5 g, is 0.026 m off the
+    # axis, and adds its own 5.1e-7.
     yaw = {PROTO: 9.78585e-5 + 2 * (0.005 * 0.026**2 + 5.1e-7)}
     height = {PROTO: (0.15 * 0.015 + 0.01 * 0.020) / 0.16}
     lying = "centre of mass without wheels, height"

@@ -69,8 +69,8 @@ BEFORE_A_WALL = (
     (50, 102.4, 67.2),
 )
 SIMULATORS: tuple[str, ...] = ("Webots", "GCtronic", "Enki", "ARGoS")
-# Distance (mm), then the counts of each simulator. They measure the distance from points that are 3
-# to 6 mm apart.
+# Distance (mm), then the counts of each simulator. The points from which the simulators measure the
+# distance are 3 to 6 mm apart.
 CURVES = (
     (5, 2133, 4095, 3501, 3706),
     (10, 1466, 2500, 2069, 3043),

@@ -39,7 +39,7 @@ LAG = 0.05  # s
 # start shifts back, the wheels push with mu m g / (1 + mu h / x): mass at h = 0.0153 m, skid at
 # x = 0.025 m.
 RAMPS = 0.1256 / 9.81, 0.1256 / 9.81 * (1 + 0.0153125 / 0.025)
-SPIN_UP = 3.14 * 1.0564e-4 / (0.16 * 9.81 * 0.026)  # s to a turn rate: w I / (mu m g L / 2)
+SPIN_UP = 3.14 * 1.0564e-4 / (0.16 * 9.81 * 0.026)  # s; time to a turn rate: w I / (mu m g L / 2)
 FINE = 0.0005  # s; a physics step that resolves a start of 8 to 21 ms
 REVOLUTIONS = 10
 TRACKS = 0.052, 0.057  # m
@@ -297,7 +297,7 @@ def blocked(bench: Rig) -> Track:
 
 
 def _wall(both: Sequence[Rig]) -> list[Row]:
-    tracks, late = [blocked(each) for each in both], slice(-60, None)  # the last of a long push
+    tracks, late = [blocked(each) for each in both], slice(-60, None)  # end of a long push
     depth = [each.pose[:, 0] + contact_radius(both[0]) - 0.5 * rig.SIDE for each in tracks]
     deepest, mean = [d.max() for d in depth], [d[late].mean() for d in depth]
     push, slips = [each.force[late].mean() for each in tracks], tracks[1].qvel[late, 6].mean()

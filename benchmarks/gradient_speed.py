@@ -1,13 +1,15 @@
 """How long does the gradient of a minibatch take with autodiff and with the fused kernels?
 
 `python -m benchmarks.gradient_speed [batch=N,N] [tile=N,N] [programs=N,N] [warps=N,N] [key=value
-...]` also takes the keys of `swarmjax.train`, but only `algo.*` matter. For each batch it compiles
-autodiff and every launch of the kernels, times them alternately, and prints a JSON line for each:
-seconds per gradient, and the difference from autodiff's gradient at the same and at full precision.
+...]` also takes the keys of `swarmjax.train`, of which only `algo.*` have an effect. For each batch
+it compiles autodiff and every launch of the kernels, times them alternately, and prints a JSON line
+for each: seconds per gradient, and the difference from autodiff's gradient at the same and at full
+precision.
 
 The time of a kernel gradient includes converting the networks to vectors and back, which learners
 do only once per update. With `algo.memory=gru` the samples are sequences as long as a rollout. With
-`algo.critic=state` the critic has the same inputs as in training. Both work only with autodiff.
+`algo.critic=state` the critic has the same inputs as in training. Both options work only with
+autodiff.
 """
 
 import functools

@@ -22,7 +22,7 @@ from swarmjax.config import about
 
 FRAMESKIP = 2  # CAMAR's own default: three substeps
 DT = 0.032 / (FRAMESKIP + 1)  # s
-CELLS = 6  # per side; with 0.2 m each the arena is 1.2 m wide
+CELLS = 6  # cells per side; they are 0.2 m wide, so the arena is 1.2 m wide
 COUNTED = {
     "step": "control step: three substeps of penalty contacts between discs in the plane, the "
     "vectors to the nearest objects instead of rays, reward",

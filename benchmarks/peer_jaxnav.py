@@ -2,9 +2,9 @@
 
 `python -m benchmarks.peer_jaxnav [arenas=4096,65536] [step=pool] ...` needs the extra `jaxmarl` and
 prints a JSON line for each number of arenas and each way to step. `pool` uses `step_env` with a
-pool of `pool` states that were drawn beforehand (JaxNav's best case). `default` uses `step`
-unchanged, which draws a whole map for every arena and step and discards nearly all of them. It
-times calls of `steps` control steps with random actions, each call one compiled scan.
+pool of `pool` states that were drawn beforehand (JaxNav's best case). `default` uses JaxNav's own
+`step`. This function draws a whole map for every arena and step, and discards nearly all of these
+maps. It times calls of `steps` control steps with random actions, each call one compiled scan.
 """
 
 import sys
@@ -26,7 +26,7 @@ from swarmjax.config import about
 # 0.3 / 0.037. Our rays of 0.04 m become 0.32 m. Samples along them have the default spacing.
 RADIUS = 0.3
 BEAMS, RANGE, RESOLUTION = 8, 0.3, 0.05
-CELLS = 7  # per side; the outer ones are wall
+CELLS = 7  # cells per side; the outer ones are wall
 RESETS = {
     "pool": "one of a pool of states that were drawn beforehand, at random: its best case",
     "default": "a new map for every arena and step, used where an episode ends: its default",

@@ -172,7 +172,7 @@ def navground() -> Any:
     """Imports `navground`.
 
     Raises:
-      ConfigError: if it is not installed.
+      ConfigError: if `navground` is not installed.
     """
     try:
         return importlib.import_module("navground.core")

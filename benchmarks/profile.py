@@ -28,7 +28,7 @@ from swarmjax import command
 from swarmjax.run.settings import TrainConfig, load_train
 
 TOP = 40
-UPDATES = 2  # in the call of training
+UPDATES = 2  # updates in the call of training
 # Parts of the names of threads and streams with kernels, by platform.
 LINES = {"gpu": "Stream", "cpu": "tf_XLA"}
 # Events that only mark the ends of a region, and loops, whose contents are counted separately.
@@ -42,7 +42,7 @@ KINDS = {
 
 
 def kind(name: str) -> str:
-    """Guesses from its name what a kernel does: a key of `KINDS`, or `fusion`."""
+    """Guesses from a kernel's name what the kernel does: a key of `KINDS`, or `fusion`."""
     return next((k for k, marks in KINDS.items() if any(m in name for m in marks)), "fusion")
 
 

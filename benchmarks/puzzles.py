@@ -174,7 +174,7 @@ def _random(*key: int) -> np.random.Generator:
 
 
 def _parts(beside: np.ndarray) -> np.ndarray:
-    """Numbers the connected parts of a layout: each place gets the lowest place of its part."""
+    """Labels the connected parts of a layout: each place gets the lowest place of its part."""
     part = np.arange(len(beside))
     for _ in beside:
         part = np.where(beside >= 0, part[beside], len(beside)).min(axis=-1)
@@ -190,7 +190,7 @@ def to_level(draw: Draw, edge: float, boxes: int) -> Level:
     Args:
       draw: the puzzle.
       edge: edge of a cell, m.
-      boxes: number of boxes in the level; those that the walls do not need are absent.
+      boxes: number of boxes in the level; boxes that the walls do not need are marked absent.
 
     Returns:
       The level of one arena.
@@ -214,7 +214,7 @@ def to_level(draw: Draw, edge: float, boxes: int) -> Level:
 
 
 def _read(rows: Sequence[str], start: Place, target: Place, edge: float) -> maps.Map:
-    """Reads a layout as a map for one robot, since a place may be a start and another's target."""
+    """Reads a layout as a map for one robot, since one place may be both a start and a target."""
     letters = [list(row) for row in rows]
     for (r, c), letter in ((start, "a"), (target, "A")):
         letters[r][c] = letter
@@ -226,7 +226,8 @@ def draw_puzzles(robots: int, draws: int) -> list[Draw]:
 
     Args:
       robots: number of robots.
-      draws: draws per layout; a smaller number gives the first of a larger one, up to `DRAWS`.
+      draws: number of draws per layout, up to `DRAWS`. A smaller number gives the first draws of a
+        larger number.
 
     Returns:
       The puzzles.

@@ -16,7 +16,8 @@ Brax differs in these points:
 - no compiler options for XLA (`loop.compiler_options`);
 - no mask, so arrived robots stay in its batch (docs/adapters.md).
 
-All of Brax's robot steps count as transitions. Of ours only those used for learning count.
+All of Brax's robot steps count as transitions. Our trainer's transitions are only the robot steps
+that it learns from.
 
 `settings=playground` gives Brax the settings of MuJoCo Playground for its walking robots
 (`PLAYGROUND`) instead of ours. The networks stay the same.
@@ -66,7 +67,7 @@ BRAX = {
     "ours": "Brax PPO, this environment",
     "playground": "Brax PPO as MuJoCo Playground sets it, this environment",
 }
-_COMPILING = 2  # calls of Brax that may compile; the second gets the first one's results
+_COMPILING = 2  # calls of Brax that may compile; the second takes the results of the first
 _ACTIVATIONS = {"tanh": linen.tanh, "relu": linen.relu, "swish": linen.swish}
 
 
@@ -96,7 +97,7 @@ class Course(NamedTuple):
 
     Attributes:
       train_s: [P] seconds of training up to each point.
-      share: [P] share of targets reached there.
+      share: [P] share of targets reached at each point.
       transitions: [P] transitions trained on up to the point.
       arena_steps: [P] arena steps up to the point.
       compile_s: compile time, s.

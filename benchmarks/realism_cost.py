@@ -37,7 +37,8 @@ def arms() -> dict[str, RealismConfig]:
     alone = {"infrared": RealismConfig(infrared=real.infrared)}
     for item in dataclasses.fields(RealismConfig):
         if item.name not in _NO_FACTOR:
-            # Factors of the counts need a response with counts, so they are added to one.
+            # Factors that change infrared counts need a response with counts, so such a response is
+            # added.
             base = alone["infrared"] if item.name in COUNTED else RealismConfig()
             alone[item.name] = replace(base, **{item.name: getattr(real, item.name)})
     return presets | alone

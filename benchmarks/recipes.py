@@ -2,8 +2,9 @@
 
 `python -m benchmarks.recipes label=NAME [judged=s6,crowd_dense] [key=value ...]` takes the keys of
 `RecipeConfig` and of `swarmjax.train`. It trains all seeds in one program and stops at points that
-are evenly spaced over the logarithm of the updates. There it judges every seed on the training
-device, with drawn and with mean actions, on levels that are in no suite. It prints one JSON line.
+are evenly spaced over the logarithm of the updates. At each point it judges every seed on the
+training device, with drawn and with mean actions, on levels that are in no suite. It prints one
+JSON line.
 """
 
 import json
@@ -70,8 +71,8 @@ def load_judge(recipe: RecipeConfig, trained: TrainConfig) -> Judge:
     """Makes the judge of all points.
 
     Returns:
-      A function from learners [N, L] to means [N] over levels, by stage, kind of action and
-      measure.
+      A function that takes learners [N, L] and returns means [N] over levels, by stage, kind of
+      action and measure.
     """
     stages = [build(StageConfig, stage_files.read_stage(name)) for name in recipe.judged]
     robot = trained.robot

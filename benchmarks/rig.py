@@ -1,7 +1,7 @@
 """A test rig for one robot: alone in a square arena of MuJoCo's C engine, with given wheel speeds.
 
-It measures numbers of the robot. Its model is the one that training and the judge share. Nothing
-here uses the expected behaviour.
+It measures numbers of the robot. Its model is the one that training and the judge share. No code
+here uses the numbers that are expected.
 """
 
 from dataclasses import dataclass
@@ -67,7 +67,8 @@ def load(robot: RobotConfig, timestep: float | None = None) -> Rig:
 
     Args:
       robot: settings of the robot.
-      timestep: physics step, s, with one command per physics step; None for the judge's steps.
+      timestep: physics step, s; every physics step then has its own command. None: the judge's
+        steps.
 
     Returns:
       The rig.

@@ -3,8 +3,9 @@
 `python -m benchmarks.rub_sweeps [stages=A,...] [designs=A,...] [driver=random] [key=value ...]`
 also takes the keys of `swarmjax.train`. It drives many arenas of each stage, either straight to the
 targets with noise or at random, and keeps their states at every `EVERY`-th control step. It then
-solves the contacts of each state with every design: `built`, which is `sim/fast/rubbing_jax.py`,
-and those of `DESIGNS` in NumPy, on the same contacts and also in float32.
+solves the contacts of each state with every design: with `built`, which is
+`sim/fast/rubbing_jax.py`, and with the `DESIGNS` in NumPy. All designs use float32 and get the same
+contacts.
 
 It prints a JSON line for each stage and design: the sweeps, and the error of the accelerations
 relative to `CONVERGED` plain sweeps in float64. A warp of a GPU needs as many sweeps as the slowest
@@ -35,7 +36,7 @@ from swarmjax.sim.fast.discs import TOLERANCE, DiscRobots, Discs
 STAGES = "s6", "fence", "world_fence", "world_door", "crowd", "world_crowd"
 DEFAULTS = ("robot.hull_friction=1", "arenas=512")
 STEPS, EVERY = 480, 24  # control steps per arena, and between two kept states
-CONVERGED, EXACT = 2000, 1e-13  # maximum of sweeps in float64, which end when forces change by less
+CONVERGED, EXACT = 2000, 1e-13  # most float64 sweeps, and the change of forces that ends them
 NOISE = 0.5  # standard deviation of the actions of robots that head for their targets
 WARP = 32  # threads of a GPU that wait for each other
 
@@ -52,7 +53,7 @@ class RubSweepsConfig(Section):
 
 
 class States(NamedTuple):
-    """States to solve contacts in: S states, with those of one control step next to each other.
+    """S states whose contacts are solved; states of the same control step are next to each other.
 
     Attributes:
       discs: the fixed numbers of the discs.
@@ -378,7 +379,7 @@ def _leap(contacts: Contacts, past: list[tuple[np.ndarray, np.ndarray]]) -> np.n
 def _coast(
     trail: Trail, past: list[tuple[np.ndarray, np.ndarray]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Continues the forces' last change (Nesterov's momentum); also returns the new pace."""
+    """Continues the forces' last change (Nesterov's momentum); returns the new pace too."""
     (force, change), (before, _) = past
     uphill = np.einsum("ksc,ksc->s", change, force - before) < 0.0
     pace = np.where(uphill, 1.0, trail.pace)

@@ -169,14 +169,14 @@ def read(path: Path) -> list[Line]:
 def run_entry(entry: SuiteEntry, output: Output, deadline: float) -> None:
     """Runs the remaining values of an entry, in as many processes as needed.
 
-    If a process dies or is ended, the value that it was at is recorded as failed. The next process
-    takes the values after it.
+    If a process dies or is ended, the value that it was measuring is recorded as failed. The next
+    process takes the values after it.
 
     Args:
       entry: entry of a suite.
       output: gets the lines.
-      deadline: time by `time.monotonic`. The process that runs at this time is ended, which is no
-        failure.
+      deadline: time by `time.monotonic`. The process that runs at this time is ended, but its value
+        is not recorded as failed.
     """
     waiting = left(entry, output.lines)
     while waiting:

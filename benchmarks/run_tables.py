@@ -246,7 +246,7 @@ def _success(lines: Sequence[Line]) -> list[str]:
 
 
 def _median(values: Sequence[float | None], digits: int = 1) -> str:
-    """Writes the median and all values; a seed that never got there counts as the slowest."""
+    """Writes the median and all values; a seed that never succeeded counts as the slowest."""
     known = sorted(value if value is not None else float("inf") for value in values)
     middle = statistics.median_high(known)
     shown = ", ".join(seconds(value, digits) for value in values)

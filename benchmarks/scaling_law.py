@@ -39,7 +39,7 @@ from swarmjax.task.stage_files import load_levels
 
 MEASURES = ("targets_reached", "all_reached", "contacts_per_robot", "episode_time_s")
 ACTIONS = ("sampled", "mean")
-_ROBOTS = 5  # per arena, to convert arena steps to transitions
+_ROBOTS = 5  # robots per arena, to convert arena steps to transitions
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,10 +1,11 @@
 """Do memory, descriptors and speed of a long run stay constant?
 
 `python -m benchmarks.soak dir=DIR minutes=60 [key=value ...]` trains in `DIR`/run for this time and
-then asks the run to stop. It appends a sample every ten seconds to `DIR`/samples.jsonl. The other
-words are those of `swarmjax.train`. The same command again resumes the run as another leg.
-`python -m benchmarks.soak dir=DIR do=table` prints a JSON line with the median of each leg and
-quantity, and its slope in percent of the median per hour, by Theil and Sen with a 95 % interval.
+then asks the run to stop. It appends a sample every ten seconds to `DIR`/samples.jsonl. All other
+keys are keys of `swarmjax.train`. If the same command is given again, it resumes the run, and this
+part of the run is called another leg. `python -m benchmarks.soak dir=DIR do=table` prints a JSON
+line with the median of each leg and quantity, and its slope in percent of the median per hour, by
+Theil and Sen with a 95 % interval.
 
 Speed is given per second, and per second of processor time, which other processes on the machine
 affect less.

@@ -191,7 +191,7 @@ def about(settings: TrainConfig, impl: str | None = None) -> dict[str, Any]:
 
     Args:
       settings: settings of training.
-      impl: implementation that was used; None finds it out, which may need the GPU.
+      impl: implementation that was used; None: the function finds out, which may need the GPU.
 
     Returns:
       Entries with the names in docs/interface.md.

@@ -28,7 +28,7 @@ class Watched:
 
     Attributes:
       directory: directory of the run.
-      seconds: seconds from the command to its end, once it has ended.
+      seconds: seconds from the start of the command to its end; valid once the run has ended.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Watched:
         )
 
     def rows(self) -> Iterator[tuple[float, dict[str, Any]]]:
-        """Yields the rows of its metrics until it ends, each with the seconds since the command.
+        """Yields the rows of the run's metrics until it ends, with the seconds since the command.
 
         Raises:
           ConfigError: if the run ends with an error; the message is the run's.

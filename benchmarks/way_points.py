@@ -17,7 +17,7 @@ CELL = 0.01  # m; a 0.09 m passage on s6 leaves a centre 0.016 m, which 0.02 m c
 COARSE_CELL, LARGE = 0.02, 2.0  # m; COARSE_CELL is for arenas with a side above LARGE
 MARGIN, DEARER = 0.015, 3.0  # steps within MARGIN (m) of the hull's limit cost DEARER times as much
 REACH = 24  # maximum distance of a way-point, in cells along the path
-_STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))  # to half of a cell's neighbours
+_STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))  # steps to half of a cell's neighbours
 
 
 class Plan(NamedTuple):

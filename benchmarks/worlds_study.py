@@ -1,10 +1,10 @@
-"""Does a curriculum pay on worlds with walls? Its modes, levels, memory and messages compared.
+"""Does a curriculum pay on worlds with walls? Compares modes, levels, memory and messages.
 
 `python -m benchmarks.worlds_study arms=random,adaptive [key=value ...]` trains each arm on the ten
-families of `stage=worlds`, one seed after another in one program, and judges every seed at points
-along its training: on the device, on the same new levels of every family, with the sizes of the
-suite `worlds`. It prints a JSON line for each arm as soon as it is done. Keys are those of `Study`
-and of `swarmjax.train`; `seeds` is 10 unless given.
+families of `stage=worlds`, one seed after another in one program. It judges every seed at several
+points of its training, on the device. All arms are judged on the same new levels of every family,
+with the sizes of the suite `worlds`. It prints a JSON line for each arm as soon as it is done. It
+takes the keys of `Study` and of `swarmjax.train`; `seeds` is 10 by default.
 
 `python -m benchmarks.worlds_table FILE...` makes the table.
 """
@@ -89,7 +89,7 @@ _PARTS = {
     "messages": ["task.neighbours.count=4", "task.neighbours.message_size=2"],
     "state": ["algo.critic=state"],
 }
-# The sizes of the suite `worlds`, where a stage of training has ranges.
+# The sizes of the suite `worlds`; the stages for training have ranges instead.
 HARDEST: dict[str, dict[str, Any]] = {
     "trap": {"width": 0.3, "depth": 0.3},
     "fence": {"length": 0.6},
@@ -101,7 +101,7 @@ Judge = Callable[[LearnerState], dict[str, dict[str, np.ndarray]]]
 
 @dataclass(frozen=True, kw_only=True)
 class Study(Section):
-    """What is compared, and how it is judged."""
+    """Settings: which arms to compare, and how to judge them."""
 
     arms: tuple[Arm, ...] = field(
         default=tuple(ARMS),
@@ -121,14 +121,14 @@ def load_arm(study: Study, arm: Arm, words: Sequence[str]) -> TrainConfig:
 
     Args:
       study: The study.
-      arm: One of its arms.
-      words: Of training, `key=value`; they win over the recipe.
+      arm: One of the study's arms.
+      words: `key=value` words for training; they override the recipe.
 
     Returns:
       The config.
 
     Raises:
-      ConfigError: If a word is unsound.
+      ConfigError: If a word is invalid.
     """
     parts = [word for name, mine in _PARTS.items() if name != study.without for word in mine]
     found = load_train([*RECIPE, *parts, *ARMS[arm], *words])
@@ -164,7 +164,8 @@ def load_judge(study: Study, trained: TrainConfig) -> Judge:
       trained: The config of the arm.
 
     Returns:
-      From learners [N, L] to the means [N] over the levels of each of the `Outcomes`, by family.
+      A function that takes learners [N, L] and returns, by family, each of the `Outcomes` as its
+      mean [N] over the levels.
     """
     stages = tuple(_hardest(stage) for stage in trained.stage)
     config = programs.load(trained)[0].config.algo
@@ -193,7 +194,7 @@ def load_judge(study: Study, trained: TrainConfig) -> Judge:
 
 
 def results(study: Study, words: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Trains and judges all arms; yields a line each."""
+    """Trains and judges all arms; yields one line per arm."""
     arms: list[tuple[Arm, TrainConfig]] = [(arm, load_arm(study, arm, words)) for arm in study.arms]
     for arm, trained in arms:
         at = points(study, trained)
@@ -202,7 +203,7 @@ def results(study: Study, words: Sequence[str]) -> Iterator[dict[str, Any]]:
 
 
 def _line(study: Study, arm: Arm, trained: TrainConfig, at: np.ndarray) -> dict[str, Any]:
-    """Says what an arm was."""
+    """Returns the entries of a line that describe an arm."""
     return {
         "benchmark": "worlds_study",
         "arm": arm if study.without == "nothing" else f"{arm}, without {study.without}",

@@ -1,4 +1,4 @@
-"""Tables of what `benchmarks.worlds_study` has printed.
+"""Makes tables from the lines that `benchmarks.worlds_study` has printed.
 
 `python -m benchmarks.worlds_table FILE...` prints two Markdown tables. The first has an arm in each
 row, with interquartile means over seeds and families and 95 % intervals of a stratified bootstrap
@@ -6,8 +6,8 @@ row, with interquartile means over seeds and families and 95 % intervals of a st
 
 - `all arrive`: share of levels in which all robots arrive, at the end of training.
 - `to 0.9`: arena steps until a seed's mean over the families first reaches 0.9.
-- `worst 5 %`: mean of the worst twentieth of the seeds' families.
-- `contacts`: per robot.
+- `worst 5 %`: mean of the worst twentieth of all results, one for each seed and family.
+- `contacts`: contacts per robot.
 - `P(better)`: probability that a seed does better on a family than a seed of `random`.
 
 The second has a family in each row, with the mean over seeds of `all arrive` for every arm.
@@ -40,7 +40,7 @@ def read(path: Path) -> list[Line]:
     """Reads the lines of a file.
 
     Raises:
-      ConfigError: If it cannot be read, or has a line that `benchmarks.worlds_study` did not print.
+      ConfigError: If the file cannot be read, or a line is not from `benchmarks.worlds_study`.
     """
     try:
         lines = [json.loads(text) for text in path.read_text().splitlines() if text]
@@ -56,16 +56,16 @@ def read(path: Path) -> list[Line]:
 
 
 def merge(lines: Sequence[Line]) -> dict[str, Line]:
-    """Puts together the seeds of each arm, which several runs may have trained.
+    """Joins the lines of each arm, since several runs may have trained seeds of one arm.
 
     Args:
-      lines: As `benchmarks.worlds_study` prints them.
+      lines: The lines that `benchmarks.worlds_study` printed.
 
     Returns:
       A line for each arm, the baseline first.
 
     Raises:
-      ConfigError: If a seed of an arm is there twice, or lines were judged differently.
+      ConfigError: If an arm has the same seed twice, or lines were judged differently.
     """
     found: dict[str, Line] = {}
     for line in sorted(lines, key=lambda line: line["arm"] != BASELINE):
@@ -93,7 +93,7 @@ def _joined(one: Line, other: Line) -> Line:
 
 
 def curves(line: Line, measure: str) -> np.ndarray:
-    """Returns what an arm measured, [N seeds, F families, P points]."""
+    """Returns the results of an arm, [N seeds, F families, P points]."""
     return np.stack([np.array(found[measure]) for found in line["judged"].values()], axis=1)
 
 

@@ -1,6 +1,6 @@
 """Exit codes of the commands."""
 
-FAILED = 1  # what was asked for could not be done, or two things differ
-USER_ERROR = 2  # a setting, a file or a word of the command line is unsound
-REQUEUE = 75  # EX_TEMPFAIL of sysexits.h: stopped by a scheduler, to be started again
-INTERRUPTED = 130  # 128 + SIGINT, as a shell gives it
+FAILED = 1  # the command could not do its work, or a comparison found a difference
+USER_ERROR = 2  # a setting, a file or a word of the command line is invalid
+REQUEUE = 75  # EX_TEMPFAIL of sysexits.h: a scheduler stopped the run; start it again
+INTERRUPTED = 130  # 128 + SIGINT, the code that shells use

@@ -11,9 +11,9 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 FORMAT = 2
-MEMORY_FORMAT = 4  # of a policy with a memory or a history
-HEARING_FORMAT = 5  # of a policy that hears neighbours, with or without memory
-MAX_BYTES = 2**30  # of all arrays; those of two layers of 64 take 20 kB
+MEMORY_FORMAT = 4  # for a policy with a memory or a history
+HEARING_FORMAT = 5  # for a policy that hears neighbours, with or without memory
+MAX_BYTES = 2**30  # limit for all arrays; with two layers of 64 they take 20 kB
 _MAX_LIST = 2**16  # bytes of the list of members; a name takes a hundred
 MAX_LETTERS = 2**20  # characters of `meta`, four bytes each
 MAX_ENTRIES = 2**16  # entries of `meta`, each a hundred bytes or more
@@ -55,7 +55,7 @@ class Policy(NamedTuple):
 
     @property
     def history(self) -> int:
-        """Number of observations that the policy uses: the last one, and those before."""
+        """Number of observations that the policy uses: the last one, and earlier ones."""
         return self.meta["observation"].get("history", 1)
 
     @property
@@ -67,7 +67,7 @@ class Policy(NamedTuple):
 
 
 def load(path: str | Path | IO[bytes]) -> Policy:
-    """Returns the policy in a file (path, or open in binary); raises PolicyError if unsound."""
+    """Returns the policy in a file (path, or open in binary); raises PolicyError if invalid."""
     try:
         if isinstance(path, str | Path) and Path(path).exists() and not Path(path).is_file():
             raise ValueError("it is not a plain file")  # reading a pipe would wait for its writer
@@ -107,7 +107,7 @@ def load(path: str | Path | IO[bytes]) -> Policy:
 
 
 def open_archive(file: IO[bytes]) -> zipfile.ZipFile:
-    """Opens an archive, after checking at its end how much of it zipfile would read."""
+    """Opens an archive; first checks the size of its list of members, which zipfile reads."""
     file.seek(max(0, file.seek(0, 2) - 42))
     end = file.read()
     if end[-22:-18] != b"PK\5\6":
@@ -130,7 +130,7 @@ def _read(file: IO[bytes]) -> dict[str, np.ndarray]:
 
 
 def read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """Reads a member, and checks that its size is that of its header."""
+    """Reads a member, and checks that its size matches its header."""
     with archive.open(member) as file:
         if np.lib.format.read_magic(file) != (1, 0):
             raise ValueError(f"{member.filename!r} is not of npy version 1.0")
@@ -160,7 +160,7 @@ def act(policy: Policy, observation: np.ndarray, normal: Any = 0.0) -> np.ndarra
     """Draws the action of each robot; without `normal` it is the most likely one.
 
     Args:
-      policy: Without memory or history, with one learner for all robots, or at least R.
+      policy: Has no memory or history, and one learner for all robots or at least R learners.
       observation: [..., R, O] as `meta["observation"]` says: (quantity - offset) / scale.
       normal: [..., R, U] standard normal, drawn afresh at each control step.
 
@@ -186,13 +186,13 @@ def step(
     """Draws actions as `act` does, and updates the memory.
 
     Args:
-      policy: With one learner for all robots, or at least R.
+      policy: Has one learner for all robots, or at least R learners.
       memory: [..., R, H] from `begin` or from the step before.
-      observation: As in `act`; of this control step alone, also with a history.
+      observation: As in `act`; even with a history, only that of this control step.
       normal: As in `act`.
 
     Returns:
-      The memory after, and the action.
+      The memory after this step, and the action.
     """
     _check(policy, memory, observation)
     mine, limit = slice(observation.shape[-2]), policy.meta["observation"]["limit"]
@@ -239,7 +239,7 @@ def _hear(parts: list[np.ndarray], policy: Policy, x: np.ndarray) -> np.ndarray:
 
 
 def _remember(parts: list[np.ndarray], memory: np.ndarray, features: np.ndarray) -> np.ndarray:
-    """Returns the memory after a gated recurrent unit (GRU), reset gate after the product."""
+    """Applies a gated recurrent unit (GRU), whose reset gate follows the product, to the memory."""
     seen, recalled = (
         np.vecmat(features, parts[0]) + parts[1],
         np.vecmat(memory, parts[2]) + parts[3],
@@ -257,8 +257,8 @@ def command(policy: Policy, action: np.ndarray) -> np.ndarray:
     """Scales actions [..., U], clipped to -1..1, to commands.
 
     Returns:
-      [..., U]: speed, 0..max_speed (m/s), and turn rate (rad/s, left positive). With messages,
-      these follow, within -1..1.
+      [..., U]: speed, 0..max_speed (m/s), and turn rate (rad/s, left positive). If robots send
+      messages, these follow, within -1..1.
     """
     speed, turn, *said = np.moveaxis(np.clip(action, -1, 1), -1, 0)
     drive = [(speed + 1) * (0.5 * policy.max_speed), turn * policy.max_turn_rate]

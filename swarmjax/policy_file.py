@@ -1,4 +1,4 @@
-"""Reads and writes policy files (docs/policy-format.md), every field checked. No JAX.
+"""Reads and writes policy files (docs/policy-format.md), and checks every field. No JAX.
 
 `policy.load` trusts NumPy's reading of a file; `read` trusts nothing. It matches each member's
 header against the one form that NumPy writes, instead of evaluating it, and compares sizes before
@@ -40,14 +40,14 @@ BODIES = ("planar", "wheeled")
 RESPONSES = ("ideal", "webots", "real")
 ARRIVALS = ("latch", "hold")
 
-_MOST_MEMORY = 1024  # numbers in a robot's memory
-_MOST_HISTORY = 64  # observations that a policy uses
-_MOST_HEARD = 32  # neighbours, and numbers in each message
-NETWORK_FORMAT = 3  # of a policy whose network is an extension's code, not in the file
+_MOST_MEMORY = 1024  # limit of the numbers in a robot's memory
+_MOST_HISTORY = 64  # limit of the observations that a policy uses
+_MOST_HEARD = 32  # limit of the neighbours, and of the numbers in each message
+NETWORK_FORMAT = 3  # for a policy whose network is an extension's code, which is not in the file
 _NETWORK = "network/"
 _DTYPE = np.dtype("<f4")
-_MOST = float(np.finfo(np.float32).max)  # for numbers of `meta`, which are used in float32
-_MOST_LIMIT = 1e6  # standard deviations; above it, sums of float32 may overflow
+_MOST = float(np.finfo(np.float32).max)  # limit for numbers in `meta`, since they become float32
+_MOST_LIMIT = 1e6  # limit in standard deviations; above it, float32 sums may overflow
 _MEMBER = re.compile(
     r"(actor/(hidden_\d{1,3}|mean|hearing|memory/(input|recurrent))/(kernel|bias)|actor/log_std|"
     r"normalizer/(mean|std)|meta|digest|"
@@ -104,7 +104,7 @@ def read(path: str | Path, extensions: str | None = None) -> Policy:
         return _with_network(path, members, meta, extensions)
     try:
         return policy.load(io.BytesIO(content))
-    except PolicyError as error:  # its sentence names the buffer instead of the path
+    except PolicyError as error:  # the error's message names the buffer instead of the path
         _, _, reason = str(error).partition(" cannot be read as a policy: ")
         raise PolicyError(f"{path} cannot be read as a policy: {reason}") from None
 
@@ -271,7 +271,7 @@ def _check_memory(meta: Mapping[str, Any]) -> int:
 
 
 class _Heard(NamedTuple):
-    """The number of neighbours that a robot hears, and of numbers in each message."""
+    """The number of neighbours that a robot hears, and the length of each message."""
 
     robots: int = 0
     messages: int = 0
@@ -348,7 +348,7 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _check_file(content: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Refuses an unsound policy file; returns its arrays, with the digest, and meta."""
+    """Refuses an invalid policy file; returns its arrays, with the digest, and meta."""
     members = {name: _parse_array(name, data) for name, data in _unpack(content).items()}
     expected, meta = _text(members, "digest"), _parse_meta(_text(members, "meta"))
     del members["digest"]
@@ -419,7 +419,7 @@ def _parse_array(name: str, data: bytes) -> np.ndarray:
         raise PolicyError(f"{name} does not have as many values as its shape {list(shape)}.")
     try:
         return np.ndarray(shape, dtype, data, start)
-    except ValueError:  # an axis of 0, where NumPy cannot hold the product of the others
+    except ValueError:  # one axis is 0, and the product of the others is too large for NumPy
         raise PolicyError(f"{name} has shape {list(shape)}: expected no axis of 0.") from None
 
 
@@ -580,7 +580,7 @@ def _check_embodiment(meta: Mapping[str, Any]) -> None:
     _check_positive(sensors, "range", "meta.sensors")
     for key in ("control_step", "target_radius"):
         _check_positive(task, key, "meta.task")
-    if "arrival" in task:  # older files lack it, and mean the first rule
+    if "arrival" in task:  # older files lack this key, and their rule is `latch`
         _choice(task, "arrival", ARRIVALS, "meta.task")
 
 

@@ -86,8 +86,9 @@ def load_digests(settings: VerifyConfig, trained: TrainConfig) -> dict[int, str]
 def _is_replayable(row: directory.Row, trained: TrainConfig) -> bool:
     """Returns whether training from the beginning reproduces a checkpoint.
 
-    It does not if the run had lowered its learning rates, other random streams or another budget.
-    The budget matters because the learning rates fall to 0 over it.
+    A checkpoint cannot be reproduced if the run has lowered its learning rates, or used other
+    random streams or another budget. The budget matters because the learning rates fall to 0 over
+    the budget.
     """
     same = {"rate_scale": 1.0, "budget": trained.budget, "streams": trained.stream_count}
     return row["update"] > 0 and all(row.get(key, value) == value for key, value in same.items())

@@ -114,7 +114,7 @@ class LevelsConfig(Section):
 
     @property
     def is_on(self) -> bool:
-        """Whether there is a buffer."""
+        """Whether the curriculum has a buffer of levels."""
         return self.mode in _BUFFERED
 
     @property
@@ -140,7 +140,8 @@ class CurriculumConfig(Section):
     """Which arenas train on which stage, when that changes, and what a promotion changes.
 
     Some options work only in the modes that their meanings name in brackets. Other modes accept
-    only the initial value of such an option. In its own modes, null means the default.
+    only the initial value of such an option. In the modes that support the option, null means the
+    default.
     """
 
     mode: Literal["sequential", "mixed", "adaptive"] = field(

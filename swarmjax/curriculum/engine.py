@@ -32,13 +32,14 @@ STAYED, BY_THRESHOLD, BY_BUDGET, BY_DEMOTION, REWEIGHED = range(5)
 REASONS = ("stayed", "threshold", "budget", "demotion", "reweighed")
 NEVER = np.iinfo(np.int32).max  # as a deadline
 
-# The golden ratio in steps of 2**-32: its multiples fill the circle as evenly as those of any
-# number (Knuth, The Art of Computer Programming 3, section 6.4, multiplicative hashing, theorem S).
+# The golden ratio in steps of 2**-32: no other number has multiples that fill the circle more
+# evenly (Knuth, The Art of Computer Programming 3, section 6.4, multiplicative hashing, theorem S).
 _GOLDEN = np.uint32(2654435769)
-# A verdict on n trials moves `fast` by n / (n + 20) of the way to it, as if there were 20 earlier
-# trials with the old result. A few episodes then cannot outweigh many earlier ones.
+# A verdict on n trials moves `fast` towards its success, by n / (n + 20) of the way: as if there
+# had been 20 earlier trials with the old result. A few episodes then cannot outweigh many earlier
+# ones.
 _PRIOR_TRIALS = 20.0
-# The success of those trials before the first verdict: half, where p (1 - p) is largest.
+# The success of these 20 trials before the first verdict: one half, where p (1 - p) is largest.
 _PRIOR_SUCCESS = 0.5
 # `slow` moves a fifth as fast, so it lags about five verdicts behind. |fast - slow| is how far
 # success has moved since then. This is the learning progress of Kanitscheider et al. 2021
@@ -57,7 +58,7 @@ class Schedule(NamedTuple):
       stages: [S], in order.
       deadline: [S] update at which the stage ends at the latest, int32.
       threshold: [] success that promotes.
-      demotion: [] success below which the stage before returns; -1: never.
+      demotion: [] success below which the run returns to the previous stage; -1: never.
       earlier_share: [] share of the arenas on earlier stages.
       floor: [] share of the arenas that is spread evenly over all stages.
       cohort_updates: [] updates of one step limit, int32.
@@ -99,12 +100,12 @@ class Record(NamedTuple):
 
     Attributes:
       episodes: episodes of the newest verdict, int32.
-      success: share of its targets that were reached.
-      complete: share of its episodes in which every robot arrived.
+      success: share of targets that were reached in these episodes.
+      complete: share of these episodes in which every robot arrived.
       contacts: per robot.
       reward: per robot.
       fast: running mean of the deciding success.
-      slow: the same, five times as slow.
+      slow: running mean of the same success, which changes five times as slowly.
     """
 
     episodes: Array
@@ -184,7 +185,7 @@ class Decision(NamedTuple):
     Attributes:
       reason: [] one of `REASONS`, int32.
       stage: [] index of the newest stage before the decision, int32.
-      next_stage: [] index of the newest stage after it, int32.
+      next_stage: [] index of the newest stage after the decision, int32.
       success: [] deciding success of the newest verdict on `stage`; nan before the first.
     """
 
@@ -214,7 +215,7 @@ def schedule(
     """Computes the curriculum's numbers.
 
     The stages before the last share `budget_share` of the updates in equal parts. Prerequisites may
-    take all of it.
+    use the whole of this share.
 
     Args:
       stages: S, in order.
@@ -297,7 +298,7 @@ def begin_cohort(curriculum: Curriculum) -> Curriculum:
     """Begins a cohort when all arenas are drawn again: their open episodes will never end.
 
     Args:
-      curriculum: before; its measurements and decisions stay.
+      curriculum: the curriculum before; its measurements and decisions are kept.
 
     Returns:
       The curriculum with empty tallies.
@@ -315,12 +316,11 @@ def begin_cohort(curriculum: Curriculum) -> Curriculum:
 def assign(curriculum: Curriculum, arenas: int) -> Array:
     """Chooses the stage [A] on which the next episode of each arena begins.
 
-    The weights divide a line into stages. The arenas are spread along it like the points (a + u) /
-    A, so that the share of arenas, and of time, on a stage is its weight. From cohort to cohort, u
-    moves by the golden ratio. If there are few arenas, each then visits every stage over time. If
-    there are many, most stay on their stage. That matters because an arena that moves must wait for
-    its episode to end: if all arenas moved, stages with long episodes would get more than their
-    share.
+    The weights divide a line into stages. Arena a is at the point (a + u) / A of this line, so that
+    the share of arenas, and of time, on a stage is its weight. From cohort to cohort, u moves by
+    the golden ratio. If there are few arenas, each then visits every stage over time. If there are
+    many, most stay on their stage. That matters because an arena that moves must wait for its
+    episode to end: if all arenas moved, stages with long episodes would get more than their share.
 
     Args:
       curriculum: its current state.

@@ -37,7 +37,7 @@ _MEMORY = 16.0
 # Weight of what is known before a level's first episode: as much as two episodes with the mean
 # success of its stage. The number is this project's choice.
 _PRIOR_EPISODES = 2.0
-_LARGEST_STEP = 0.25  # of a number's range, in a mutation: this project's choice
+_LARGEST_STEP = 0.25  # largest share of its range by which a mutation moves a number: our choice
 _BELOW_ONE = np.float32(1.0 - 2.0**-24)  # the largest float32 below 1
 
 
@@ -46,7 +46,7 @@ class LevelNumbers(NamedTuple):
 
     Attributes:
       replay: [] share of episodes that begin on a level of a full buffer.
-      mutation: [] share of those that begin on a mutated level instead.
+      mutation: [] share of these replayed episodes that begin on a mutated level instead.
       temperature: [] temperature of the ranks; the higher, the more evenly levels are replayed.
       staleness: [] share of replays chosen by how long the levels have not been played.
       minimum_episodes: [] episodes that a level needs before it is mutated, int32.
@@ -67,8 +67,8 @@ class LevelBuffer:
 
     Attributes:
       numbers: [.., V] numbers that define the level, float32.
-      episodes: ended episodes on it, at most `_MEMORY` remembered, float32; 0: the place is empty.
-      successes: successes among these, float32.
+      episodes: ended episodes on the level, at most `_MEMORY`, float32; 0: the place is empty.
+      successes: successes among these episodes, float32.
       loss: positive value loss of the newest episodes, float32.
       score: the higher, the sooner the level is played again, float32.
       begun: update in which an episode last began on it, int32.
@@ -95,11 +95,11 @@ class Play(NamedTuple):
     """Episodes of an update, [N].
 
     Attributes:
-      slot: place in the buffer, counted through all stages, of the level on which it began; or
-        `FRESH`, `MUTATED` or `LOST`.
+      slot: place in the buffer of the level on which the episode began, counted through all stages;
+        or `FRESH`, `MUTATED` or `LOST`.
       stage: stage of the level.
-      begun: whether it began in this update.
-      ended: whether it ended in this update.
+      begun: whether the episode began in this update.
+      ended: whether the episode ended in this update.
       successes: number of successful trials, int32; 0 unless it ended.
       trials: number of robots, or 1 if the episode counts as a whole, int32.
       loss: positive value loss, mean over the transitions of all robots.
@@ -191,8 +191,8 @@ def choose(buffer: LevelBuffer, options: LevelNumbers, stage: Array, picks: Arra
     share = options.replay * jnp.mean(held.astype(jnp.float32), axis=1)
     ends = jnp.cumsum(probabilities(buffer, options), axis=1)
     ends = ends / jnp.maximum(ends[:, -1:], np.finfo(np.float32).tiny)
-    # The cumulative shares of all stages on one line, each shifted by its stage: one search
-    # suffices.
+    # Puts the cumulative shares of all stages on one line, each shifted by its stage's index, so
+    # that one search suffices.
     line = (ends + jnp.arange(stages)[:, None]).ravel()
     found = jnp.searchsorted(line, stage + picks[:, 1], side="right")
     # Rounding may lead past a stage's last level, or to the end of the stage before.
@@ -237,7 +237,7 @@ def _record(buffer: LevelBuffer, plays: Play) -> LevelBuffer:
 
     one = jnp.ones_like(plays.slot)
     new, begun = total(one, plays.ended), total(one, plays.begun)
-    # Whole numbers first: their sum is the same in any order.
+    # Adds up whole numbers before any division, because their sum is the same in any order.
     successes, trials = (total(x, plays.ended) for x in (plays.successes, plays.trials))
     episodes = buffer.episodes + new
     successes = buffer.successes + new * (successes / jnp.maximum(trials, 1))
@@ -291,7 +291,7 @@ _SCORES: dict[str, Callable[[Array, Array, Array, Array], Array]] = {
 def _admit(
     buffer: LevelBuffer, plays: Play, config: LevelsConfig, usual: Array
 ) -> tuple[LevelBuffer, Array]:
-    """Replaces levels by new ones with a higher score: the worst by the best."""
+    """Replaces the worst levels with the best new ones, if these have a higher score."""
     stages, places = buffer.score.shape
     new = plays.ended & ((plays.slot == FRESH) | (plays.slot == MUTATED))
     share = plays.successes / jnp.maximum(plays.trials, 1)
@@ -331,7 +331,7 @@ def describe(buffer: LevelBuffer, plays: Play) -> dict[str, Any]:
 
     Args:
       buffer: after `update`.
-      plays: [N] of the update.
+      plays: [N] episodes of the update.
 
     Returns:
       [S] each: `levels_fresh`, `levels_replayed` and `levels_mutated` count the ended episodes by
@@ -370,7 +370,8 @@ def mutate(numbers: Array, movable: Array, picks: Array) -> Array:
       picks: [2] uniform numbers in [0, 1).
 
     Returns:
-      [V] numbers in [0, 1) of the mutated level. It is drawn by the same rules as any other.
+      [V] numbers in [0, 1) of the mutated level. The mutated level is drawn by the same rules as
+      any other level.
     """
     ends = jnp.cumsum(movable)
     chosen = jnp.searchsorted(ends, picks[0] * ends[-1], side="right")

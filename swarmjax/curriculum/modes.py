@@ -1,8 +1,9 @@
-"""The modes of the curriculum: each says from the record which stages are trained, and how much.
+"""The modes of the curriculum: each decides which stages are trained, and how much.
 
-A mode is one pure function of the signature `engine.Mode`. It sees the curriculum with the
-verdicts of the update just done, and returns the newest stage, the share of the arenas on each,
-and why; asked before the first update, when nothing is known, it says where a run begins.
+A mode is one pure function of the signature `engine.Mode`. After each update it gets the curriculum
+with its newest verdicts, and returns the newest stage, the share of the arenas on each stage, and
+the reason. It is also called before the first update, without verdicts, and then returns where a
+run begins.
 """
 
 import jax
@@ -24,7 +25,7 @@ from swarmjax.curriculum.engine import (
     StageChoice,
 )
 
-_UNKNOWN_LEARNABILITY = 0.25  # the most that p (1 - p) can be, so that what is unknown is tried
+_UNKNOWN_LEARNABILITY = 0.25  # largest value of p (1 - p), so that unknown stages are tried
 
 
 def sequential(
@@ -34,21 +35,22 @@ def sequential(
     verdict: CohortVerdict,
     update: Array,
 ) -> StageChoice:
-    """All arenas are on the newest stage, and go on to the next together, or back.
+    """Puts all arenas on the newest stage, and moves all of them on to the next stage or back.
 
-    A stage is left for the next when a whole cohort of it has reached `threshold`, or at its
-    deadline; it gives way to the one before when a whole cohort has stayed below `demotion`, if
-    that one's deadline is not past. No decision falls within a step limit of the last.
+    The next stage begins when a whole cohort of the current stage has reached `threshold`, or at
+    the stage's deadline. The previous stage returns when a whole cohort has stayed below
+    `demotion`, unless the previous stage's deadline is past. At least one step limit lies between
+    two decisions.
 
     Args:
-      curriculum: where it stands, the newest verdicts in its record.
+      curriculum: state of the curriculum; its record has the newest verdicts.
       schedule: the curriculum's numbers.
-      options: what the config says of the curriculum.
-      verdict: what the update brought to light.
-      update: [] the update that has just been done, from 0; -1 before the first.
+      options: settings of the curriculum.
+      verdict: findings of the update.
+      update: [] number of the finished update, from 0; -1 before the first.
 
     Returns:
-      What to do from the next update on.
+      The choice from the next update on.
     """
     stage, reason = _step(curriculum, schedule, verdict, update)
     weights = jax.nn.one_hot(stage, curriculum.weights.shape[0], dtype=jnp.float32)
@@ -66,13 +68,13 @@ def mixed(
 
     Args:
       curriculum: as in `sequential`.
-      schedule: likewise.
-      options: likewise.
-      verdict: likewise.
-      update: likewise.
+      schedule: as in `sequential`.
+      options: as in `sequential`.
+      verdict: as in `sequential`.
+      update: as in `sequential`.
 
     Returns:
-      What to do from the next update on.
+      The choice from the next update on.
     """
     stage, reason = _step(curriculum, schedule, verdict, update)
     index = jnp.arange(curriculum.weights.shape[0])
@@ -90,29 +92,30 @@ def adaptive(
     verdict: CohortVerdict,
     update: Array,
 ) -> StageChoice:
-    """All stages at once, weighed anew after every cohort by their `score`, none below the floor.
+    """Trains all stages at once, with weights from their `score` and a floor for every stage.
 
-    `learnability` is p (1 - p), p the success: nothing is learned where all or nothing succeeds
-    (Tzannetos et al. 2023, "Proximal Curriculum for Reinforcement Learning Agents",
-    arXiv:2304.12877; Rutherford et al. 2024, "No Regrets: Investigating and Improving Regret
-    Approximations for Curriculum Discovery", arXiv:2408.15099). `progress` is how far success has
-    changed of late, for better or worse, so that what is forgotten comes back (Kanitscheider et
-    al. 2021, arXiv:2106.14876). `failure` is 1 - p: where all stages can be solved, the one that
-    never succeeds is practised most, which `learnability` leaves to the floor.
+    The weights are computed again after every cohort. The score `learnability` is p (1 - p), where
+    p is the success: nothing is learned where every episode succeeds or none does (Tzannetos et al.
+    2023, "Proximal Curriculum for Reinforcement Learning Agents", arXiv:2304.12877; Rutherford et
+    al. 2024, "No Regrets: Investigating and Improving Regret Approximations for Curriculum
+    Discovery", arXiv:2408.15099). `progress` is how far success has recently risen or fallen, so
+    that forgotten stages come back (Kanitscheider et al. 2021, arXiv:2106.14876). `failure` is 1 -
+    p: a stage that never succeeds is practised most, whereas `learnability` gives such a stage only
+    the floor. `failure` is useful if all stages can be solved.
 
     With `prerequisites` the first stages of the sequence are practised alone, until all of them
-    succeed at `threshold` or the deadline is past. What they teach is then there before the rest
-    teaches something else.
+    reach `threshold` or the deadline is past. Their skills are then learned before the other stages
+    teach different ones.
 
     Args:
       curriculum: as in `sequential`.
-      schedule: likewise.
-      options: likewise.
-      verdict: likewise.
-      update: likewise.
+      schedule: as in `sequential`.
+      options: as in `sequential`.
+      verdict: as in `sequential`.
+      update: as in `sequential`.
 
     Returns:
-      What to do from the next update on; the newest stage is the last that is practised.
+      The choice from the next update on; its newest stage is the last one that is practised.
     """
     assert options.score is not None  # an option of this mode: the config has filled it in
     stage, reason = _unlock(curriculum, schedule, options, verdict, update)
@@ -139,7 +142,7 @@ def _unlock(
     verdict: CohortVerdict,
     update: Array,
 ) -> tuple[Array, Array]:
-    """Returns the last stage that is practised, and why the weights change."""
+    """Returns the last stage that is practised, and the reason for a change of weights."""
     reweighed = jnp.where(verdict.over & jnp.any(verdict.judged), REWEIGHED, STAYED)
     last = jnp.full_like(curriculum.stage, curriculum.weights.shape[0] - 1)
     if not options.prerequisites:
@@ -156,7 +159,7 @@ def _unlock(
 def _step(
     curriculum: Curriculum, schedule: Schedule, verdict: CohortVerdict, update: Array
 ) -> tuple[Array, Array]:
-    """Returns the stage, one further or back or the same, and why."""
+    """Returns the stage, which is the next, the previous or the same one, and the reason."""
     stage, deadline = curriculum.stage, jnp.asarray(schedule.deadline)
     first, last = stage == 0, stage == deadline.shape[0] - 1
     whole = verdict.judged[stage] & (curriculum.cohort - 1 >= curriculum.since)
@@ -187,7 +190,7 @@ def _learnability(record: Record) -> Array:
 
 
 def _progress(record: Record) -> Array:
-    """Returns |fast - slow|, and the most that is known for stages that nothing is known of."""
+    """Returns |fast - slow|; stages without a verdict get the largest value of the other stages."""
     known = ~jnp.isnan(record.progress)
     most = jnp.max(jnp.where(known, record.progress, 0.0))
     unknown = jnp.where(jnp.any(known), most, 1.0)

@@ -12,7 +12,7 @@ from swarmjax.export import layout as export_layout
 from swarmjax.export.layout import short
 from swarmjax.policy import Policy
 
-CASES = 32  # of the self-test, per learner
+CASES = 32  # cases of the self-test for each learner
 _TEMPLATES = Path(__file__).resolve().parent / "templates" / "c"
 _ACTIVATIONS = {
     "tanh": "tanhf(x[i])",
@@ -52,7 +52,7 @@ static void remember(unsigned learner, const float *features, float *recalled)
 }
 
 """
-# The observations of a history, newest first. It is zero at the start of an episode, as in
+# The observations of a history, newest first. The history is zero at the start of an episode, as in
 # `policy.step`.
 _HISTORY_CODE = """static void remember(const float *observation, float *recalled)
 {
@@ -292,7 +292,7 @@ def _array(name: str, rows: np.ndarray) -> str:
 
 
 def _calls(sizes: Sequence[int], recalled: int) -> Iterable[str]:
-    """Yields the calls of the layers, alternating between two buffers; memory precedes the last."""
+    """Yields the layers' calls, with two buffers in turn; the memory comes before the last one."""
     source, target = "a", "b"
     last = len(sizes) - 2
     for i, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):

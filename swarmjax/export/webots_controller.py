@@ -173,7 +173,7 @@ def wheel_speeds(
       [2] speeds of the left and the right wheel, rad/s, each within its own limit, and the memory
       afterwards.
     """
-    # Rows of the robots before this one only ensure that it gets its own network.
+    # The rows of robots with lower numbers only ensure that this robot gets its own network.
     seen = np.broadcast_to(observation, (1 if trained.is_shared else robot + 1, observation.size))
     memory, action = policy.step(trained, memory, seen, normal)
     speed, turn_rate = policy.command(trained, action)[-1]

@@ -24,7 +24,8 @@ def png(figure: Figure, shades: int | None = None) -> bytes:
     if shades is None:
         return content.getvalue()
     image = Image.open(content).convert("RGB")
-    # By coverage: with the median cut, a short line would get the colour of other lines.
+    # Colours are chosen by coverage, since the median cut would give a short line another line's
+    # colour.
     few = image.quantize(shades, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     few.save(small, format="png", optimize=True)
     return small.getvalue()

@@ -11,9 +11,9 @@ from swarmjax.ppo.config import AlgoConfig
 def levels(config: AlgoConfig) -> tuple[float, ...]:
     """Lists the deviations of the schedule, from `initial_std` to the last one.
 
-    Each deviation is the one before less `std_decrement`, rounded to four digits. It is `std_floor`
-    as soon as it would fall to that or below. This is `PPO.decay_action_std` of PPO-PyTorch
-    (nikhilbarhate99, commit 728cce8).
+    Each deviation is the previous one minus `std_decrement`, rounded to four digits. If the result
+    is not above `std_floor`, the deviation is `std_floor`, and the list ends. This is
+    `PPO.decay_action_std` of PPO-PyTorch (nikhilbarhate99, commit 728cce8).
 
     Args:
       config: With `exploration` scheduled.

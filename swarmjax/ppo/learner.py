@@ -58,8 +58,9 @@ class Batch:
       observation: [G, N, O], raw.
       action: [G, N, U], as drawn.
       log_prob: [G, N], as `act` returned it.
-      advantage: [G, N]. If the config says so, the update normalises it over the valid samples,
-        except for Monte-Carlo returns, which are normalised already.
+      advantage: [G, N]. With `config.normalize_advantages`, the update normalises the advantages
+        over the valid samples, unless they are from Monte-Carlo returns, which are normalised
+        already.
       return_: [G, N], target of the critic.
       valid: [G, N], bool or 0/1.
       memory: [G, S, H], memory of the S robots of a group before the rollout; None without
@@ -250,10 +251,10 @@ def update(
 ) -> tuple[LearnerState, Metrics]:
     """Learns from one batch: `config.epochs` passes in `config.num_minibatches` steps each.
 
-    The normalizer before this update normalised the batch's observations and gave its log
-    densities. All epochs keep it, so that the ratio of new to old density starts at 1. Only then
-    does the normalizer take in the batch. A minibatch without a valid sample is skipped: it changes
-    neither the parameters nor the learning rate's schedule.
+    The log densities in the batch were computed with the normalizer from before this update. All
+    epochs use this normalizer, so that the ratio of new to old density starts at 1. After the
+    epochs, the batch's observations are added to the normalizer. A minibatch without a valid sample
+    is skipped: it changes neither the parameters nor the learning rate's schedule.
 
     Args:
       learner: The learner before the update.

@@ -46,7 +46,8 @@ class Gru(nn.Module):
       size: H.
       uniform: Whether weights and biases begin within 1 / sqrt(H), as in PyTorch's GRU
         (`torch.nn.RNNBase.reset_parameters`).
-      kernels: Module whose `remember` and `remember_all` compute the same on a GPU; None: XLA.
+      kernels: Module with `remember` and `remember_all`, which replace the functions of this file
+        on a GPU; None: XLA computes them.
     """
 
     size: int

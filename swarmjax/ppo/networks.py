@@ -26,7 +26,7 @@ _ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "swish": nn.swish}
 _OUTPUTS = {"linear": lambda mean: mean, "tanh": nn.tanh}
 
 # Gains of the orthogonal initialisation: Huang et al. 2022, "The 37 Implementation Details of
-# Proximal Policy Optimization", core detail 2. Theirs is 1 for the critic, because they scale
+# Proximal Policy Optimization", core detail 2. Their gain is 1 for the critic, because they scale
 # rewards to a return of about 1. Our returns are metres: a critic that begins between -1 and 1 is
 # wrong by more than a robot can earn, and the policy follows its errors (docs/results.md, "Why
 # seeds were slow").
@@ -142,8 +142,8 @@ def _hear(config: AlgoConfig, seen: jax.Array) -> jax.Array:
       seen: [B, O], or [B, O + P] for a critic that sees the state too.
 
     Returns:
-      [B, O - K W + E], or with P more. E is the width of the first hidden layer. Without
-      neighbour messages, `seen` unchanged.
+      [B, O - K W + E], or [B, O - K W + E + P] for a critic that sees the state too. E is the width
+      of the first hidden layer. Without neighbour messages, `seen` unchanged.
     """
     hearing = config.hearing
     if hearing is None:
@@ -382,7 +382,7 @@ def _check_input(network: Params, observation: jax.Array, config: AlgoConfig) ->
 
 
 def bind_hearing(config: AlgoConfig, observation_size: int, count: int, width: int) -> AlgoConfig:
-    """Adds the place of neighbours in an observation, its end, to a config.
+    """Adds the neighbours' place to a config: they are the last entries of an observation.
 
     Args:
       config: Settings of the learner.

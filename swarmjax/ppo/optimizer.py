@@ -49,8 +49,9 @@ def gradient_steps(config: AlgoConfig, updates: int) -> int:
 def learning_rates(config: AlgoConfig, updates: int) -> dict[str, float]:
     """Chooses the learning rates that a run begins with.
 
-    If the config leaves a rate open, it is `_RATES` times a share of at most 1. The share keeps the
-    sum of rates over the run at or below that of `_FULL_RATE_STEPS` steps that fall linearly to 0.
+    A rate that is null in the config becomes its value in `_RATES` times a share of at most 1. The
+    share keeps the sum of rates over the run at or below that of `_FULL_RATE_STEPS` steps that fall
+    linearly to 0.
 
     Args:
       config: Learning rates, or None for the rule; their schedule.
@@ -108,7 +109,7 @@ def take(
 
     A step is skipped, and counted, if its gradient or its result is not finite.
     `optax.apply_if_finite` is not enough: it checks the gradient alone, so a broken optimiser state
-    would break the parameters. After some skips it also takes such a step anyway.
+    would break the parameters. After some skipped steps it also takes a step that is not finite.
 
     Args:
       config: Settings of the optimiser.
@@ -147,7 +148,7 @@ def mean_of_taken(metrics: Metrics) -> Metrics:
     """Averages the metrics over the steps of an update.
 
     Args:
-      metrics: Metrics of its steps, any shape, from `take`.
+      metrics: Metrics of the update's steps, any shape, from `take`.
 
     Returns:
       The means over the steps taken, [], and the number of `skipped_steps`. If no step was taken,

@@ -25,13 +25,13 @@ LENGTH = 2e-4  # m; positions are off by at most half of it
 ANGLE = 1e-3  # rad; headings are off by at most half of it
 RAY = 5e-4  # m; a ray is shown with the middle of its interval
 MOST = 1 << 30  # largest number of quanta; differences of such numbers fold to 32 bits
-REWARD = 1e-4  # for each reward term, summed since the start
+REWARD = 1e-4  # quantum of each reward term, summed since the start
 # Colours for small swarms, distinct on light and dark pages.
 _PALETTE = (
     "#2f7fd1", "#e06c00", "#1f9d6b", "#c94f9d", "#c9a100",
     "#35a7c9", "#a0653c", "#8e6bd0", "#7a9a1e", "#d1495b",
 )  # fmt: skip
-_GOLDEN = 0.381966  # of a turn: hues with this spacing stay distinct for any number of robots
+_GOLDEN = 0.381966  # share of a turn between hues; keeps any number of robots distinct
 
 
 def pack(about: Mapping[str, Any], episodes: Sequence[ReplayEpisode], reach: float) -> bytes:

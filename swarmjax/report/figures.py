@@ -22,7 +22,7 @@ from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History
 from swarmjax.task.stage_config import StageConfig
 
-_POINTS, _STRETCHES = 600, 200  # per curve and per band: about one per pixel
+_POINTS, _STRETCHES = 600, 200  # points of a curve, and stretches of a band: about one per pixel
 _NAMED = 24  # stages named along a colour strip; more names would overlap
 SMALL = (5.4, 3.2)  # inches
 _SEED, _ALL, _LIMIT = "0.62", "#0b4f9e", "#c04000"
@@ -165,7 +165,7 @@ def curves(history: History) -> Figure | None:
         panel.tick_params(labelsize=9)
     for panel in panels[len(_CURVES) :]:
         panel.set_visible(False)
-    panels[2].tick_params(labelbottom=True)  # no panel is below it
+    panels[2].tick_params(labelbottom=True)  # the last row has no panel below this one
     panels[0].set_xlim(0, history.arena_steps[-1])
     panels[0].xaxis.set_major_locator(MaxNLocator(4))
     panels[0].xaxis.set_major_formatter(drawing.thousands())

@@ -53,7 +53,7 @@ _COHORTS_OF_A_VERDICT = 2
 
 
 class ValueKind(NamedTuple):
-    """A kind of value in a row: its name in a message, and a test whether a value has this kind."""
+    """A kind of value in a row: its name in messages, and the test for values of this kind."""
 
     name: str
     fits: Callable[[Any], bool]

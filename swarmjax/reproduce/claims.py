@@ -1,4 +1,4 @@
-"""Judges the claims in the paper's text by the data of a reproduction. No JAX.
+"""Judges the claims in the paper's text with the data of a reproduction. No JAX.
 
 The criteria that support or contradict a claim were fixed here before any data existed. A claim
 has one reading for each way to understand the paper (docs/paper.md). Every number is an
@@ -36,7 +36,7 @@ _NOTE = (
 )
 
 type Outcome = Literal["reproduced", "not reproduced", "undecidable"]
-# From the values [N] of each arm of a reading to whether the claim holds, and the numbers.
+# A function of the values [N] of a reading's arms: whether the claim holds, and the numbers.
 type Test = Callable[..., tuple[bool | None, str]]
 # The value of each seed of an arm, [N]: a function of `measures` with its options set.
 type Values = Callable[[Reproduction, str], np.ndarray]
@@ -232,7 +232,7 @@ def _rewarded() -> tuple[tuple[str, Values], ...]:
 
 
 def _expanded(test: Test, which: slice, key: str = "targets_reached") -> tuple[Reading, ...]:
-    """Makes the readings of the 1.5 m arena, zero-shot and trained on, for arms of the pair."""
+    """Makes two readings for the 1.5 m arena: zero-shot, and with arms that trained on it."""
     source = partial(measures.judged, key=key, stage=EXPANDED)
     return (
         Reading(name="zero-shot at 1.5 m", arms=PAIR[which], values=source, test=test),

@@ -172,7 +172,8 @@ def crowding(data: Reproduction, arm: str, *, stage: str) -> np.ndarray:
     Args:
       data: the reproduction's data.
       arm: a finished arm.
-      stage: the stage. Of its last `WINDOW` episodes, those with two or more arrivals are used.
+      stage: the stage. Episodes with two or more arrivals are used, among its last `WINDOW`
+        episodes.
 
     Returns:
       [N] robot steps per pair, mean by seed; nan for a seed without such an episode.

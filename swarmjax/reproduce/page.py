@@ -174,18 +174,18 @@ def _places(data: Reproduction) -> list[tuple[str, str, str, np.ndarray]]:
 
 
 def _summary(places: np.ndarray) -> tuple[str, str, str]:
-    """Writes median and IQM of places, and how many seeds get there; inf means never."""
+    """Writes median and IQM of places, and how many seeds have one; inf means none."""
     there = np.isfinite(places)
     return (
         PLACE.value(float(np.median(places))),
         _mean(places, PLACE),
-        # No bootstrap: if all ten seeds get there, its interval would be 100 to 100 %.
+        # No bootstrap: if all ten seeds become steady, its interval would be 100 to 100 %.
         f"{there.sum()} of {len(places)}",
     )
 
 
 def _compared(data: Reproduction) -> list[tuple[str, ...]]:
-    """Makes the table of how much earlier the curriculum is steady.
+    """Makes the table of how much earlier success becomes steady with the curriculum.
 
     It gives the difference of paired seeds, and the probability for unpaired ones.
     """

@@ -12,7 +12,7 @@ from swarmjax.reproduce.measures import AXES, Axis, Measure
 from swarmjax.reproduce.rows import Reproduction, RunLog
 
 PAPER = {"curriculum": 300, "baseline": 600}  # episodes: section 4, on Figure 6
-_COLUMNS = 700  # of a raster: about one per pixel
+_COLUMNS = 700  # columns of a raster: about one per pixel
 _REACHED = LinearSegmentedColormap.from_list("reached", ["white", "#0b4f9e"])
 _NOTHING, _STEADY = "0.86", "#e69f00"
 

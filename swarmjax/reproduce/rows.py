@@ -61,7 +61,8 @@ class RunLog:
       reached: [E, R] whether the robot reached its target.
       reward: [E, R] sum over the episode, undiscounted, m.
       robot_steps: [E, R] control steps before the robot arrived.
-      sensed: [E, R] of these, steps with something in infrared range: the paper's collisions.
+      sensed: [E, R] how many of `robot_steps` had something in infrared range: the paper's
+        collisions.
       contacts: [E, R] contacts that the robot began or met.
     """
 

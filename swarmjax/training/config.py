@@ -19,7 +19,7 @@ _STEPS_PER_EPISODE = 32
 
 @dataclass(frozen=True, kw_only=True)
 class ProgramConfig(Section):
-    """The settings that fix the compiled program, for every caller and every file."""
+    """The settings that fix the compiled program; every caller and every file uses them."""
 
     stage: tuple[StageConfig, ...]
     robot: RobotConfig = field(default_factory=RobotConfig)
@@ -59,8 +59,8 @@ class ProgramConfig(Section):
     streams: int | None = field(
         default=None,
         metadata=about(
-            "random streams, a multiple of devices; a run with as many draws the same on fewer or "
-            "more devices; null: devices",
+            "random streams, a multiple of devices; runs with equal streams draw the same numbers "
+            "on any number of devices; null: devices",
             1,
             2**16,
         ),

@@ -43,8 +43,9 @@ class EpisodeLog(NamedTuple):
 def room(config: ProgramConfig) -> int:
     """Returns the most episodes of one update and seed that are kept.
 
-    For each arena these are the waiting episodes and the one under way, or, if more, as many as the
-    step limit ends. No arena ends more than one episode at each control step.
+    For each arena this is the larger of two numbers: the waiting episodes plus the one under way,
+    and the episodes that the step limit ends. No arena ends more than one episode at each control
+    step.
     """
     steps, limit = config.algo.rollout_length, config.task.step_limit
     return config.arenas * min(steps, max(config.waiting, steps // limit) + 1)

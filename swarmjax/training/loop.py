@@ -29,7 +29,7 @@ from swarmjax.training.rollout import Arena
 # XLA then runs two iterations of a loop as one, so it need not copy what one iteration passes to
 # the next: a step of 8,192 arenas took 542 us instead of 606 on an H100 (docs/performance.md).
 _GPU_OPTIONS = {"xla_gpu_enable_while_loop_unrolling": "WHILE_LOOP_UNROLLING_DOUBLE_BUFFER"}
-# XLA then does not choose kernels by timing them, and uses none that adds in a varying order.
+# XLA then does not choose kernels by timing them, and uses no kernel that adds in a varying order.
 _DETERMINISTIC = {"xla_gpu_deterministic_ops": True}
 
 Metrics = dict[str, Any]
@@ -116,7 +116,7 @@ def train_chunk(
       The state after, and metrics with a leading axis of `program.rows`: the first n rows hold one
       update each.
     """
-    # Traced once, for both the shapes and the loop.
+    # Traces the update once, for both the shapes and the loop.
     step = jax.jit(partial(update, program), inline=True)
     one = step.eval_shape(schedule, state)[1]
     blank = jax.tree.map(lambda x: jnp.zeros((program.rows, *x.shape), x.dtype), one)

@@ -1,8 +1,8 @@
 """The curriculum over levels in a rollout: where episodes begin, and how they end.
 
-`curriculum.levels` holds the buffer. This module deals its levels out to arenas, and reads the
-results of a rollout's episodes. The steps of a rollout do not carry an arena's level source along:
-the number of ended episodes in an arena tells which one it is in.
+`curriculum.levels` holds the buffer. This module deals the buffer's levels out to arenas, and reads
+the results of a rollout's episodes. The steps of a rollout do not carry an arena's level source
+along: the number of ended episodes in an arena tells which episode is under way.
 
 Axes: W episodes that wait for each arena, J = 1 + W with the one under way, V numbers of a level.
 """

@@ -18,7 +18,7 @@ from swarmjax.task.env import World
 from swarmjax.training import episodes, practice
 from swarmjax.training.config import ProgramConfig
 
-ACTION_SIZE = drive.COMMAND_SIZE  # of robots that broadcast nothing
+ACTION_SIZE = drive.COMMAND_SIZE  # size of the action if robots broadcast nothing
 MAX_ROWS = 4096  # most updates of a call, over all seeds; longer chunks take several calls
 
 
@@ -121,7 +121,7 @@ def schedule(config: ProgramConfig) -> Schedule:
 
 
 def groups(config: ProgramConfig, cores: int) -> int:
-    """Returns the number of equal groups of seeds that a run is split into, called at once.
+    """Returns into how many equal groups the seeds are split; the groups run at the same time.
 
     Args:
       config: settings of the run.

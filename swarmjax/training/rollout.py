@@ -30,8 +30,8 @@ from swarmjax.training import practice as practices
 from swarmjax.training.practice import LevelSource, Practice
 from swarmjax.training.program import Program
 
-# Cohort of an episode that does not count. Curricula number theirs from 0, and -1 is the cohort
-# before the first.
+# Cohort of an episode that does not count. The curriculum's cohorts have numbers from 0, and -1 is
+# the cohort before the first.
 UNCOUNTED = -2
 
 
@@ -41,7 +41,7 @@ class Arena(EnvState):
 
     Attributes:
       stage: [] index of the stage on which the episode began, int32.
-      cohort: [] the curriculum's cohort in which it began, int32.
+      cohort: [] the curriculum's cohort in which the episode began, int32.
       recall: [R, H] memory of each robot's actor and critic before the observation; None without a
         memory.
       source: the episode's level source; None without a curriculum over levels.
@@ -61,7 +61,7 @@ class Trajectory(NamedTuple):
       action: [.., U].
       log_prob: of the action.
       value: of the observation.
-      next_value: of the observation after the step, before any reset.
+      next_value: value of the observation after the step, before any reset.
       reward: of the step.
       terminated: the robot arrived in this step; with `task.arrival=hold`, all robots were on their
         targets at once.
@@ -413,15 +413,15 @@ def _judge(program: Program, learners: LearnerState, arenas: Arena) -> _Judged:
 
 
 def restart[S: EnvState](arenas: S, starts: S, done: Array) -> S:
-    """Replaces episodes that are over by waiting ones.
+    """Replaces episodes that are over with waiting ones.
 
     Args:
-      arenas: [A], with `sim` the physics' data.
+      arenas: [A]; their `sim` is the data of the physics.
       starts: [A], packed.
       done: [A].
 
     Returns:
-      The arenas, with `sim` the physics' data; only the physical state in it is replaced.
+      The arenas; in their `sim`, only the physical state has been replaced.
     """
     packed = physics.PhysicsState(arenas.sim.qpos, arenas.sim.qvel, arenas.sim.qacc_warmstart)
     chosen = _pick(done, starts, replace(arenas, sim=packed))

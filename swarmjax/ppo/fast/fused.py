@@ -174,7 +174,7 @@ def shuffle(
       keys: [E] random keys, one for each pass over the samples, consumed.
       samples: B, the number of samples. The valid ones come first.
       valid: [], int32, the number of valid samples.
-      minibatches: M of a pass.
+      minibatches: M, the number of minibatches in a pass.
       launch: Its `tile` is the number of samples of a tile.
 
     Returns:

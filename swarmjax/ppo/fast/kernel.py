@@ -25,7 +25,8 @@ LEAST_WIDTH = 16
 MOST_WIDTH = 128
 # Bytes of the chip's memory that a program may use. Compute capability 8 and later gives at least
 # 99 KiB (CUDA C++ Programming Guide, "Technical Specifications per Compute Capability"). `fits`
-# counts for the matrix products of capability 9.0; those of others take up to 4 KiB more.
+# counts for the matrix products of capability 9.0; the products of other capabilities take up to 4
+# KiB more.
 SHARED_MEMORY = 95 * 1024
 # Bytes by compute capability, where a program may use more; from the same source.
 _MORE_SHARED_MEMORY = {"8.0": 163 * 1024, "9.0": 227 * 1024, "10.0": 227 * 1024}
@@ -62,7 +63,7 @@ class Launch(NamedTuple):
 
     Attributes:
       tile: Samples of a tile, a power of two of at least `LEAST_WIDTH`.
-      programs: Programs of the grid, at most. There are never more than tiles to choose from.
+      programs: Programs of the grid, at most. There are never more programs than tiles.
       warps: Warps of a program.
     """
 
@@ -132,7 +133,7 @@ def fits(
     for the backward pass. It also stores a tile of observations and two of the widest hidden layer.
 
     Args:
-      inputs: Width of the observation. It is padded, and so is the output.
+      inputs: Width of the observation. The widths of observation and output are padded.
       hidden: Widths of the hidden layers, powers of two.
       outputs: Width of the output.
       tile: Samples of a tile.
@@ -167,8 +168,8 @@ def sums(
       layout: Layout of `parameters`. `padded_width` leaves the widths of the hidden layers
         unchanged.
       activation: Activation of the hidden layers: `tanh`, `relu` or `swish`.
-      loss: Loss of the output. Whatever must not count is 0 in all that it returns. It takes the
-        layout's vectors with padding, and returns their derivatives under their names.
+      loss: Loss of the output. Its results must be 0 for samples that do not count. It gets the
+        layout's vectors with padding, and returns their derivatives under the same names.
       samples: By name, each [B] or [B, width], float32. `observation` [B, O] is the network's
         input.
       tiles: The tiles to take, each of `launch.tile` samples.

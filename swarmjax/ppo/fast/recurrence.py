@@ -31,7 +31,7 @@ _SEEN = jnp.bfloat16
 # than 64 do not fit the chip.
 _SIZES = (16, 32, 64)
 
-_Three = tuple[jax.Array, ...]  # of reset, update and candidate
+_Three = tuple[jax.Array, ...]  # arrays of reset, update and candidate
 _Kept = tuple[jax.Array, ...]
 
 
@@ -39,7 +39,7 @@ class _Rows(NamedTuple):
     """The sequences of a program at a step.
 
     Attributes:
-      at: [tile], their rows in [T B, ...].
+      at: [tile], rows of the sequences in [T B, ...].
       exist: [tile], false past the last sequence.
     """
 
@@ -299,8 +299,8 @@ def _slopes(slope: jax.Array, gates: _Gates, before: jax.Array) -> tuple[_Three,
     """Backpropagates from the memory after a step through the gates.
 
     r and u are the gates, n = tanh(x + r c) is the candidate, and h' = n + u (h - n). The
-    derivatives of h' with respect to n, u and h are 1 - u, h - n and u. Those of tanh and of the
-    logistic function are 1 - n^2 and r (1 - r).
+    derivatives of h' with respect to n, u and h are 1 - u, h - n and u. The derivatives of tanh and
+    of the logistic function are 1 - n^2 and r (1 - r).
 
     Returns:
       Derivatives with respect to the inputs and to the memory's part, gate by gate, and to the
@@ -315,7 +315,7 @@ def _slopes(slope: jax.Array, gates: _Gates, before: jax.Array) -> tuple[_Three,
 
 
 def _own(count: int) -> _Rows:
-    """Returns this program's sequences at the first step. Interpreted loops cannot look them up."""
+    """Returns this program's sequences at the first step; to be called outside of a loop."""
     at = pl.program_id(0) * TILE + jnp.arange(TILE)
     return _Rows(at, at < count)
 

@@ -1,9 +1,10 @@
 """Updates of policies with memory, in minibatches of sequences that hold a valid sample.
 
 A sequence is the rollout of one robot. A robot that is absent, or had arrived before the rollout
-began, has no valid sample. Its sequence comes last, and tiles of such sequences alone are left out.
-The other sequences are shuffled one by one, and a minibatch is processed in tiles of a fixed number
-of sequences. The loss is a sum over samples, so the gradients of tiles add up.
+began, has no valid sample. The sequences of such robots come last, and tiles that hold no other
+sequences are left out. The other sequences are shuffled one by one, and a minibatch is processed in
+tiles of a fixed number of sequences. The loss is a sum over samples, so the gradients of tiles add
+up.
 """
 
 from dataclasses import replace
@@ -36,8 +37,8 @@ class Dealt(NamedTuple):
     """The useful sequences of a batch, dealt out to minibatches.
 
     Attributes:
-      order: [Q], int32, all sequences. Those of the first minibatch come first, and those without
-        a valid sample last.
+      order: [Q], int32, all sequences. The sequences of the first minibatch come first, and
+        sequences without a valid sample last.
       span: [M, 2], int32, where in `order` each minibatch begins and ends.
     """
 
@@ -121,7 +122,7 @@ def deal(key: jax.Array, useful: jax.Array, minibatches: int, shards: Shards = A
     drawn = shards.draw(key, lambda key: jax.random.uniform(key, (size,))).reshape(by_stream.shape)
     shuffled = jnp.argsort(jnp.where(by_stream, drawn, jnp.inf), axis=1).astype(jnp.int32)
     count = jnp.sum(by_stream, axis=1, keepdims=True, dtype=jnp.int32)
-    share, rest = count // minibatches, count % minibatches  # the first `rest` get one more
+    share, rest = count // minibatches, count % minibatches  # `rest` minibatches get one more
     place, longer = jnp.arange(size, dtype=jnp.int32), rest * (share + 1)
     beyond = rest + (place - longer) // jnp.maximum(share, 1)
     dealt_to = jnp.where(place < longer, place // (share + 1), beyond)
@@ -196,8 +197,8 @@ def take_tile(
       rows: Result of `arrange`.
       order: [Q], result of `deal`.
       start: [], int32, index in `order` of the tile's first sequence.
-      end: [], int32, index in `order` at which the minibatch ends. Samples from there on are not
-        valid.
+      end: [], int32, index in `order` at which the minibatch ends. Samples of sequences from this
+        index on are not valid.
       size: Sequences of the tile.
 
     Returns:

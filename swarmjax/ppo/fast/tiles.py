@@ -35,8 +35,8 @@ def learn(
     Each device deals out its own tiles. The samples of a minibatch therefore depend on the number
     of devices as well as on the random streams.
 
-    Each network is one vector here, and so is the optimiser's state of it. Otherwise most kernels
-    of a minibatch would handle one of two dozen small arrays each.
+    Here each network is one vector, and the optimiser's state for each network is also one vector.
+    Otherwise most kernels of a minibatch would handle one of two dozen small arrays each.
 
     Args:
       config: Settings of networks that `fused.fits` accepts.
