@@ -106,7 +106,7 @@ class Swarm:
 
     @property
     def action_space(self) -> Space:
-        """One robot's action, [U]: the command, clipped to -1..1; these are the ends of its range.
+        """One robot's action, [U]: the command, clipped to -1..1; -1 and 1 span its range.
 
         The numbers that a robot broadcasts, if any, follow the two numbers of the command.
         """

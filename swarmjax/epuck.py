@@ -91,11 +91,11 @@ MEASURED_INFRARED_SD = (
     (0.92, 3.07, 3.37, 4.20, 3.30, 2.68, 2.21, 1.79),
     (1.59, 4.42, 4.96, 6.21, 5.45, 4.67, 3.89, 7.91),
 )
-# The curve A / (gap + d)^2 + b of ps0..ps7: A (counts m^2), d (m), b (counts). It was fitted to the
-# means at 1 to 7 cm by least squares, weighted by their standard deviations. No residual may exceed
-# 13 counts; this limit binds for ps0 alone, which has 13.1 without it. The last two columns are the
-# median of those standard deviations, and the mean at 0 cm, which is the largest reading (counts).
-# tests/sim/test_response.py repeats the fit.
+# The curve A / (gap + d)^2 + b of ps0..ps7: A (counts m^2), d (m), b (counts). The curve was fitted
+# to the means at 1 to 7 cm by least squares, weighted by the standard deviations. No residual may
+# exceed 13 counts; this limit affects only ps0, which has a residual of 13.1 without the limit. The
+# last two columns are the median of those standard deviations, and the mean at 0 cm, which is the
+# largest reading (counts). tests/sim/test_response.py repeats the fit.
 INFRARED_FIT = (
     (0.16935, 0.0034172, 442.63, 12.06, 3779.0),
     (0.18230, 0.0015093, 179.89, 3.58, 3810.0),

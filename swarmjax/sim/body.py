@@ -138,8 +138,8 @@ def scale_mass(ratio: Array, rows: Rows, model: mujoco.MjModel) -> Changes:
 
     Returns:
       Changes of the bodies. The changes include the inverse weights. MuJoCo softens contacts with
-      them, and MJX does not recompute them. The weights shrink in proportion to the mass. This is
-      exact except for the share of the wheel motors.
+      them, and MJX does not recompute them. The weights shrink in proportion to the mass. This
+      scaling is exact except for the share of the wheel motors.
     """
     bodies, dofs = rows.bodies, rows.dofs
     return {

@@ -143,8 +143,8 @@ class SimConfig(Section):
     solver: Literal["auto", "mjx", "swarm"] = field(
         default="auto",
         metadata=about(
-            "contact solver; mjx: MJX's own step, unpatched; swarm: made for the body, for wheels "
-            "by warp only; auto: swarm where available",
+            "contact solver; mjx: MJX's own step, unpatched; swarm: a step made for the "
+            "body, on wheels only with warp; auto: swarm where available",
             renamed={"newton": "mjx"},
         ),
     )

@@ -1,6 +1,7 @@
 """Chooses the faster code of `sim/fast/` where it exists, and plain code elsewhere.
 
-The rest of this package uses plain MJX and plain loops. It works without `fast/`, but more slowly.
+The rest of this package uses plain MJX and plain loops. That code works without `fast/`, but more
+slowly.
 """
 
 import importlib

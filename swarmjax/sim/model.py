@@ -78,8 +78,9 @@ def build(
       size: sizes to compile for.
       timestep: one physics step, s.
       ray_geoms: whether to add the cylinder hulls that rays see; analytic sensors need none.
-      fixtures: `mocap` makes obstacles and walls bodies, for MuJoCo C. `world` makes them geoms of
-        the world, for MJX, which gets their poses and the servos' forces at run time.
+      fixtures: `mocap` makes obstacles and walls bodies, for MuJoCo C. `world` makes obstacles and
+        walls geoms of the world, for MJX. MJX gets their poses and the forces of the servos at run
+        time.
 
     Returns:
       The spec, ready to compile. qpos, qvel and ctrl hold each robot in turn, in its body's layout.

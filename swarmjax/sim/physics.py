@@ -1,8 +1,9 @@
 """Physics of many arenas on one device: MJX, with `impl=jax` or `impl=warp`.
 
-The state of an arena is `PhysicsState`: positions, velocities and the solver's warm start. It is
-the same for every engine, and a step reads nothing else. Within a rollout, the engine's complete
-data is carried instead, since rebuilding it at every control step costs a quarter of the speed.
+The state of an arena is `PhysicsState`: positions, velocities and the solver's warm start. This
+state is the same for every engine, and a step reads nothing else. Within a rollout, the engine's
+complete data is carried instead, since rebuilding it at every control step costs a quarter of the
+speed.
 """
 
 import functools

@@ -1,11 +1,11 @@
 """The planar body: three degrees of freedom, and a servo in place of wheels on a floor.
 
-It trains five times faster than the wheeled body. Its forces are limited to what wheels can pass to
-the floor, but the servo is deadbeat over 32 ms and seldom reaches that limit. The servo reaches its
-speed in one step, while wheels get two thirds of the way. When blocked, it pushes with m v / dt =
-0.6 N, while wheels push with 1.0 N. A blocked planar robot also turns freely, while two slipping
-wheels hardly turn. Policies that push objects therefore perform worse on the wheeled body
-(docs/robot.md).
+The planar body trains five times faster than the wheeled body. Its forces are limited to what
+wheels can pass to the floor, but the servo is deadbeat over 32 ms and seldom reaches that limit.
+The servo reaches its speed in one step, while wheels get two thirds of the way. When blocked, it
+pushes with m v / dt = 0.6 N, while wheels push with 1.0 N. A blocked planar robot also turns
+freely, while two slipping wheels hardly turn. Policies that push objects therefore perform worse on
+the wheeled body (docs/robot.md).
 """
 
 import itertools

@@ -3,10 +3,11 @@
 A ray is the horizontal distance from the sensor's origin to the nearest object, in metres. The real
 ray rises by `epuck.SENSOR_TILT`, so it is longer by 1 / cos(tilt) against an upright face.
 
-`webots` is the lookup table of Webots' E-puck. It maps (length of the ray) / reflectance to counts,
-with multiplicative noise; free space reads 67.19. `real` is a curve fitted to each sensor of a
-measured robot. It gives reflectance * A / (gap + d)^2 counts above free space, with additive noise.
-Readings in free space are set to zero, as by the firmware. The code runs on NumPy or JAX.
+`webots` is the lookup table of Webots' E-puck. The table maps (length of the ray) / reflectance to
+counts, with multiplicative noise; free space reads 67.19. `real` is a curve fitted to each sensor
+of a measured robot. The curve gives reflectance * A / (gap + d)^2 counts above free space, with
+additive noise. Readings in free space are set to zero, as by the firmware. The code runs on NumPy
+or JAX.
 """
 
 import math
@@ -140,8 +141,8 @@ def _real(ray: Array, bright: Array, gain: Array, xp: Any) -> tuple[Array, Array
 def _interpolate(x: Array, knots: Sequence[float], values: Sequence[float], xp: Any) -> Array:
     """Interpolates linearly between increasing knots, and holds the end values outside them.
 
-    It sums one ramp per segment. This is cheaper on an accelerator than a search. It is exact where
-    the last value is small, since the sum starts from there.
+    The result is a sum of one ramp per segment. On an accelerator, this is cheaper than a search.
+    The result is exact where the last value is small, since the sum starts from there.
     """
     result = values[-1]
     for i, start in enumerate(knots[:-1]):

@@ -63,7 +63,7 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
 
 
 def _set_inertia(body: mujoco.MjsBody, robot: RobotConfig) -> None:
-    """Gives the body the robot's mass and inertia, less those of its wheels."""
+    """Gives the body the mass and inertia of the robot without its wheels."""
     wheel = epuck.WHEEL_MASS
     yaw = robot.yaw_inertia - 2.0 * (wheel * epuck.AXLE_Y**2 + epuck.WHEEL_INERTIA[0])
     body.explicitinertial = True
@@ -82,8 +82,9 @@ def _add_wheel(
 ) -> None:
     """Adds a wheel, its motor, and its grip on the floor; `side` is 1 for left and -1 for right.
 
-    The wheel's geom is a sphere, centred on the axle above the tyre's contact point. It rolls like
-    a wheel of the same radius. The distance between the contact points of both wheels is constant.
+    The wheel's geom is a sphere, centred on the axle above the tyre's contact point. The sphere
+    rolls like a wheel of the same radius. The distance between the contact points of both wheels is
+    constant.
     """
     wheel = body.add_body(name=name, pos=[0.0, side * _INNER_EDGE, robot.wheel_radius])
     wheel.explicitinertial = True

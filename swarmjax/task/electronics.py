@@ -142,9 +142,10 @@ def load(
     Args:
       task: the task.
       realism: the factors.
-      encoding: encoding that the policy was trained with; None for that of the task.
+      encoding: encoding that the policy was trained with; None for the encoding of the task.
       own: observations of an extension.
-      neighbours: neighbour settings that the policy was trained with; None for those of the task.
+      neighbours: neighbour settings that the policy was trained with; None for the settings of the
+        task.
 
     Returns:
       The electronics.

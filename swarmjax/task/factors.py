@@ -15,7 +15,7 @@ from swarmjax.sim.realism_config import RealismConfig
 
 Array = Any
 
-# Settings that draw random numbers at every control step. They need the seed as well.
+# Settings that draw random numbers at every control step. These settings need the seed as well.
 _PER_STEP = (
     "speed_noise",
     "stall",

@@ -1,8 +1,8 @@
 """Places objects one after the other on the points of a lattice, in integers.
 
 With integer arithmetic, NumPy and JAX choose the same point from the same uniform number. The unit
-is 1/4096 m. It is a power of two, so it converts to metres exactly. It is large enough that
-squared distances within the largest arena fit an int32.
+is 1/4096 m. This is a power of two, so lengths convert to metres exactly. The unit is large enough
+that squared distances within the largest arena fit an int32.
 """
 
 import math
@@ -128,8 +128,8 @@ def score_things(points: Array, centres: Array, there: Array, gap: Gap, xp: Any)
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [P] 0 where all soft distances are kept, below 0 where one is violated, and very low where a
-      hard one is violated. Worse violations score lower.
+      [P] 0 where all soft distances are kept, below 0 where a soft distance is violated, and very
+      low where a hard distance is violated. Worse violations score lower.
     """
     apart = points[:, None, :] - centres[None, :, :]
     square = xp.sum(apart * apart, axis=-1)

@@ -295,9 +295,9 @@ def smallest_side(stage: StageConfig) -> float:
     (obstacle_size * sqrt(2) + 0.10)^2 for each obstacle. This leaves more than a passage on either
     side of any single obstacle.
 
-    A random level places its obstacles one after the other. They may take at most the share
-    FILLING of the free square. Discs placed this way jam at 0.547 of the area (Feder 1980), which
-    is 0.70 of a square grid of discs. The walls reduce this further.
+    A random level places its obstacles one after the other. The obstacles may take at most the
+    share FILLING of the free square. Discs placed this way jam at 0.547 of the area (Feder 1980),
+    which is 0.70 of a square grid of discs. The walls reduce this further.
 
     Args:
       stage: the stage; its `side` is not read.

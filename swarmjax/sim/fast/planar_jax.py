@@ -65,8 +65,8 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
-      [R, 3] accelerations of x and y, m/s^2, and of yaw, rad/s^2. Contacts do not change that of
-      yaw.
+      [R, 3] accelerations of x and y, m/s^2, and of yaw, rad/s^2. Contacts do not change the
+      acceleration of yaw.
     """
     one = contacts(discs, robots, sim_model.fixture_rectangles(side, obstacle, jnp))
     free, before = (Motion(m[:, 0], m[:, 1]) for m in (robots.free, robots.before))

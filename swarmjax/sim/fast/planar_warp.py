@@ -42,8 +42,8 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
-      [R, 3] accelerations of x and y, m/s^2, and of yaw, rad/s^2. Contacts do not change that of
-      yaw.
+      [R, 3] accelerations of x and y, m/s^2, and of yaw, rad/s^2. Contacts do not change the
+      acceleration of yaw.
     """
     many = of_arenas(functools.partial(_solve, discs))
     return many(*jax.tree.map(lambda x: x[None], (robots, side, obstacle)))[0]

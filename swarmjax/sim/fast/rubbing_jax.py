@@ -8,7 +8,7 @@ the robot in different ways, so for one contact the problem
     minimise over the cone:  1/2 f' (J M^-1 J' + R) f + f' (J a0 - aref)
 
 is two separate parabolas. The least point of their sum in the cone has a closed form (`project`).
-Projected Gauss-Seidel then goes through contacts instead of forces. It sets each contact to its
+Projected Gauss-Seidel then goes through contacts instead of forces. A step sets one contact to its
 best forces while the other forces stay the same.
 
 Wedged robots pass a force back and forth, a little less of it in each sweep. An arena may take up
@@ -181,8 +181,8 @@ def _go_on(discs: Discs, touch: Touch, robots: DiscRobots, least: Array, now: Se
 def _leap(touch: Touch, robots: DiscRobots, swept: Swept, now: Search, leaps: Array) -> Force:
     """Returns the mix of the last three sweeps' forces that should change least in the next sweep.
 
-    This assumes that a sweep is a linear map. That holds as long as no contact starts or stops
-    pushing, sticking or slipping.
+    This assumes that a sweep is a linear map. A sweep is linear as long as no contact starts or
+    stops pushing, sticking or slipping.
     """
     newer, older = _minus(swept.change, now.last.change), _minus(now.last.change, now.before.change)
     by_newer, by_older = (jnp.where(leaps, x, 0.0) for x in _weights(swept.change, newer, older))

@@ -55,7 +55,7 @@ _BLOCK = 64  # threads per block; their work is long and uneven, so small blocks
 def step(m: Any, d: Any) -> None:
     """Advances all arenas of wheeled robots by one physics step (MuJoCo's semi-implicit Euler).
 
-    It ignores the external forces `xfrc_applied`, since nothing here uses them.
+    The step ignores the external forces `xfrc_applied`, since nothing here uses them.
 
     Args:
       m: Warp's model: only robots, with eight joints each; a sparse Jacobian.
