@@ -82,7 +82,7 @@ def make_env(
 
     Args:
       stage: a name of `configs/stage/`, the path of a .yaml file, a `StageConfig`, or several of
-        these; arena i plays stage i modulo their number.
+        these; arena i plays stage i modulo the number of stages.
       robot: `planar`, `wheeled` or another name of `configs/robot/`, or settings by name, as in
         `{"hull_radius": 0.04}`.
       task: settings by name, as in `{"step_limit": 300, "reward": {"contact": -0.1}}`.
@@ -132,10 +132,10 @@ def train_policy(
         `["algo.discount=0.995"]`; `stage` may also be a `StageConfig` or a list of them.
       on_update: called with each row of `metrics.jsonl`. If it returns True, the run saves and
         stops, as it does on Ctrl-C.
-      log: a function that is also called with each row, but in its own thread, so the run does
-        not wait for it. If it raises, a warning is printed to standard error and the run
-        continues without it. Or a `Logger` of `swarmjax.run.loggers`, which also receives
-        speeds and is closed at the end. Or a list of these.
+      log: a function that is also called with each row, but in its own thread, so the run does not
+        wait for it. If the function raises, a warning is printed to standard error and the run
+        continues without it. May also be a `Logger` of `swarmjax.run.loggers`, which also receives
+        speeds and is closed at the end, or a list of functions and loggers.
       extensions: your own extension pieces: a file, a module, or a list of them.
 
     Returns:
@@ -180,10 +180,10 @@ def evaluate_policy(
     Args:
       policy: a `Policy`, the path of a policy file, or several from the same recipe.
       suite: a name of `configs/suites/`, or a file, instead of a stage.
-      stage: a name, a path or a `StageConfig`; None: the last one it was trained on.
+      stage: a name, a path or a `StageConfig`; None: the last stage that the policy was trained on.
       extensions: pieces that the policy needs: a file, a module, or a list of them.
-      workers: number of processes. Each additional process imports the calling script again,
-        which then needs `if __name__ == "__main__":`.
+      workers: number of processes. Each additional process imports the calling script again, so
+        that script needs `if __name__ == "__main__":`.
       settings: further keys of the command, as `episodes=100`, `realism="real"`.
 
     Returns:
@@ -216,7 +216,7 @@ def load_policy(path: str | Path, extensions: Any = None) -> Policy:
     """Reads and checks a policy file; `swarmjax.policy.act` runs the policy.
 
     Args:
-      path: of the file.
+      path: path of the file.
       extensions: a file, module or list with the network that the policy needs, if any.
 
     Raises:
@@ -245,7 +245,7 @@ def _is_one(policy: Any) -> bool:
 
 
 def _given(settings: Mapping[str, Any]) -> tuple[list[str], list[dict[str, Any]] | None]:
-    """Splits settings into command-line words, and stages that no word can name."""
+    """Returns settings as command-line words, and separately the stages that no word can name."""
     rest = dict(settings)
     stage = rest.get("stage")
     stages = None if stage is None or isinstance(stage, str | Path) else _stages(rest.pop("stage"))

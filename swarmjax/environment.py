@@ -24,7 +24,7 @@ from swarmjax.training import program as programs
 from swarmjax.training import rollout
 from swarmjax.training.config import ProgramConfig
 
-_REDRAW = 32  # control steps in which every waiting level is replaced; episodes take longer
+_REDRAW = 32  # control steps in which all waiting levels are replaced; episodes take longer
 
 
 class Space(NamedTuple):
@@ -64,7 +64,7 @@ class SwarmState:
 
     @property
     def observation(self) -> Array:
-        """[A, R, O] input of the policy; from the new episode where the last one has ended."""
+        """Input of the policy, [A, R, O]; after the end of an episode, that of the new one."""
         return self.arenas.observation
 
     @property
@@ -106,9 +106,9 @@ class Swarm:
 
     @property
     def action_space(self) -> Space:
-        """One robot's action, [U]: the command, clipped to -1..1, which spans its range.
+        """One robot's action, [U]: the command, clipped to -1..1; -1 and 1 span its range.
 
-        The numbers that a robot broadcasts, if any, follow the two of the command.
+        The numbers that a robot broadcasts, if any, follow the two numbers of the command.
         """
         ones = np.ones(self.world.action_size, np.float32)
         names, _ = policy_file.action_layout(self.world.electronics.neighbours.message_size)
@@ -146,7 +146,7 @@ class Swarm:
 
         Args:
           state: before the step.
-          action: [A, R, U], clipped to -1..1, which spans the commands.
+          action: [A, R, U], clipped to -1..1; -1 and 1 are the ends of each command's range.
 
         Returns:
           The new state, and the outcome of the step: observation [A, R, O], reward, terminated,
@@ -169,7 +169,7 @@ class Swarm:
         return jax.tree.map(lambda old, new: old.at[which].set(new), waiting, fresh)
 
     def _draw(self, key: Array, arena: Array) -> EnvState:
-        """Starts episodes [N] for the arenas [N], packed."""
+        """Starts one episode in each of these arenas [N], with `sim` as a `PhysicsState`."""
         spacing, stages = self.world.spacing, jax.tree.map(jnp.asarray, self.stages)
         count = len(self.stages.robots)
 

@@ -16,7 +16,8 @@ MASS = 0.16  # kg; Webots e-puck guide, version 1: body 0.15 and two wheels of 0
 YAW_INERTIA = 1.06e-4
 WHEEL_MASS = 0.005  # kg, each; Webots E-puck
 # The whole body, for `robot=wheeled`: Webots E-puck, version 1, without its wheels. The moments are
-# in the order of its older, y-up file; the newer z-up file has them in the same order.
+# in the order of the older model file, with y up; the newer file, with z up, has them in the same
+# order.
 BODY_INERTIA = (8.64333e-5, 8.74869e-5, 9.78585e-5)  # kg m^2 about x, y, z of the centre of mass
 COM_HEIGHT = 0.015  # m; height of the centre of mass, exactly over the axle
 SKID_X = 0.025  # m; front and back end of the box that it skids on (0.05 long)
@@ -51,7 +52,7 @@ SENSOR_POSES = (
 )
 SENSOR_TILT = 0.16  # rad; upward tilt of every ray, Webots E-puckDistanceSensor
 # Ray length (m), counts, and standard deviation relative to the counts: Webots
-# E-puckDistanceSensor. It interpolates linearly and holds the end values beyond the table. The
+# E-puckDistanceSensor. Webots interpolates linearly and holds the end values beyond the table. The
 # points up to 0.05 m are also in INFRARED_TABLE, driver.cpp of cyberbotics/epuck_ros2 (Apache-2.0).
 INFRARED_TABLE = (
     (0.000, 4095.00, 0.00200),
@@ -90,11 +91,11 @@ MEASURED_INFRARED_SD = (
     (0.92, 3.07, 3.37, 4.20, 3.30, 2.68, 2.21, 1.79),
     (1.59, 4.42, 4.96, 6.21, 5.45, 4.67, 3.89, 7.91),
 )
-# The curve A / (gap + d)^2 + b of ps0..ps7: A (counts m^2), d (m), b (counts). It was fitted to the
-# means at 1 to 7 cm by least squares, weighted by their standard deviations. No residual may exceed
-# 13 counts; this limit binds for ps0 alone, which has 13.1 without it. The last two columns are the
-# median of those standard deviations, and the mean at 0 cm, which is the largest reading (counts).
-# tests/sim/test_response.py repeats the fit.
+# The curve A / (gap + d)^2 + b of ps0..ps7: A (counts m^2), d (m), b (counts). The curve was fitted
+# to the means at 1 to 7 cm by least squares, weighted by the standard deviations. No residual may
+# exceed 13 counts; this limit affects only ps0, which has a residual of 13.1 without the limit. The
+# last two columns are the median of those standard deviations, and the mean at 0 cm, which is the
+# largest reading (counts). tests/sim/test_response.py repeats the fit.
 INFRARED_FIT = (
     (0.16935, 0.0034172, 442.63, 12.06, 3779.0),
     (0.18230, 0.0015093, 179.89, 3.58, 3810.0),

@@ -29,12 +29,12 @@ _CONSTANTS = (bool, int, float, str, bytes, tuple, frozenset, type(None))
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Piece:
-    """A function of yours with its name.
+    """A function or class of the user, with its name.
 
     Attributes:
       kind: the kind of piece, as messages and policy files call it.
       taken: names of this kind that the package itself uses.
-      name: its name in keys and policy files.
+      name: name of the piece in keys and policy files.
       function: the function.
     """
 
@@ -46,7 +46,7 @@ class Piece:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of its code and of the code that it uses from its file, without comments."""
+        """SHA-256 of the piece's code and of what it uses from its file, without comments."""
         texts = sorted(_sources(self.function, {}).items())
         return hashlib.sha256(repr(texts).encode()).hexdigest()
 
@@ -164,7 +164,10 @@ def observation(
 
 
 def level_drawing(function: Callable) -> LevelDrawing:
-    """Turns a function into a way to draw levels. A stage uses it if its `level` is its name."""
+    """Turns a function into a way to draw levels.
+
+    A stage uses this drawing if the stage's `level` is the name of the drawing.
+    """
     return LevelDrawing(name=function.__name__, function=function)
 
 
@@ -212,7 +215,7 @@ NONE = Extensions()
 
 _files: dict[tuple[str, str], Extensions] = {}  # by path and SHA-256 of the content
 _handed: dict[str, Extensions] = {}  # pieces from `hand_over`, by the word that stands for them
-_HANDED = "python:"  # prefix of such a word, which is not a file path
+_HANDED = "python:"  # prefix of the words that `hand_over` returns
 
 
 def load(source: str | None) -> Extensions:
@@ -316,7 +319,7 @@ def collect(pieces: Iterable[Piece], where: str) -> Extensions:
 
     Args:
       pieces: the pieces, in any order.
-      where: name of their source in messages.
+      where: name of the pieces' source in messages.
 
     Raises:
       ConfigError: if a name is invalid or used twice, or a number is out of range.
@@ -381,7 +384,10 @@ def _sources(thing: Any, found: dict[str, str]) -> dict[str, str]:
 
 
 def _bare(tree: ast.Module) -> ast.Module:
-    """Removes the decorator and all docstrings. Keys and layouts already record its arguments."""
+    """Removes the decorator and all docstrings.
+
+    Keys and layouts already record the arguments of the decorator.
+    """
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             if node in tree.body:

@@ -23,10 +23,10 @@ class Chassis(NamedTuple):
 
     Attributes:
       wheel_radius: [R, 2] left and right, m, or None.
-      track: [R] between the points where the wheels grip the floor, m, or None.
+      track: [R] distance between the points where the wheels grip the floor, m, or None.
       mass: [R] kg, or None.
-      friction: [R] between wheels and floor, or None.
-      hull_friction: [] between hulls and everything that they touch, or None.
+      friction: [R] friction between wheels and floor, or None.
+      hull_friction: [] friction between hulls and everything that they touch, or None.
     """
 
     wheel_radius: Array | None = None
@@ -80,13 +80,13 @@ class Body:
     """One kind of body, as functions.
 
     Attributes:
-      gravity: whether gravity acts along any of its joints.
-      cone: friction cone of its contacts.
+      gravity: whether gravity acts along any of the body's joints.
+      cone: friction cone of the body's contacts.
       add: adds a robot of this name to a spec, for a physics step (s); returns its contact geom.
       qpos: joint positions [..., R * Q] of robots at rest at [..., R, 3] x (m), y (m), yaw (rad).
       pose: the inverse, [..., R, 3].
       ctrl: controls [..., R * U] for wheel speeds [..., R, 2] (rad/s) of a chassis.
-      changes: changes that a chassis makes to the compiled model, which is the last argument.
+      changes: changes that a chassis makes to the compiled model; the model is the last argument.
       servos: servos that follow `ctrl`, if a spec can omit them; None if `add` adds them.
     """
 
@@ -132,14 +132,14 @@ def scale_mass(ratio: Array, rows: Rows, model: mujoco.MjModel) -> Changes:
     """Changes a robot's mass, and its inertia in proportion.
 
     Args:
-      ratio: [R] of the new mass to the compiled mass.
-      rows: of the robots.
+      ratio: [R] ratio of the new mass to the compiled mass.
+      rows: rows of the robots.
       model: compiled.
 
     Returns:
-      Changes of the bodies. They include the inverse weights, with which MuJoCo softens contacts
-      and which MJX does not recompute. The weights shrink in proportion to the mass. This is exact
-      except for the share of the wheel motors.
+      Changes of the bodies. The changes include the inverse weights. MuJoCo softens contacts with
+      them, and MJX does not recompute them. The weights shrink in proportion to the mass. This
+      scaling is exact except for the share of the wheel motors.
     """
     bodies, dofs = rows.bodies, rows.dofs
     return {
@@ -155,8 +155,8 @@ def rub(friction: Array, rows: Rows) -> tuple[Any, Array]:
     """Returns the change of hull friction: rows of `pair_friction`, and their new values.
 
     Args:
-      friction: [] between hulls and everything that they touch.
-      rows: of the robots.
+      friction: [] friction between hulls and everything that they touch.
+      rows: rows of the robots.
 
     Returns:
       The value of an entry of `Changes`.

@@ -7,7 +7,7 @@ from swarmjax import epuck
 from swarmjax.config import ConfigError, Section, about, show
 
 # m; a level leaves passages of 0.10 m (task/stage_config.py). A robot of this radius fits through
-# with a tenth of that to spare.
+# with a tenth of the passage to spare.
 LARGEST_HULL = 0.045
 _HULL_REASON = (
     "levels leave passages of 0.10 m, and a larger robot would not fit through them. To train "
@@ -24,8 +24,8 @@ FASTEST_WHEEL = 1000.0  # rad/s
 MOST_FRICTION = 10.0
 FRICTION_REASON = "rubber on rubber has less than 2"
 # Below this value, MuJoCo's pyramidal cone makes a wheeled robot's contact too stiff for float32.
-# Crowds of tests/sim/test_rubbing.py were off by 1e-4 at 0.1, by 1e-3 at 0.05, and not finite at
-# 0.001.
+# The crowds of tests/sim/test_rubbing.py were off by 1e-4 with friction 0.1 and by 1e-3 with 0.05,
+# and not finite with 0.001.
 LEAST_HULL_FRICTION = 0.1
 MOST_HULL_FRICTION = 2.0
 HULL_FRICTION_REASON = "rubber on rubber has less than 2, and plastic has less than that"
@@ -143,8 +143,8 @@ class SimConfig(Section):
     solver: Literal["auto", "mjx", "swarm"] = field(
         default="auto",
         metadata=about(
-            "contact solver; mjx: MJX's own step, unpatched; swarm: made for the body, for wheels "
-            "by warp only; auto: swarm where available",
+            "contact solver; mjx: MJX's own step, unpatched; swarm: a step made for the "
+            "body, on wheels only with warp; auto: swarm where available",
             renamed={"newton": "mjx"},
         ),
     )
@@ -183,5 +183,5 @@ class SimConfig(Section):
 
 
 def physics_substeps(robot: RobotConfig, given: int | None) -> int:
-    """Returns the physics steps per control step: those given, else the body's default."""
+    """Returns the physics steps per control step: the given number, or else the body's default."""
     return {"planar": 1, "wheeled": 2}[robot.body] if given is None else given

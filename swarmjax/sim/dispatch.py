@@ -1,6 +1,7 @@
 """Chooses the faster code of `sim/fast/` where it exists, and plain code elsewhere.
 
-The rest of this package uses plain MJX and plain loops. It works without `fast/`, but more slowly.
+The rest of this package uses plain MJX and plain loops. That code works without `fast/`, but more
+slowly.
 """
 
 import importlib
@@ -64,8 +65,8 @@ def resolve_impl(impl: str) -> str:
 def resolve_solver(solver: str, impl: str, body: str, robots: int, *, rubs: bool = False) -> str:
     """Resolves `auto` to `swarm` where available, and to `mjx` elsewhere.
 
-    Where `swarm` is chosen, tests require it to match MuJoCo C at least as closely as MJX's own
-    step does (tests/sim/test_solver.py).
+    Tests require that `swarm`, wherever it is chosen, matches MuJoCo C at least as closely as MJX's
+    own step does (tests/sim/test_solver.py).
 
     Args:
       solver: `auto`, `mjx` or `swarm`.
@@ -188,7 +189,7 @@ def _push_apart(impl: str, *, rubs: bool) -> Any:
 
 
 def load_paths(impl: str) -> ModuleType | None:
-    """Loads the shortest-path finder in Warp; None where plain JAX finds them.
+    """Loads the shortest-path finder in Warp; returns None where plain JAX finds the paths.
 
     Args:
       impl: `jax` or `warp`.
@@ -219,7 +220,7 @@ def pieces(count: int, xp: Any) -> list[slice]:
 
 
 def least(values: Iterable[Array], limit: float, xp: Any) -> Array:
-    """Returns the minimum over all objects, which come in pieces.
+    """Returns the minimum over all objects; their values are split into pieces.
 
     Args:
       values: [..., N] values of objects, one array per piece.

@@ -1,4 +1,4 @@
-"""Differential drive: converts a policy's action to wheel speeds, and those to motion."""
+"""Differential drive: converts a policy's action to wheel speeds, and wheel speeds to motion."""
 
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ class Drive(NamedTuple):
     Attributes:
       wheel_radius: m.
       track: distance between the wheels, m.
-      max_wheel_speed: of each wheel, rad/s.
+      max_wheel_speed: speed limit of each wheel, rad/s.
       max_speed: upper limit of the commanded forward speed (the lower limit is 0), m/s.
       max_turn_rate: limit of the commanded turn rate in both directions, rad/s.
     """
@@ -36,7 +36,7 @@ def command(action: Array, drive: Drive, xp: Any) -> Array:
     """Clips an action to -1..1 and scales it to a command.
 
     Args:
-      action: [..., 2], any real number; -1..1 spans the command's range.
+      action: [..., 2], any real number; -1 and 1 are the ends of the command's range.
       drive: the drive.
       xp: `numpy` or `jax.numpy`.
 
@@ -51,8 +51,8 @@ def command(action: Array, drive: Drive, xp: Any) -> Array:
 def wheel_speeds(command: Array, drive: Drive, xp: Any) -> Array:
     """Computes the wheel speeds of a command, with each wheel clamped to its own limit.
 
-    The robot clamps each wheel separately, so a fast command loses its turn first. Above
-    v = 0.2072 m/s, the turn is lost entirely.
+    The robot clamps each wheel separately, so a command for a high speed loses its turn first.
+    Above v = 0.2072 m/s, the turn is lost entirely.
 
     Args:
       command: [..., 2] forward speed (m/s) and turn rate (rad/s).
@@ -73,7 +73,7 @@ def body_velocity(wheels: Array, wheel_radius: Array, track: Array, xp: Any) -> 
     Args:
       wheels: [..., 2] left and right wheel speed, rad/s.
       wheel_radius: [] or [..., 2] left and right, m.
-      track: [] or [...] between the points where the wheels touch the floor, m.
+      track: [] or [...] distance between the points where the wheels touch the floor, m.
       xp: `numpy` or `jax.numpy`.
 
     Returns:

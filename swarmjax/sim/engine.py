@@ -10,12 +10,12 @@ import mujoco
 import numpy as np
 from jax import Array
 
-# Warp stores the contacts of all arenas together. This is the average number of hull contacts per
-# robot that it has memory for, far more than a swarm makes. Floor contacts are counted separately.
+# Warp stores the contacts of all arenas together. Warp gets memory for this average number of hull
+# contacts per robot, far more than a swarm makes. Floor contacts are counted separately.
 CONTACTS_PER_ROBOT = 3
 # Contacts per robot in one arena: a disc touches at most six neighbours of its size at once.
 ROWS_PER_ROBOT = 6
-FEW_ARENAS = 64  # up to this many may all be crowded at once, so every pair gets memory
+FEW_ARENAS = 64  # up to this many arenas may all be crowded, so every pair gets memory
 
 # Types of MJX, in either implementation, or of a faster engine with the same field names.
 Model = Any
@@ -32,8 +32,9 @@ class Engine:
       template: data of one arena, to fill in.
       step: takes model, data, side [] (m) and obstacles [M, 5], and returns the data one physics
         step later.
-      is_mjx: whether MJX takes the steps. Its model and data then hold obstacles and walls. Any
-        other engine gets them as arguments, and its model has only the fields that it reads.
+      is_mjx: whether MJX takes the steps. The engine's model and data then hold obstacles and
+        walls. Any other engine gets obstacles and walls as arguments, and its model has only the
+        fields that the engine reads.
       impl: `jax` or `warp`.
       solver: `mjx` or `swarm`.
     """
@@ -48,7 +49,7 @@ class Engine:
 
     @property
     def builds_kernels(self) -> bool:
-        """Whether Warp builds MJX's kernels at the first step, which takes half a minute, once."""
+        """Whether Warp builds MJX's kernels at the first step, once, for half a minute."""
         return self.is_mjx and self.impl == "warp"
 
 
@@ -77,7 +78,7 @@ def step_mjx(model: Model, data: Data, _side: Array, _obstacle: Array) -> Data:
 
 
 def import_mjx() -> Any:
-    """Imports MJX lazily: it takes two to four seconds, and planar robots do not need it."""
+    """Imports MJX lazily: this takes two to four seconds, and planar robots do not need MJX."""
     with contextlib.redirect_stdout(io.StringIO()):  # MJX prints two lines if Warp is missing
         from mujoco import mjx
     return mjx

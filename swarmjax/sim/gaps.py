@@ -9,7 +9,7 @@ from swarmjax.sim.infrared import Box, to_box_frame, turned
 
 Array = Any
 KINDS = ("robot", "obstacle", "wall")  # the last axis of gaps and contacts
-CONTACT_PAUSE = 0.1  # s; a contact that reopens for less than this is still the same contact
+CONTACT_PAUSE = 0.1  # s; a contact interrupted for less than this is still the same contact
 
 
 def gaps(pose: Array, side: Array, obstacle: Array, hull_radius: float, xp: Any) -> Array:
@@ -17,7 +17,7 @@ def gaps(pose: Array, side: Array, obstacle: Array, hull_radius: float, xp: Any)
 
     Args:
       pose: [R, 3] x (m), y (m), yaw (rad); absent robots are parked far away.
-      side: [] of the arena, m.
+      side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
       hull_radius: m.
       xp: `numpy` or `jax.numpy`.
@@ -53,10 +53,10 @@ def _box_distance(x: Array, y: Array, box: Box, xp: Any) -> Array:
 
 
 def count_contacts(gap: Array, apart: Array, control_step: float, xp: Any) -> tuple[Array, Array]:
-    """Counts contacts: a contact begins when a gap closes that has been open for a while.
+    """Counts contacts: a contact begins when a gap closes after it has been open for a while.
 
     Args:
-      gap: [..., R, 3] now, m.
+      gap: [..., R, 3] gaps now, m.
       apart: [..., R, 3] time for which the gap has been open, s.
       control_step: s.
       xp: `numpy` or `jax.numpy`.

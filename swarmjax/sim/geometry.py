@@ -9,8 +9,8 @@ from swarmjax import epuck
 HULL_GROUP = 3  # contact spheres, which rays ignore
 FLOOR_GROUP = 4  # wheels, skids and floor, which rays ignore; wheels reach beyond the hull
 # Contacts are between a sphere at the height of the robot's centre of mass and upright faces. In
-# the plane this is exactly a disc of the hull's radius. It needs one contact point per pair, while
-# a capsule needs two. A push neither tips the robot nor puts extra load on a skid.
+# the plane this is exactly a disc of the hull's radius. A sphere needs one contact point per pair,
+# while a capsule needs two. A push neither tips the robot nor puts extra load on a skid.
 CONTACT_HEIGHT = epuck.COM_HEIGHT
 SPIN = 5e-3, 1e-4, 1e-4  # MuJoCo's default torsional and rolling friction; condim 3 ignores it
 
@@ -27,10 +27,10 @@ def add_geom(
 
     Args:
       body: parent body.
-      name: of the geom.
+      name: name of the geom.
       kind: shape.
       size: three numbers, m, with MuJoCo's meaning for the shape.
-      place: in the frame of the body, m.
+      place: position in the frame of the body, m.
       group: determines which rays see the geom.
 
     Returns:
@@ -46,8 +46,8 @@ def add_hull(body: mujoco.MjsBody, name: str, radius: float) -> str:
     """Adds the hull that makes contact, and returns its name.
 
     Args:
-      body: of the robot, its origin on the floor.
-      name: of the robot.
+      body: body of the robot, with its origin on the floor.
+      name: name of the robot.
       radius: m.
 
     Returns:
@@ -67,8 +67,8 @@ def add_ray_hull(body: mujoco.MjsBody, name: str, radius: float) -> None:
     """Adds the hull that rays see: a cylinder.
 
     Args:
-      body: of the robot, its origin on the floor.
-      name: of the robot.
+      body: body of the robot, with its origin on the floor.
+      name: name of the robot.
       radius: m.
     """
     half = 0.5 * (epuck.HULL_TOP - epuck.HULL_BOTTOM)

@@ -1,8 +1,9 @@
 """Eight infrared rays per robot, computed from the geometry of walls, discs and turned boxes.
 
-There is one function per shape. It returns the distance at which a ray meets the shape, `inf` for a
-miss, and 0 for a ray that starts inside. Sensors sit 3.5 to 6 mm behind the hull's surface, so a
-robot pressed against an object has its sensor inside that object. Runs on NumPy or JAX.
+There is one function per shape. Each function returns the distance at which a ray meets the shape,
+`inf` for a miss, and 0 for a ray that starts inside. Sensors sit 3.5 to 6 mm behind the hull's
+surface, so a robot pressed against an object has its sensor inside that object. Runs on NumPy or
+JAX.
 """
 
 import itertools
@@ -33,7 +34,7 @@ class Reflectance(NamedTuple):
     """Reflectances of surfaces, above 0 and at most 1; None means 1.
 
     Attributes:
-      wall: [...] of all the walls.
+      wall: [...] reflectance of all walls.
       obstacle: [..., M].
       robot: [..., R].
     """
@@ -47,10 +48,10 @@ class Ray(NamedTuple):
     """Rays in the world frame; separate coordinate arrays spare XLA any gathering.
 
     Attributes:
-      x: [...] of the origin, m.
-      y: [...] of the origin, m.
-      toward_x: [...] of the unit direction.
-      toward_y: [...] of the unit direction.
+      x: [...] x of the origin, m.
+      y: [...] y of the origin, m.
+      toward_x: [...] x of the unit direction.
+      toward_y: [...] y of the unit direction.
     """
 
     x: Array
@@ -63,10 +64,10 @@ class Box(NamedTuple):
     """Turned rectangles, with sine and cosine computed once for all rays.
 
     Attributes:
-      x: [...] of the centre, m.
-      y: [...] of the centre, m.
-      cos: [...] of the yaw.
-      sin: [...] of the yaw.
+      x: [...] x of the centre, m.
+      y: [...] y of the centre, m.
+      cos: [...] cosine of the yaw.
+      sin: [...] sine of the yaw.
       half_x: [...] half edge, m.
       half_y: [...] half edge, m.
     """
@@ -144,8 +145,8 @@ def ray_disc(ray: Ray, x: Array, y: Array, radius: float, xp: Any) -> Array:
 
     Args:
       ray: [...].
-      x: [...] of the centre, m.
-      y: [...] of the centre, m.
+      x: [...] x of the centre, m.
+      y: [...] y of the centre, m.
       radius: m.
       xp: `numpy` or `jax.numpy`.
 
@@ -213,7 +214,7 @@ def distances(
 
     Args:
       pose: [..., R, 3] x (m), y (m), yaw (rad) of the robots; absent ones are parked far away.
-      side: [...] of the arena, m.
+      side: [...] side of the arena, m.
       obstacle: [..., M, 5] x (m), y (m), yaw (rad), half edges (m); absent ones are parked far
         away.
       hull_radius: m.
@@ -241,12 +242,12 @@ def sights(
     """Returns what the infrared sensors of a swarm see: distances and reflectances.
 
     Args:
-      pose: [..., R, 3] as for `distances`, as are all but `reflectance`.
-      side: [...] of the arena, m.
+      pose: [..., R, 3] x (m), y (m), yaw (rad) of the robots; absent ones are parked far away.
+      side: [...] side of the arena, m.
       obstacle: [..., M, 5] x (m), y (m), yaw (rad), half edges (m).
       hull_radius: m.
       limit: range of a sensor from its own origin, m.
-      reflectance: of surfaces.
+      reflectance: reflectances of surfaces.
       mount: mounting errors of the sensors; None without errors.
       xp: `numpy` or `jax.numpy`.
 
@@ -267,7 +268,7 @@ def sights(
 
 
 def _brightest(reaches: list[Array], here: Array, shade: Array | None, xp: Any) -> Array | float:
-    """Returns reflectances [..., R, K] of the objects of one kind that rays meet at `here`."""
+    """Returns reflectances [..., R, K] of objects of one kind that rays meet at distance `here`."""
     if shade is None:
         return 1.0
     found = 0.0
@@ -281,7 +282,7 @@ def _brightest(reaches: list[Array], here: Array, shade: Array | None, xp: Any) 
 def _reaches(
     pose: Array, side: Array, obstacle: Array, hull_radius: float, mount: Mount | None, xp: Any
 ) -> tuple[list[Array], list[Array], list[Array]]:
-    """Returns distances (m) to walls, other robots and obstacles: pieces [..., R, K, N]."""
+    """Returns distances (m) to walls, other robots and obstacles, as pieces [..., R, K, N]."""
     ray = _cast(pose, xp, mount)
     wall = ray_walls(ray, 0.5 * side[..., None, None], xp)[..., None]
     ray = Ray(*(part[..., None] for part in ray))

@@ -52,7 +52,7 @@ class Ids(NamedTuple):
         west, south.
       fixture_mocap: [M + 4] rows of `mocap_pos` in the same order; -1 for geoms of the world.
       obstacle_geom: [M] the first rows of `fixture_geom`.
-      hull_body: [R] bodies, for `bodyexclude` of a ray.
+      hull_body: [R] bodies of the hulls, for `bodyexclude` of a ray.
       robots: rows of the robots.
     """
 
@@ -78,8 +78,9 @@ def build(
       size: sizes to compile for.
       timestep: one physics step, s.
       ray_geoms: whether to add the cylinder hulls that rays see; analytic sensors need none.
-      fixtures: `mocap` makes obstacles and walls bodies, for MuJoCo C. `world` makes them geoms of
-        the world, for MJX, which gets their poses and the servos' forces at run time.
+      fixtures: `mocap` makes obstacles and walls bodies, for MuJoCo C. `world` makes obstacles and
+        walls geoms of the world, for MJX. MJX gets their poses and the forces of the servos at run
+        time.
 
     Returns:
       The spec, ready to compile. qpos, qvel and ctrl hold each robot in turn, in its body's layout.
@@ -118,7 +119,7 @@ def ids(model: mujoco.MjModel, size: ArenaSize) -> Ids:
 def resize_obstacles(model: mujoco.MjModel, ids: Ids, half: np.ndarray) -> mujoco.MjModel:
     """Changes the obstacle sizes of a compiled arena.
 
-    From a box's size, MuJoCo's compiler derives only its bounds.
+    MuJoCo's compiler derives only the bounds of a box from its size.
 
     Args:
       model: made by `build` with `fixtures="mocap"`; it stays unchanged.
@@ -140,7 +141,7 @@ def fixture_rectangles(side: Any, obstacle: Any, xp: Any) -> Any:
     """Returns the rectangles of obstacles, and of the walls east, north, west and south.
 
     Args:
-      side: [] of the arena, m.
+      side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
       xp: `numpy` or `jax.numpy`.
 
@@ -159,7 +160,7 @@ def fixture_poses(side: Any, obstacle: Any, xp: Any) -> tuple[Any, Any]:
     """Returns the poses of obstacles, and of the walls east, north, west and south.
 
     Args:
-      side: [] of the arena, m.
+      side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
       xp: `numpy` or `jax.numpy`.
 

@@ -1,6 +1,6 @@
 """Realistic motors: commands arrive late or get lost, and wheels follow them inexactly.
 
-The code takes the array module, since training and JAX-free evaluation share it.
+The code takes the array module as an argument, since training and JAX-free evaluation share it.
 """
 
 import math
@@ -77,8 +77,8 @@ def deliver(
 
     Args:
       motor: state of the last control step, with the leading axes of `command`.
-      command: [..., R, 2] sent now, in any unit.
-      latency: [..., R] control steps, 0 to the largest of `realism`, int32; None is 0.
+      command: [..., R, 2] the command sent now, in any unit.
+      latency: [..., R] control steps, 0 to the largest latency of `realism`, int32; None means 0.
       realism: provides probability and length of stalls; fixed for a program.
       seed: [...] uint32 of the episode.
       clock: [...] or [] control steps since the start.

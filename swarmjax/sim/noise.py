@@ -73,8 +73,8 @@ def bits(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: Any
     Returns:
       [..., *shape] uint32.
     """
-    # Keep a last axis throughout, because NumPy warns about overflow only for scalars.
-    # Mixed only once, the seed would commute with the clock.
+    # Keep a last axis throughout, because NumPy warns about overflow only for scalars. If the seed
+    # were mixed only once, it would commute with the clock.
     key = _mix(_mix(xp.asarray(seed, xp.uint32)[..., None]))
     index = np.arange(math.prod(shape), dtype=np.uint32)
     for word in (xp.asarray(clock, xp.uint32)[..., None], np.full(1, stream, np.uint32), index):

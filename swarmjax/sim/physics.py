@@ -1,8 +1,9 @@
 """Physics of many arenas on one device: MJX, with `impl=jax` or `impl=warp`.
 
-The state of an arena is `PhysicsState`: positions, velocities and the solver's warm start. It is
-the same for every engine, and a step reads nothing else. Within a rollout, the engine's complete
-data is carried instead, since rebuilding it at every control step costs a quarter of the speed.
+The state of an arena is `PhysicsState`: positions, velocities and the solver's warm start. This
+state is the same for every engine, and a step reads nothing else. Within a rollout, the engine's
+complete data is carried instead, since rebuilding it at every control step costs a quarter of the
+speed.
 """
 
 import functools
@@ -69,11 +70,12 @@ class Physics:
 
 
 def build_kernels(physics: Physics, states: PhysicsState) -> None:
-    """Makes Warp build MJX's kernels, which otherwise happens at the first step: half a minute.
+    """Makes Warp build MJX's kernels now, not at the first step; this takes half a minute.
 
     Args:
-      physics: the compiled physics; its engine `builds_kernels`.
-      states: [A] arenas; as many as the program will step, since contact memory depends on it.
+      physics: the compiled physics, with an engine that `builds_kernels`.
+      states: [A] arenas; as many as the program will step, since contact memory depends on their
+        number.
     """
 
     def step_once(state: PhysicsState) -> Array:
@@ -121,7 +123,7 @@ def step(
     Args:
       physics: the compiled physics.
       data: the arena.
-      side: [] of the arena, m.
+      side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
       wheels: [R, 2] speeds of the left and right wheel that the motors hold, rad/s.
       chassis: differences of the robots from the config.
@@ -152,8 +154,8 @@ def _drive(physics: Physics, data: Data, ctrl: Array, chassis: Chassis) -> Data:
     Args:
       physics: the compiled physics.
       data: the arena.
-      ctrl: [R * U] in the body's layout.
-      chassis: of the robots.
+      ctrl: [R * U] controls, in the body's layout.
+      chassis: chassis of the robots.
 
     Returns:
       The arena, with what acts on its joints during the next physics step.
@@ -169,12 +171,12 @@ def _fixtures(physics: Physics, side: Array, obstacle: Array) -> tuple[Fields, F
     """Places obstacles and walls of an arena where the implementation reads them.
 
     `jax` computes the poses of all geoms from the model. `warp` does not compute the poses of geoms
-    of the world, so they are set in the data; it overwrites the poses of all other geoms. An engine
-    that is not MJX takes side and obstacles directly.
+    of the world, so these poses are set in the data; `warp` overwrites the poses of all other
+    geoms. An engine that is not MJX takes side and obstacles directly.
 
     Args:
       physics: the compiled physics.
-      side: [] of the arena, m.
+      side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
@@ -200,8 +202,8 @@ def _fixtures(physics: Physics, side: Array, obstacle: Array) -> tuple[Fields, F
 def _with_rows(array: Array, rows: Any, first: int) -> Array:
     """Replaces the rows from `first` on.
 
-    It uses `where`: `.at` becomes a scatter under `vmap`, and a concatenation becomes a branch per
-    part, all of which a GPU takes.
+    It uses `where`, because `.at` becomes a scatter under `vmap`. A concatenation becomes one
+    branch per part, and a GPU takes all of the branches.
     """
     count, end = len(array), first + len(rows)
     row = np.arange(count).reshape(-1, *[1] * (array.ndim - 1))
@@ -225,7 +227,7 @@ def _change(physics: Physics, fields: Fields, chassis: Chassis) -> Model:
     """Sets the parts of the model that differ between arenas: `fields` and the chassis."""
     model, rows_of = physics.engine.model, physics.ids.robots
     changes = physics.body.changes(chassis, rows_of, physics.robot, physics.host)
-    if not physics.engine.is_mjx:  # its model has only the fields that it reads
+    if not physics.engine.is_mjx:  # such a model lacks fields that its engine does not read
         changes = {
             name: changes[name] for name in changes if getattr(model, name, None) is not None
         }

@@ -1,10 +1,11 @@
 """The planar body: three degrees of freedom, and a servo in place of wheels on a floor.
 
-It trains five times faster than the wheeled body. Its forces are limited to what wheels can pass to
-the floor, but the servo is deadbeat over 32 ms and seldom reaches that limit. It reaches its speed
-in one step, where wheels get two thirds of the way. When blocked, it pushes with m v / dt = 0.6 N,
-where wheels push with 1.0 N. A blocked planar robot also turns freely, while two slipping wheels
-hardly turn. Policies that push objects therefore perform worse on the wheeled body (docs/robot.md).
+The planar body trains five times faster than the wheeled body. Its forces are limited to what
+wheels can pass to the floor, but the servo is deadbeat over 32 ms and seldom reaches that limit.
+The servo reaches its speed in one step, while wheels get two thirds of the way. When blocked, it
+pushes with m v / dt = 0.6 N, while wheels push with 1.0 N. A blocked planar robot also turns
+freely, while two slipping wheels hardly turn. Policies that push objects therefore perform worse on
+the wheeled body (docs/robot.md).
 """
 
 import itertools
@@ -22,7 +23,7 @@ from swarmjax.sim.geometry import add_hull
 
 Array = Any
 _SERVOS = "forward", "lateral", "turn"
-_WRENCH = 0, 1, 5  # their axes in the robot's frame: force along x and y, torque about z
+_WRENCH = 0, 1, 5  # axes of the servos in the robot's frame: force along x and y, torque about z
 
 
 class _Numbers(NamedTuple):
@@ -30,7 +31,7 @@ class _Numbers(NamedTuple):
 
     Attributes:
       gain: N s/m, N s/m, N m s/rad.
-      limit: of the force, N, N, N m.
+      limit: largest force, N, N, N m.
     """
 
     gain: Array
@@ -71,10 +72,10 @@ def _add_servos(spec: mujoco.MjSpec, names: list[str], robot: RobotConfig, times
 def _servos(robot: RobotConfig, timestep: float) -> _Numbers:
     """Returns the servos of a nominal robot.
 
-    The gains are deadbeat, mass / timestep, multiplied by the share of the way that a first-order
-    lag goes in one step. The velocity then equals the lag's at every step, for any step length. The
-    force limits are those that wheels can pass to the floor (Coulomb): mu m g along either axis,
-    and a torque of mu m g times half the track.
+    The gains are deadbeat, mass / timestep, multiplied by the share of a change that a first-order
+    lag makes in one step. The velocity then equals that of the lag at every step, for any step
+    length. The force limits are those that wheels can pass to the floor (Coulomb): mu m g along
+    either axis, and a torque of mu m g times half the track.
     """
     grip = robot.friction * robot.mass * epuck.GRAVITY
     share = servo_share(robot.motor_lag, timestep)
@@ -83,7 +84,7 @@ def _servos(robot: RobotConfig, timestep: float) -> _Numbers:
 
 
 def _ratios(chassis: Chassis, robot: RobotConfig, xp: Any) -> _Numbers:
-    """Returns the factors of a chassis on gains and limits: [R, 3], or 1 for axes without change.
+    """Returns the factors of a chassis for gains and limits: [R, 3], or 1 where nothing changes.
 
     A servo stays deadbeat for another mass. The grip depends on mass, friction and track.
     """
@@ -132,10 +133,10 @@ def _turn(vector: Array, cos: Array, sin: Array, xp: Any) -> Array:
 
 
 def servo_share(lag: float, timestep: float) -> float:
-    """Returns the share of the way that a first-order servo goes in one physics step.
+    """Returns the share of a change that a first-order servo makes in one physics step.
 
     Args:
-      lag: time constant, s; 0 reaches the set point in one step.
+      lag: time constant, s; with 0, the servo reaches the set point in one step.
       timestep: s.
 
     Returns:
@@ -189,8 +190,9 @@ def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjM
 
 PLANAR = Body(
     gravity=False,
-    # With this cone, a hull's push and its friction are two numbers, as soft as without friction.
-    # Planar friction has only two cone edges, so it is exactly Coulomb's (docs/design-notes.md).
+    # With this cone, a hull's push and its friction are two numbers, and contacts are as soft as
+    # without friction. Planar friction has only two cone edges, so it is exactly Coulomb's
+    # (docs/design-notes.md).
     cone=mujoco.mjtCone.mjCONE_ELLIPTIC,
     add=_add,
     qpos=_qpos,

@@ -63,7 +63,8 @@ class RealismConfig(Section):
         default=None, metadata=about("SD of the yaw, rad; per sensor and episode", 0.0, math.pi)
     )
     infrared_position: float | None = field(
-        default=None, metadata=about("SD on each axis, m; per sensor and episode", 0.0, 0.01)
+        default=None,
+        metadata=about("SD of the position on each axis, m; per sensor and episode", 0.0, 0.01),
     )
     infrared_period: tuple[float, float] | None = field(
         default=None,
@@ -74,25 +75,29 @@ class RealismConfig(Section):
         ),
     )
     reflectance_wall: tuple[float, float] | None = field(
-        default=None, metadata=about("of all walls; per episode; null: 1", above=0.0, high=1.0)
+        default=None,
+        metadata=about("reflectance of all walls; per episode; null: 1", above=0.0, high=1.0),
     )
     reflectance_obstacle: tuple[float, float] | None = field(
-        default=None, metadata=about("of each obstacle; per episode; null: 1", above=0.0, high=1.0)
+        default=None,
+        metadata=about("reflectance of each obstacle; per episode; null: 1", above=0.0, high=1.0),
     )
     reflectance_robot: tuple[float, float] | None = field(
-        default=None, metadata=about("of each robot; per episode; null: 1", above=0.0, high=1.0)
+        default=None,
+        metadata=about("reflectance of each robot; per episode; null: 1", above=0.0, high=1.0),
     )
     dead_sensor: float | None = field(
         default=None,
         metadata=about("probability of a dead sensor; per sensor and episode", 0.0, 1.0),
     )
     wheel_radius: tuple[float, float] | None = field(
-        default=None, metadata=about("m; per robot and episode", LEAST, below=0.03)
+        default=None,
+        metadata=about("radius of the wheels, m; per robot and episode", LEAST, below=0.03),
     )
     wheel_mismatch: float | None = field(
         default=None,
         metadata=about(
-            "SD of the relative difference right - left; per robot and episode", 0.0, 0.1
+            "SD of the relative difference in radius, right - left; per robot and episode", 0.0, 0.1
         ),
     )
     track: tuple[float, float] | None = field(
@@ -100,29 +105,36 @@ class RealismConfig(Section):
         metadata=about("effective track, m; per robot and episode", LEAST, 2 * LARGEST_HULL),
     )
     max_wheel_speed: tuple[float, float] | None = field(
-        default=None, metadata=about("rad/s; per robot and episode", LEAST, FASTEST_WHEEL)
+        default=None,
+        metadata=about(
+            "speed limit of each wheel, rad/s; per robot and episode", LEAST, FASTEST_WHEEL
+        ),
     )
     mass: tuple[float, float] | None = field(
         default=None,
-        metadata=about("kg; per robot and episode", above=2 * epuck.WHEEL_MASS, high=100.0),
+        metadata=about("mass, kg; per robot and episode", above=2 * epuck.WHEEL_MASS, high=100.0),
     )
     friction: tuple[float, float] | None = field(
         default=None,
         metadata=about(
-            "wheels on floor; per robot and episode", LEAST, MOST_FRICTION, reason=FRICTION_REASON
+            "friction of wheels on floor; per robot and episode",
+            LEAST,
+            MOST_FRICTION,
+            reason=FRICTION_REASON,
         ),
     )
     hull_friction: tuple[float, float] | None = field(
         default=None,
         metadata=about(
-            "all hulls on hulls, boxes and walls; per episode",
+            "friction of all hulls on hulls, boxes and walls; per episode",
             LEAST_HULL_FRICTION,
             MOST_HULL_FRICTION,
             reason=HULL_FRICTION_REASON,
         ),
     )
     speed_noise: float | None = field(
-        default=None, metadata=about("relative SD; per wheel and control step", 0.0, 1.0)
+        default=None,
+        metadata=about("relative SD of the wheel speed; per wheel and control step", 0.0, 1.0),
     )
     speed_quantisation: Literal["epuck1", "epuck2"] | None = field(
         default=None, metadata=about("rounds to wheel speeds that this firmware can make")
@@ -130,7 +142,10 @@ class RealismConfig(Section):
     action_latency: tuple[int, int] | None = field(
         default=None,
         metadata=about(
-            "control steps; per robot and episode", 0, _MOST_LATENCY, reason=_LATENCY_REASON
+            "latency of commands, control steps; per robot and episode",
+            0,
+            _MOST_LATENCY,
+            reason=_LATENCY_REASON,
         ),
     )
     stall: float | None = field(
@@ -143,14 +158,18 @@ class RealismConfig(Section):
     observation_latency: tuple[int, int] | None = field(
         default=None,
         metadata=about(
-            "control steps; per robot and episode", 0, _MOST_LATENCY, reason=_LATENCY_REASON
+            "latency of observations, control steps; per robot and episode",
+            0,
+            _MOST_LATENCY,
+            reason=_LATENCY_REASON,
         ),
     )
     target_distance_noise: float | None = field(
-        default=None, metadata=about("SD, m; per robot and control step", 0.0, 10.0)
+        default=None, metadata=about("SD of the distance, m; per robot and control step", 0.0, 10.0)
     )
     target_bearing_noise: float | None = field(
-        default=None, metadata=about("SD, rad; per robot and control step", 0.0, math.pi)
+        default=None,
+        metadata=about("SD of the bearing, rad; per robot and control step", 0.0, math.pi),
     )
     packet_loss: float | None = field(
         default=None,
@@ -159,10 +178,11 @@ class RealismConfig(Section):
         ),
     )
     neighbour_distance_noise: float | None = field(
-        default=None, metadata=about("SD, m; per pair and control step", 0.0, 10.0)
+        default=None, metadata=about("SD of the distance, m; per pair and control step", 0.0, 10.0)
     )
     neighbour_bearing_noise: float | None = field(
-        default=None, metadata=about("SD, rad; per pair and control step", 0.0, math.pi)
+        default=None,
+        metadata=about("SD of the bearing, rad; per pair and control step", 0.0, math.pi),
     )
 
     def _check(self) -> None:

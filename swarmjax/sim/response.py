@@ -3,10 +3,11 @@
 A ray is the horizontal distance from the sensor's origin to the nearest object, in metres. The real
 ray rises by `epuck.SENSOR_TILT`, so it is longer by 1 / cos(tilt) against an upright face.
 
-`webots` is the lookup table of Webots' E-puck. It maps (length of the ray) / reflectance to counts,
-with multiplicative noise; free space reads 67.19. `real` is a curve fitted to each sensor of a
-measured robot. It gives reflectance * A / (gap + d)^2 counts above free space, with additive noise.
-Free space is zeroed, as the firmware does. The code runs on NumPy or JAX.
+`webots` is the lookup table of Webots' E-puck. The table maps (length of the ray) / reflectance to
+counts, with multiplicative noise; free space reads 67.19. `real` is a curve fitted to each sensor
+of a measured robot. The curve gives reflectance * A / (gap + d)^2 counts above free space, with
+additive noise. Readings in free space are set to zero, as by the firmware. The code runs on NumPy
+or JAX.
 """
 
 import math
@@ -70,8 +71,8 @@ def read(
     Args:
       response: sensor model.
       ray: [..., R, K] horizontal distance from the sensor's origin to the nearest object, m.
-      reflectance: [..., R, K] of that object, above 0 and at most 1; None is 1.
-      wear: of the sensors.
+      reflectance: [..., R, K] reflectance of that object, above 0 and at most 1; None is 1.
+      wear: wear of the sensors.
       normal: [..., R, K] standard normal, drawn for each sample; None for no noise.
       xp: `numpy` or `jax.numpy`.
 
@@ -113,7 +114,7 @@ def distance(response: Response, counts: Array, xp: Any) -> Array:
     reach = REACH[response]
     if response == "webots":
         return xp.clip(_RISE * _interpolate(counts, _COUNTS[::-1], _LENGTH[::-1], xp), 0.0, reach)
-    # Any lower limit works that is below the reading at the largest distance.
+    # Any lower limit works if it is below the reading at the largest distance.
     echo = xp.clip(counts, 1.0, _SPAN)
     return xp.clip(xp.sqrt(_STRENGTH / echo) - _DEPTH + TO_HULL, 0.0, reach)
 
@@ -140,8 +141,8 @@ def _real(ray: Array, bright: Array, gain: Array, xp: Any) -> tuple[Array, Array
 def _interpolate(x: Array, knots: Sequence[float], values: Sequence[float], xp: Any) -> Array:
     """Interpolates linearly between increasing knots, and holds the end values outside them.
 
-    It sums one ramp per segment. This is cheaper on an accelerator than a search. It is exact where
-    the last value is small, since the sum starts from there.
+    The result is a sum of one ramp per segment. On an accelerator, this is cheaper than a search.
+    The result is exact where the last value is small, since the sum starts from there.
     """
     result = values[-1]
     for i, start in enumerate(knots[:-1]):

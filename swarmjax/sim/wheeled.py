@@ -2,10 +2,11 @@
 
 The motors are steppers behind a 50:1 gear. A command sets the speed of a wheel, and no load changes
 it until steps are lost. (Webots gives its motors 10 N m, which has the same effect.) Here the motor
-is a velocity servo on a large reflected inertia, deadbeat in one physics step. The floor passes
-mu m g r / 2 = 0.016 N m to each wheel. Over 16 ms this changes the wheel's speed by 0.2 % of its
-limit, and the next step undoes it. A motor with only the wheel's inertia (1e-6 kg m^2) does not
-work: with a stable gain it lags by milliseconds that depend on the time step.
+is a velocity servo on a large reflected inertia, deadbeat in one physics step. The floor passes a
+torque of mu m g r / 2 = 0.016 N m to each wheel. Over 16 ms it changes the wheel's speed by 0.2 %
+of its limit, and the next step undoes the change. A motor with only the wheel's inertia (1e-6 kg
+m^2) does not work: with a stable gain it lags by several milliseconds, and the lag depends on the
+time step.
 
 The grip of wheels on the floor is a contact. Within one physics step it removes half the
 penetration and, as far as friction allows, all slip. MuJoCo's default contact takes 10 to 30 ms for
@@ -29,8 +30,8 @@ ROTOR_INERTIA = 0.02  # kg m^2, reflected through the gear; chosen as explained 
 SKID_RADIUS = 0.005  # m; half the height of the box under the Webots e-puck
 _QPOS = 9  # x, y, z, quaternion (w, x, y, z), left wheel, right wheel
 REST_DEPTH = 1e-5  # m; depth of the wheels in the floor at rest; at 16 ms it is 9e-6
-_PENETRATION = 0.5  # share that one physics step removes
-_IMPEDANCE = 0.999  # of the grip; it leaves a thousandth of gravity's acceleration
+_PENETRATION = 0.5  # share of the penetration that one physics step removes
+_IMPEDANCE = 0.999  # impedance of the grip; it leaves a thousandth of gravity's acceleration
 # m; y of a wheel's frame. The tyre is 5 mm wide, so its geom lies off this frame. MuJoCo would
 # treat a geom compiled at the origin of its body's frame as fixed there, whatever `geom_pos` is.
 _INNER_EDGE = epuck.AXLE_Y - 0.0025
@@ -62,7 +63,7 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
 
 
 def _set_inertia(body: mujoco.MjsBody, robot: RobotConfig) -> None:
-    """Gives the body the robot's mass and inertia, less those of its wheels."""
+    """Gives the body the mass and inertia of the robot without its wheels."""
     wheel = epuck.WHEEL_MASS
     yaw = robot.yaw_inertia - 2.0 * (wheel * epuck.AXLE_Y**2 + epuck.WHEEL_INERTIA[0])
     body.explicitinertial = True
@@ -81,8 +82,9 @@ def _add_wheel(
 ) -> None:
     """Adds a wheel, its motor, and its grip on the floor; `side` is 1 for left and -1 for right.
 
-    The wheel's geom is a sphere, centred on the axle above the tyre's contact point. It rolls like
-    a wheel of the same radius. The distance between the contact points of both wheels is constant.
+    The wheel's geom is a sphere, centred on the axle above the tyre's contact point. The sphere
+    rolls like a wheel of the same radius. The distance between the contact points of both wheels is
+    constant.
     """
     wheel = body.add_body(name=name, pos=[0.0, side * _INNER_EDGE, robot.wheel_radius])
     wheel.explicitinertial = True
@@ -133,7 +135,7 @@ def encoders(qpos: Array, xp: Any) -> Array:
     """Returns the angles that the wheels' encoders report.
 
     Args:
-      qpos: [..., R * 9] of wheeled robots.
+      qpos: [..., R * 9] joint positions of wheeled robots.
       xp: `numpy` or `jax.numpy`.
 
     Returns:

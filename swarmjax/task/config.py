@@ -155,7 +155,7 @@ def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, 
 
     Args:
       realism: settings, already checked against their own bounds.
-      robot: the robot that they apply to.
+      robot: the robot that the settings apply to.
       task: provides the control step.
       steps: control steps of an episode.
 

@@ -88,8 +88,8 @@ class Sight(NamedTuple):
     Attributes:
       ray: [..., R, K] m, 0 to `Electronics.reach`.
       reflectance: [..., R, K] reflectance of the surface that each ray hits; None for 1.
-      distance: [..., R] to the target, m.
-      bearing: [..., R] of the target, rad.
+      distance: [..., R] distance to the target, m.
+      bearing: [..., R] bearing of the target, rad.
       own: [..., R, E] observations of an extension; None without any.
       heard: neighbours within reach; None without neighbour messages.
     """
@@ -142,9 +142,10 @@ def load(
     Args:
       task: the task.
       realism: the factors.
-      encoding: encoding that the policy was trained with; None for the task's.
+      encoding: encoding that the policy was trained with; None for the encoding of the task.
       own: observations of an extension.
-      neighbours: neighbour settings that the policy was trained with; None for the task's.
+      neighbours: neighbour settings that the policy was trained with; None for the settings of the
+        task.
 
     Returns:
       The electronics.
@@ -189,8 +190,8 @@ def begin(
     Delayed observations are filled with the first one.
 
     Args:
-      electronics: of the program.
-      factors: of the episode.
+      electronics: electronics of the program.
+      factors: factors of the episode.
       sight: exact sensor quantities at the start.
       clock: [...] or [] zero.
       xp: `numpy` or `jax.numpy`.
@@ -225,9 +226,9 @@ def drive(
     """Turns commands into wheel speeds.
 
     Args:
-      electronics: of the program.
+      electronics: electronics of the program.
       memory: before the control step.
-      factors: of the episode.
+      factors: factors of the episode.
       command: [..., R, 2] forward speed (m/s) and turn rate (rad/s).
       motors: the drive with the nominal values that the firmware uses.
       clock: [...] or [] control steps since the start.
@@ -265,9 +266,9 @@ def sense(
     """Samples the sensors and returns the observation that reaches the policy now.
 
     Args:
-      electronics: of the program.
+      electronics: electronics of the program.
       memory: before the control step.
-      factors: of the episode.
+      factors: factors of the episode.
       sight: exact sensor quantities.
       clock: [...] or [] control steps since the start, including the current one.
       xp: `numpy` or `jax.numpy`.

@@ -84,7 +84,7 @@ class EnvState:
     """State of one arena, or of many with a leading axis.
 
     Attributes:
-      sim: `PhysicsState` before and after a rollout; the physics' own data within it.
+      sim: a `PhysicsState` before and after a rollout; during a rollout, the engine's own data.
       level: the level that the episode started from.
       factors: realism factors of the episode, drawn from the level's seed.
       memory: state of the robots' electronics.
@@ -93,7 +93,7 @@ class EnvState:
       clock: [] control steps since the start, int32.
       arrived: [R] whether the robot has arrived; with `task.arrival=hold`, whether it is within
         its target now.
-      distance: [R] to the target, m.
+      distance: [R] distance to the target, m.
       apart: [R, 3] time since the last contact of each kind, s.
       episode: sums since the start.
       path: the shortest paths to the targets; None if the reward does not use them.
@@ -215,7 +215,7 @@ def reset(world: World, level: Level) -> EnvState:
       level: the level to start from.
 
     Returns:
-      The state, with `sim` packed.
+      The state, with `sim` as a `PhysicsState`.
     """
     robots, obstacles = level.present.shape[0], level.obstacle_present.shape[0]
     factors = task_factors.draw(level.seed, world.realism, world.robot, robots, obstacles, jnp)
@@ -278,8 +278,8 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
       world: the compiled environment.
       state: the arena, with `sim` as the physics' own data. Fields of a subclass of `EnvState`
         pass through unchanged.
-      action: [R, U] command, clipped to -1..1, which spans its range. Broadcast numbers start at
-        the third entry.
+      action: [R, U] command, clipped to -1..1; -1 and 1 are the ends of its range. Broadcast
+        numbers start at the third entry.
 
     Returns:
       The new state, and the outcome of the step.
@@ -411,7 +411,8 @@ def _look(world: World, pose: Array, level: Level, factors: Factors, said: Array
         ray, bright = infrared.distances(*arena, jnp, mount), None
     else:
         ray, bright = infrared.sights(*arena, shades, mount, jnp)
-    # Several consumers read these. Without the barrier, XLA recomputes the rays for each on a GPU.
+    # Several consumers read these. Without the barrier, XLA recomputes the rays for each consumer
+    # on a GPU.
     ray, bright = jax.lax.optimization_barrier((ray, bright))
     return _hear(world, Sight(ray, bright, distance, bearing), pose, level, said)
 

@@ -11,8 +11,8 @@ class Episode(NamedTuple):
     Attributes:
       reward: [R] sum of rewards.
       contacts: [R, 3] contacts of each kind.
-      sensed: [R] contacts with an infrared ray shorter than its range (the paper's collision
-        rule).
+      sensed: [R] control steps in which a ray was shorter than the infrared range (the paper's rule
+        for collisions).
       moving: [R] control steps that began before arrival; with `task.arrival=hold`, those that
         began outside the target.
     """
@@ -31,7 +31,7 @@ class Robots(NamedTuple):
       reached: whether it had arrived at the end.
       reward: undiscounted sum over the episode.
       robot_steps: control steps before arrival.
-      sensed: contacts with an infrared ray shorter than its range.
+      sensed: control steps in which a ray was shorter than the infrared range.
       contacts: contacts of all kinds.
     """
 
@@ -48,14 +48,14 @@ class Ended(NamedTuple):
 
     Attributes:
       episodes: 1 where an episode ended.
-      stage: stage that the episode began on.
-      cohort: cohort that the episode began in; -1 where none ended.
+      stage: stage on which the episode began.
+      cohort: cohort in which the episode began; -1 where no episode ended.
       targets: robots present.
       reached: robots that had arrived at the end.
       all_reached: 1 where every robot had arrived.
       steps: control steps.
       robot_steps: control steps before arrival, summed over robots.
-      sensed: contacts with an infrared ray shorter than its range.
+      sensed: control steps in which a ray was shorter than the infrared range.
       contacts: [.., 3] contacts of each kind, summed over robots.
       reward: undiscounted, summed over robots.
       broken: 1 where the episode ended because the physics was no longer finite.

@@ -28,7 +28,7 @@ def look(own: Sequence[Observation], view: View) -> Array:
 
     Args:
       own: the observations.
-      view: of the arena.
+      view: view of the arena.
 
     Returns:
       [R, E] in their own units, concatenated in order.
@@ -42,7 +42,7 @@ def draw(uniforms: Any, stage: Stage, spacing: Spacing, drawings: Sequence[Level
     """Draws a level of a stage with JAX, using the stage's extension drawing if it has one.
 
     Args:
-      uniforms: as `level.sample` takes them.
+      uniforms: uniform numbers, as `level.sample` takes them.
       stage: fields [].
       spacing: sizes.
       drawings: extension drawings, in the order that `stage.drawing` counts.
@@ -70,7 +70,7 @@ def check_levels(
       drawings: extension drawings.
       stages: [S], as NumPy arrays.
       spacing: sizes.
-      names: [S] of the stages.
+      names: [S] names of the stages.
 
     Raises:
       ConfigError: a drawn level is invalid; the message names the piece, the stage and the fault.
@@ -218,7 +218,7 @@ def trace(piece: Piece, *arguments: Any) -> Any:
 
 
 def label(piece: Piece) -> str:
-    """Returns the name of a piece, after the file that defines it."""
+    """Returns the file that defines a piece, followed by the kind and the name of the piece."""
     code = getattr(piece.function, "__code__", None)
     file = f"{code.co_filename}: " if code is not None else ""
     return f"{file}{piece.kind} {piece.name}"

@@ -15,7 +15,7 @@ from swarmjax.sim.realism_config import RealismConfig
 
 Array = Any
 
-# Settings that draw random numbers at every control step. They need the seed as well.
+# Settings that draw random numbers at every control step. These settings need the seed as well.
 _PER_STEP = (
     "speed_noise",
     "stall",
@@ -28,16 +28,16 @@ _PER_STEP = (
 
 
 class Factors(NamedTuple):
-    """The factors of an episode; None where one is off.
+    """The factors of an episode; a factor that is off is None.
 
     Attributes:
       seed: [...] uint32 seed of everything drawn at each control step; None without randomness.
-      wheel_radius: [..., R, 2] of the left and the right wheel, m.
-      track: [..., R] effective, m.
+      wheel_radius: [..., R, 2] radius of the left and the right wheel, m.
+      track: [..., R] effective track, m.
       max_wheel_speed: [..., R] rad/s.
       mass: [..., R] kg.
-      friction: [..., R] between wheels and floor.
-      hull_friction: [...] between hulls and everything that they touch.
+      friction: [..., R] friction between wheels and floor.
+      hull_friction: [...] friction between hulls and everything that they touch.
       infrared_noise: [..., R, K] factor on the noise of the response.
       infrared_gain: [..., R, K] factor on the reflected part of the response.
       infrared_offset: [..., R, K] counts.
@@ -45,7 +45,7 @@ class Factors(NamedTuple):
       infrared_position: [..., R, K, 2] m, in the robot's frame.
       infrared_period: [..., R] s between samples.
       dead: [..., R, K] whether the sensor never detects anything.
-      reflectance_wall: [...] of all walls.
+      reflectance_wall: [...] reflectance of all walls.
       reflectance_obstacle: [..., M].
       reflectance_robot: [..., R].
       action_latency: [..., R] control steps, int32.
@@ -190,7 +190,7 @@ def _is_random(found: Factors, realism: RealismConfig) -> bool:
 
 
 def largest(robot: RobotConfig, realism: RealismConfig) -> RobotConfig:
-    """Returns the robot with the largest values of any episode, which the model is compiled for.
+    """Returns the robot to compile the model for, with the largest values of any episode.
 
     Args:
       robot: the nominal robot.

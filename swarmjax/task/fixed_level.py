@@ -1,8 +1,9 @@
 """The paper's fixed level: the same starts, targets and obstacles at every reset.
 
-The paper gives no coordinates. Those here come from the published example that its task is based
-on: find_and_avoid of deepworlds. It has a 0.7 m arena, and one robot that drives from
-(-0.26, 0.27), facing +x, to (0.26, -0.23). A fence of 0.50 x 0.06 m is centred on (-0.10, 0.16).
+The paper gives no coordinates. The coordinates here come from the published example that the
+paper's task is based on: find_and_avoid of deepworlds. The example has a 0.7 m arena, and one robot
+that drives from (-0.26, 0.27), facing +x, to (0.26, -0.23). A fence of 0.50 x 0.06 m is centred on
+(-0.10, 0.16).
 
 The coordinates are scaled with the arena. The swarm starts in a row. Its targets are clustered
 0.1 m apart on the far side.
@@ -15,15 +16,15 @@ import numpy as np
 Array = Any
 
 EXAMPLE_SIDE = 0.7  # m; deepworlds find_and_avoid
-START = (-0.26, 0.27)  # m, in the example's arena
-TARGET = (0.26, -0.23)  # m, in the example's arena
-FENCE = (-0.10, 0.16)  # m, centre, in the example's arena
+START = (-0.26, 0.27)  # m, position in the example's arena
+TARGET = (0.26, -0.23)  # m, position in the example's arena
+FENCE = (-0.10, 0.16)  # m, position of the centre in the example's arena
 FENCE_HALF_LENGTH = 0.25 / EXAMPLE_SIDE  # share of the arena's side
 FENCE_HALF_WIDTH = 0.03  # m; not scaled, since a real wall keeps its thickness
 BOX_HALF = 0.05  # m; the 0.1 m boxes of the stock e-puck world
 SPACING = 0.1  # m; between starts, and between targets: wider than a robot
-# Centres of the boxes in the example's arena, in order of use. They lie between starts and targets,
-# at least 0.10 m clear of each other in arenas of 1 m and more. This project chose them.
+# Centres of the boxes in the example's arena, in order of use. The boxes lie between starts and
+# targets, at least 0.10 m clear of each other in arenas of 1 m and more. This project chose them.
 BOXES = ((0.0, 0.02), (-0.17, -0.12), (0.17, 0.1), (0.02, -0.2))
 
 
@@ -38,7 +39,7 @@ def starts(robots: int, side: Array, xp: Any) -> Array:
 
     Args:
       robots: R.
-      side: [] of the arena, m.
+      side: [] side of the arena, m.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
@@ -55,7 +56,7 @@ def targets(robots: int, side: Array, xp: Any) -> Array:
 
     Args:
       robots: R.
-      side: [] of the arena, m.
+      side: [] side of the arena, m.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
@@ -73,7 +74,7 @@ def obstacles(count: int, side: Array, fenced: Array, xp: Any) -> Array:
 
     Args:
       count: M.
-      side: [] of the arena, m.
+      side: [] side of the arena, m.
       fenced: [] whether the obstacles are the fence.
       xp: `numpy` or `jax.numpy`.
 

@@ -8,9 +8,9 @@ path (Wijmans et al. 2020, "DD-PPO", section 4).
 
 Other robots are ignored. Obstacles are widened by a little less than a robot's radius, with square
 corners, so a robot that touches an obstacle is still outside. Path lengths are therefore between a
-millimetre too short and three centimetres too long. A gap of 59 to 74 mm counts as passable, but
-no robot fits through. Neither matters to the reward: it needs the right way around the obstacles,
-and a length that shrinks along that way.
+millimetre too short and three centimetres too long. A gap of 59 to 74 mm counts as passable, but no
+robot fits through. Neither error matters to the reward, which needs the right way around the
+obstacles, and a length that shrinks along that way.
 """
 
 from collections.abc import Callable
@@ -23,8 +23,8 @@ from jax import Array
 from swarmjax.task.level import PARKING, Level
 from swarmjax.task.surroundings import into_frame
 
-# Shares of the hull's radius by which obstacles are widened, and by which corners are set off.
-# Contacts are soft, so a robot pushed against a wall can come closer to it than its radius.
+# Shares of the hull's radius: obstacles are widened by the first, and corners are set off by the
+# second. Contacts are soft, so a robot pushed against a wall can come closer to it than its radius.
 _WIDENED = 0.8
 _CORNER = 0.9
 _SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
@@ -35,7 +35,7 @@ class Roadmap(NamedTuple):
 
     Attributes:
       corner: [K, 2] x and y of the corners of the widened obstacles, m.
-      to_go: [R, K] from each corner to each robot's target, m; inf without a path.
+      to_go: [R, K] distance from each corner to each robot's target, m; inf without a path.
     """
 
     corner: Array
@@ -46,8 +46,8 @@ class Path(NamedTuple):
     """Path state of an arena.
 
     Attributes:
-      roadmap: of the episode.
-      distance: [R] along the shortest path to the target, m.
+      roadmap: roadmap of the episode.
+      distance: [R] distance along the shortest path to the target, m.
     """
 
     roadmap: Roadmap
@@ -59,7 +59,7 @@ def begin(level: Level, hull_radius: float, fast: Any = None) -> Path:
 
     Args:
       level: the level that the episode starts from.
-      hull_radius: of robots, m.
+      hull_radius: radius of the robots, m.
       fast: path finder in Warp, `swarmjax.sim.fast.paths_warp`; None for plain JAX.
 
     Returns:
@@ -76,11 +76,11 @@ def go_on(path: Path, place: Array, level: Level, hull_radius: float, fast: Any 
     """Measures the paths from the robots' current places.
 
     Args:
-      path: of the previous control step.
+      path: path state of the previous control step.
       place: [R, 2] current places of the robots, m.
-      level: of the episode.
-      hull_radius: of robots, m.
-      fast: as for `begin`.
+      level: level of the episode.
+      hull_radius: radius of the robots, m.
+      fast: path finder, as for `begin`.
 
     Returns:
       The new paths. A robot without a path keeps its previous distance.
@@ -102,8 +102,8 @@ def survey(level: Level, hull_radius: float, fast: Any = None) -> Roadmap:
 
     Args:
       level: obstacles and targets.
-      hull_radius: of robots, m.
-      fast: as for `begin`.
+      hull_radius: radius of the robots, m.
+      fast: path finder, as for `begin`.
 
     Returns:
       The corners, four per obstacle, with the distances from them to the targets.
@@ -139,11 +139,11 @@ def measure(
     """Measures the shortest paths from places [R, 2] to the robots' targets.
 
     Args:
-      roadmap: of the level.
+      roadmap: roadmap of the level.
       place: [R, 2] x and y, m.
-      level: of the episode.
-      hull_radius: of robots, m.
-      fast: as for `begin`.
+      level: level of the episode.
+      hull_radius: radius of the robots, m.
+      fast: path finder, as for `begin`.
 
     Returns:
       [R] m; inf without a path.
@@ -187,7 +187,7 @@ def _locate(place: Array, level: Level) -> _Places:
     """Turns places [P, 2] into coordinates in the frames of the obstacles."""
     local = into_frame(level.obstacle[:, None, :3], place)
     # Each pair of places uses these coordinates. Without the barrier, XLA inlines their computation
-    # into the code of every pair, which takes minutes to compile on a GPU.
+    # into the code of every pair, and compiling takes minutes on a GPU.
     return _Places(place, *jax.lax.optimization_barrier(local))
 
 

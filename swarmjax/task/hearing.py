@@ -24,8 +24,8 @@ class Heard(NamedTuple):
     """Neighbours within reach.
 
     Attributes:
-      distance: [..., R, R] from receiver (first axis) to sender, m; inf without reception.
-      bearing: [..., R, R] of the sender, from the receiver's x axis, rad.
+      distance: [..., R, R] distance from receiver (first axis) to sender, m; inf without reception.
+      bearing: [..., R, R] bearing of the sender, from the receiver's x axis, rad.
       message: [..., R, M] numbers that each robot broadcast in the last control step, -1..1.
     """
 
@@ -104,7 +104,7 @@ def listen(
     clock: Array,
     xp: Any,
 ) -> Array:
-    """Lists the nearest neighbours of each robot, among those with a packet that arrives.
+    """Lists the nearest neighbours of each robot, counting only those whose packets arrive.
 
     Args:
       heard: the neighbours within reach.
@@ -174,7 +174,7 @@ def broadcast(action: Array, size: int, active: Array, xp: Any) -> Array:
     Args:
       action: [..., R, 2 + M], or only the first two entries for a robot that broadcasts nothing.
       size: M.
-      active: [..., R] whether the robot may act; others broadcast 0.
+      active: [..., R] whether the robot may act; a robot that may not act broadcasts 0.
       xp: `numpy` or `jax.numpy`.
 
     Returns:

@@ -44,7 +44,7 @@ class Level(NamedTuple):
     """Starting conditions of an episode.
 
     Attributes:
-      side: [] of the arena, m.
+      side: [] side of the arena, m.
       present: [R] whether the robot is present.
       start: [R, 3] x (m), y (m), yaw (rad).
       target: [R, 2] x (m), y (m).
@@ -192,7 +192,7 @@ def _random(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
 
 
 def _seed(drawn: _Uniforms, xp: Any) -> Array:
-    """Makes 32 random bits from two uniform numbers; a float32 surely holds only 16."""
+    """Makes 32 random bits from two uniform numbers; one float32 is sure to hold only 16."""
     high, low = (drawn.seed * np.float32(2**16)).astype(xp.uint32)
     return (high << 16) | low
 
@@ -246,7 +246,7 @@ def _place_starts(
     side: Array,
     xp: Any,
 ) -> Array:
-    """Places starts clear of obstacles, targets and robots parked there; returns [R, 2] units."""
+    """Places starts clear of obstacles, targets and robots parked at targets; [R, 2] units."""
     hull, reach = spacing.hull_radius, spacing.target_radius
     beside = clearance(hull) + around.radius
     _, from_target, apart = gaps_of(hull, reach)
@@ -359,7 +359,7 @@ def _place_among(
     paired: Array,
     xp: Any,
 ) -> Array:
-    """Places starts or targets without a fixed place, clear of fixed ones; returns [R, 2] units."""
+    """Places starts or targets that have no fixed place, clear of fixed ones; [R, 2] units."""
     score = xp.minimum(score, score_things(points, fixed, paired, gap, xp))
     placed, _ = place(points, score, picks, present & ~paired, gap, xp)
     return xp.where(paired[:, None], fixed, placed)
@@ -376,7 +376,7 @@ def park(level: Level, xp: Any) -> Level:
     """Moves absent robots and obstacles outside, each to its own parking place.
 
     Args:
-      level: of one arena; the places of absent robots and obstacles are ignored.
+      level: level of one arena; the places of absent robots and obstacles are ignored.
       xp: `numpy` or `jax.numpy`.
 
     Returns:

@@ -24,7 +24,7 @@ Array = Any
 Cell = tuple[int, int]  # row and column of the text, from 0
 
 WALL, FLOOR, START, TARGET = "#.ST"
-MOST_CELLS = 48  # limit for the cells of a row, and for rows
+MOST_CELLS = 48  # largest number of cells in a row, and of rows
 # Points that starts and targets may be placed on: their least distance (m), and their largest
 # number. An area with more cells than that gets one point per cell.
 _APART, _MOST_POINTS = 0.03, 1024
@@ -34,7 +34,7 @@ class Map(NamedTuple):
     """A map, in metres around the middle of the arena.
 
     Attributes:
-      side: of the square arena that holds the map, m.
+      side: side of the square arena that holds the map, m.
       wall: [W, 5] x (m), y (m), yaw (0 rad), half edges (m) of rectangles.
       start: [C, 2] possible starts, m.
       target: [D, 2] possible targets, m.
@@ -53,12 +53,12 @@ class MapArrays(NamedTuple):
 
     Attributes:
       mapped: whether the stage has a map, bool.
-      wall: [W, 5] as in `Map`, float32.
-      start: [C, 2] in units, int32.
-      start_open: [C] whether it is a point of this stage, bool.
-      target: [D, 2] in units, int32.
-      target_open: [D] whether it is a point of this stage, bool.
-      pair: [P, 2, 2] in units, int32.
+      wall: [W, 5] walls, as in `Map`, float32.
+      start: [C, 2] starts in units, int32.
+      start_open: [C] whether the start is a point of this stage, bool.
+      target: [D, 2] targets in units, int32.
+      target_open: [D] whether the target is a point of this stage, bool.
+      pair: [P, 2, 2] pairs in units, int32.
       pairs: number of pairs that the stage has, int32.
     """
 
@@ -258,7 +258,7 @@ def stack(maps: Sequence[Map | None]) -> MapArrays | None:
     """Stacks the maps of stages into NumPy arrays.
 
     Args:
-      maps: of the stages; None where one has no map.
+      maps: maps of the stages; None for a stage without a map.
 
     Returns:
       The arrays [S, ...]; None if no stage has a map.

@@ -24,7 +24,7 @@ def layout_count(stages: Sequence[StageConfig], robots: int) -> int:
     """Returns the largest count of layout numbers among stages.
 
     Args:
-      stages: of a run.
+      stages: stages of a run.
       robots: largest number of robots, R.
     """
     kinds = [stage.kind for stage in stages if stage.kind is not None]
@@ -40,7 +40,7 @@ def movable(stages: Sequence[StageConfig], spacing: Spacing) -> np.ndarray:
     """Marks the numbers that place or size walls, boxes, starts and targets.
 
     Args:
-      stages: of a run.
+      stages: stages of a run.
       spacing: sizes.
 
     Returns:
@@ -92,7 +92,8 @@ def _places(stage: StageConfig, spacing: Spacing) -> np.ndarray:
 def _of_layout(stage: StageConfig, robots: int) -> list[int]:
     """Lists which numbers of a layout may change."""
     layout = LAYOUTS[stage.level]
-    # The two extents come first. Numbers with equal ends do not vary, so a mutation skips them.
+    # The two extents come first. Numbers with equal lower and upper limits do not vary, so a
+    # mutation skips them.
     lengths = ("side", "breadth", *NUMBERS)
     found = [i for i, key in enumerate(lengths) if isinstance(getattr(stage, key), tuple)]
     at = drawing.before_own(robots)

@@ -26,8 +26,8 @@ class Readings(NamedTuple):
 
     Attributes:
       infrared: [..., K] m or counts, depending on the encoding.
-      distance: [...] to the target, m.
-      bearing: [...] of the target, rad.
+      distance: [...] distance to the target, m.
+      bearing: [...] bearing of the target, rad.
       own: [..., E] observations of an extension; None without any.
       heard: [..., K W] nearest neighbours; None without neighbour messages.
     """
@@ -87,10 +87,10 @@ class Layout(NamedTuple):
     """Description of an observation's entries: each is (quantity - offset) / scale.
 
     Attributes:
-      names: [O] of the entries.
-      units: [O] of the quantities.
-      offset: [O] in these units.
-      scale: [O] in these units.
+      names: [O] names of the entries.
+      units: [O] units of the quantities.
+      offset: [O] offset of the quantities, in these units.
+      scale: [O] scale of the quantities, in these units.
     """
 
     names: tuple[str, ...]
@@ -145,8 +145,8 @@ def stacked_names(names: Sequence[str], history: int) -> tuple[str, ...]:
       history: number of observations, k.
 
     Returns:
-      [k O] names: first unchanged for the current observation, then for those 1, 2, ... control
-      steps ago, as in `target_distance[-1]`.
+      [k O] names: unchanged for the current observation, then with a suffix for observations 1, 2,
+      ... control steps ago, as in `target_distance[-1]`.
     """
     marks = ["", *(f"[-{age}]" for age in range(1, history))]
     return tuple(f"{name}{mark}" for mark in marks for name in names)
@@ -185,8 +185,8 @@ def describe(
       neighbours: neighbour settings; None without neighbour messages.
 
     Returns:
-      `names`, `encoding`, and the layout's `units`, `offset` and `scale`. With neighbour messages
-      also `neighbours`: `count`, `range` (m) and `message_size`.
+      `names`, `encoding`, and the layout's `units`, `offset` and `scale`. With neighbour messages,
+      the data also holds `neighbours`: `count`, `range` (m) and `message_size`.
     """
     found = {key: list(value) for key, value in layout(encoding, own, neighbours)._asdict().items()}
     heard = {} if not neighbours or not neighbours.count else {"neighbours": to_dict(neighbours)}
@@ -237,13 +237,13 @@ class View(NamedTuple):
     Attributes:
       pose: [R, 3] x (m), y (m), yaw (rad).
       target: [R, 2] x (m), y (m).
-      distance: [R] to the own target, m.
-      bearing: [R] of the own target, rad.
+      distance: [R] distance to the own target, m.
+      bearing: [R] bearing of the own target, rad.
       infrared: [R, K] length of each ray, m.
       present: [R] whether the robot is present, bool.
       arrived: [R] whether the robot has arrived, bool; with `task.arrival=hold`, whether it is
         within its target now.
-      side: [] of the arena, m.
+      side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
       obstacle_present: [M] bool.
       clock: [] control steps since the start, int32.

@@ -16,7 +16,7 @@ class Chosen(NamedTuple):
     """The pieces that a task uses.
 
     Attributes:
-      observations: in order, placed after the built-in inputs.
+      observations: observations in order, placed after the built-in inputs.
       terms: reward terms with non-zero weights.
       drawings: level drawings.
     """
@@ -31,8 +31,8 @@ def choose(extensions: Extensions, task: TaskConfig, stages: Sequence[StageConfi
 
     Args:
       extensions: the available pieces.
-      task: names observations and weights. By default, all observations are used, and each term
-        has its own default weight.
+      task: the task, which names observations and weights. By default, all observations are used,
+        and each term has its own default weight.
       stages: name level drawings.
 
     Returns:
@@ -49,7 +49,7 @@ def choose(extensions: Extensions, task: TaskConfig, stages: Sequence[StageConfi
     for name in task.reward.extra:
         _check_named("task.reward.extra", name, terms)
     weighted = [(each, task.reward.extra.get(name, each.weight)) for name, each in terms.items()]
-    stack(stages, extensions.levels)  # raises if one is missing
+    stack(stages, extensions.levels)  # raises if a level drawing is missing
     return Chosen(
         observations=tuple(observations[name] for name in wanted),
         terms=tuple((piece, weight) for piece, weight in weighted if weight),

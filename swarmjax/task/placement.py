@@ -1,8 +1,8 @@
 """Places objects one after the other on the points of a lattice, in integers.
 
 With integer arithmetic, NumPy and JAX choose the same point from the same uniform number. The unit
-is 1/4096 m. It is a power of two, so it converts to metres exactly. It is large enough that
-squared distances within the largest arena fit an int32.
+is 1/4096 m. This is a power of two, so lengths convert to metres exactly. The unit is large enough
+that squared distances within the largest arena fit an int32.
 """
 
 import math
@@ -17,16 +17,16 @@ UNITS = 4096  # per metre; (4 m * sqrt(2) * 4096)**2 = 5.4e8 < 2**30
 LATTICE = 24  # points along a side
 MARGIN = 0.02  # m; least free space around anything at the start
 TARGET_SPACING = 0.25  # m; least distance between targets where the arena has room
-_UNROLLED = 5  # objects placed without a loop; XLA takes a second to compile twenty
-_FORBIDDEN = -(2**30)  # a score at or below half of this violates a hard distance
+_UNROLLED = 5  # number of objects placed without a loop; XLA takes a second to compile twenty
+_FORBIDDEN = -(2**30)  # at or below half of this, a hard distance is violated
 
 
 class Gap(NamedTuple):
     """Least distance between two centres, in units.
 
     Attributes:
-      hard: kept always, if any point is that far away.
-      soft: kept where the arena has room.
+      hard: distance that is always kept, if any point is that far away.
+      soft: distance that is kept where the arena has room.
     """
 
     hard: Array
@@ -55,7 +55,8 @@ def gaps_of(hull: float, reach: float) -> Gaps:
     through = max(TARGET_SPACING, 2.0 * reach + 4.0 * hull)
     return Gaps(
         target=Gap(round_up(2.0 * hull + 2.0 * MARGIN), round_up(through)),
-        # Hard: no robot starts within its arrival zone. Soft: none starts where one may park.
+        # Hard: no robot starts within its arrival zone. Soft: no robot starts where another may
+        # park.
         from_target=Gap(round_up(reach + MARGIN), round_up(reach + 2.0 * hull + MARGIN)),
         start=Gap(round_up(2.0 * hull + MARGIN), round_up(2.0 * hull + 2.0 * MARGIN)),
     )
@@ -85,8 +86,8 @@ def lattice(shift: Array, side: Array, xp: Any) -> Array:
     """Returns points that cover a square around the origin, shifted by a part of their spacing.
 
     Args:
-      shift: [2] in [0, 1), as a share of the spacing.
-      side: [] of the square, units.
+      shift: [2] shift in [0, 1), as a share of the spacing.
+      side: [] side of the square, units.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
@@ -105,7 +106,7 @@ def score_walls(points: Array, side: Array, gap: Array, xp: Any) -> Array:
 
     Args:
       points: [P, 2] units.
-      side: [] of the arena, units.
+      side: [] side of the arena, units.
       gap: [] least distance to a wall, units.
       xp: `numpy` or `jax.numpy`.
 
@@ -121,14 +122,14 @@ def score_things(points: Array, centres: Array, there: Array, gap: Gap, xp: Any)
 
     Args:
       points: [P, 2] units.
-      centres: [N, 2] of the objects, units.
+      centres: [N, 2] centres of the objects, units.
       there: [N] whether the object is present.
       gap: distances to keep.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [P] 0 where all soft distances are kept, below 0 where one is violated, and very low where a
-      hard one is violated. Worse violations score lower.
+      [P] 0 where all soft distances are kept, below 0 where a soft distance is violated, and very
+      low where a hard distance is violated. Worse violations score lower.
     """
     apart = points[:, None, :] - centres[None, :, :]
     square = xp.sum(apart * apart, axis=-1)
@@ -199,7 +200,7 @@ def place(
 
 
 def _fold(step: Callable, state: Array, rows: tuple[Array, Array], xp: Any) -> tuple[Array, Array]:
-    """Calls `step` for each row, passing its state on, and stacks its results."""
+    """Calls `step` for each row, passes its state on to the next call, and stacks the results."""
     if xp is not np:
         from jax import lax  # evaluations draw levels without JAX
 

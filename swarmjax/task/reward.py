@@ -22,23 +22,23 @@ class Step(NamedTuple):
     """One control step of a swarm, the input of reward terms.
 
     Attributes:
-      distance_before: [R] to the target, m.
-      distance: [R] to the target after the step, m.
+      distance_before: [R] distance to the target, m.
+      distance: [R] distance to the target after the step, m.
       infrared: [R, K] ray lengths after the step, m.
       sensor_range: m.
       arrives: [R] whether the robot arrived in this step; with `task.arrival=hold`, whether all
         robots are within their targets, which ends the episode.
       contact_begins: [R, 3] whether a contact of each kind began in this step.
-      outside: [R] whether the robot had not arrived when the step began; None if that holds for all
-        robots with a reward, as with `task.arrival=latch`.
+      outside: [R] whether the robot had not arrived when the step began; None if this holds for all
+        robots that get a reward, as with `task.arrival=latch`.
       touching: [R, 3] whether the robot touches something of each kind after the step.
-      path_before: [R] along the shortest path to the target, m; None without a path weight, and in
-        an extension.
-      path: [R] after the step, m.
+      path_before: [R] distance along the shortest path to the target, m; None without a path
+        weight, and in an extension.
+      path: [R] the same distance after the step, m.
       pose_before: [R, 3] x (m), y (m), yaw (rad). This field and those below are for extensions
         only. For extensions, `outside` is set under both arrival rules.
-      pose: [R, 3] after the step.
-      action: [R, 2] clipped to -1..1, which spans the commands.
+      pose: [R, 3] the pose after the step.
+      action: [R, 2] action, clipped to -1..1; -1 and 1 are the ends of each command's range.
       present: [R] whether the robot is present, bool.
       clock: [] control steps since the start, including this one, int32.
     """
@@ -61,12 +61,12 @@ class Step(NamedTuple):
 
 
 def progress(step: Step) -> Array:
-    """Returns metres nearer to the target: previous minus current distance (equation 3)."""
+    """Returns by how many metres the robot came nearer to its target (equation 3)."""
     return step.distance_before - step.distance
 
 
 def path_progress(step: Step) -> Array:
-    """Returns metres nearer to the target on the shortest path around walls and boxes."""
+    """Returns by how many metres the shortest path to the target became shorter."""
     return step.path_before - step.path
 
 
@@ -78,7 +78,10 @@ def proximity(step: Step) -> Array:
 
 
 def arrival(step: Step) -> Array:
-    """Returns 1 in the step in which the robot arrives; with hold, in which all have arrived."""
+    """Returns 1 in the step in which the robot arrives.
+
+    With `task.arrival=hold`, this is the step in which all robots have arrived.
+    """
     return step.arrives.astype(jnp.float32)
 
 

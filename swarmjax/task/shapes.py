@@ -1,7 +1,8 @@
-"""Obstacles of other shapes than the trained box, composed of boxes within its outer circle.
+"""Obstacles of other shapes than the trained box, composed of boxes within the box's outer circle.
 
-A level keeps distances from an obstacle's outer circle, so they hold for any shape inside it. The
-shapes consist of boxes because both engines and the analytic sensors support boxes. NumPy only.
+A level keeps distances from an obstacle's outer circle, so these distances hold for any shape
+inside the circle. The shapes consist of boxes because both engines and the analytic sensors support
+boxes. NumPy only.
 """
 
 import math
@@ -14,7 +15,7 @@ from swarmjax.task.level import Level
 # Shapes of a random level's obstacles in an evaluation; training uses boxes only.
 Shape = Literal["box", "bar", "cross", "ell", "pillar"]
 
-HALF_THICKNESS = 0.005  # m, of plates; our choice: a board that stands upright
+HALF_THICKNESS = 0.005  # m, for plates; our choice: a board that stands upright
 # Coordinates are rounded to binary fractions of a metre, which float32 holds exactly. A level is
 # then identical to the last bit even where sine and cosine round differently.
 _GRID = 2.0**20
@@ -57,7 +58,7 @@ def expand(level: Level, shape: Shape) -> Level:
     """Replaces the boxes of a random level with obstacles of another shape.
 
     Args:
-      level: of one arena, as drawn; NumPy.
+      level: level of one arena, as drawn; NumPy.
       shape: shape of the obstacles; `box` changes nothing.
 
     Returns:

@@ -24,16 +24,15 @@ class Stage(NamedTuple):
     Attributes:
       robots: number of robots, int32.
       obstacles: number of obstacles, int32.
-      side: of the arena, or the smallest side it may have, m.
+      side: side of the arena, or the smallest side that it may have, m.
       largest_side: largest side, m; if it exceeds `side`, each level draws its own.
       obstacle_size: edge of the boxes of a random level, m.
       fixed: whether the level is the paper's fixed one instead of a random one, bool.
       fence: whether a fixed level has the fence instead of boxes, bool.
-      drawing: 1 + index of the extension drawing of its levels, 0 for none, int32.
+      drawing: 1 + index of the extension drawing of the stage's levels, 0 for none, int32.
       map: the maps; None if no stage has one.
       layouts: numbers of the stages' layouts, by kind; None if no stage has one.
-      laid_out: whether the stage has a layout, if all stages do; None if any stage does not, and
-        its levels are random or fixed.
+      laid_out: true if all stages have a layout; None if any stage has none.
     """
 
     robots: Array
@@ -103,7 +102,7 @@ def largest_half(stages: Sequence[StageConfig]) -> float:
 
 def _check_fixed(stage: StageConfig) -> None:
     """Refuses a fixed level with more robots or obstacles than it has room for."""
-    side = stage.sides[0]  # a fixed level has one
+    side = stage.sides[0]  # a fixed level has a single side
     most = {"robots": fixed_level.most_robots(side), "obstacles": len(fixed_level.BOXES)}
     for key, limit in most.items():
         if stage.level == "fixed" and getattr(stage, key) > limit:

@@ -266,7 +266,7 @@ class StageConfig(Section):
 
     @property
     def laid_out(self) -> tuple[Kind, dict[str, Any]] | None:
-        """The layout and its numbers in units, as `drawing.stack` takes them; None without one."""
+        """The layout and its numbers in units, as `drawing.stack` takes them, or None."""
         if self.kind is None:
             return None
         ends = [_ends(getattr(self, key) or 0.0) for key in NUMBERS]
@@ -279,7 +279,7 @@ class StageConfig(Section):
 
     @property
     def drawn_map(self) -> maps.Map | None:
-        """The map; None without one."""
+        """The stage's map; None without one."""
         return _read_map(self.map, self.cell) if self.map else None
 
     @property
@@ -295,9 +295,9 @@ def smallest_side(stage: StageConfig) -> float:
     (obstacle_size * sqrt(2) + 0.10)^2 for each obstacle. This leaves more than a passage on either
     side of any single obstacle.
 
-    A random level places its obstacles one after the other. They may take at most the share
-    FILLING of the free square. Discs placed this way jam at 0.547 of the area (Feder 1980), which
-    is 0.70 of a square grid of discs. The walls reduce this further.
+    A random level places its obstacles one after the other. The obstacles may take at most the
+    share FILLING of the free square. Discs placed this way jam at 0.547 of the area (Feder 1980),
+    which is 0.70 of a square grid of discs. The walls reduce this further.
 
     Args:
       stage: the stage; its `side` is not read.
@@ -317,8 +317,8 @@ def make_room(sim: SimConfig, stages: Sequence[StageConfig]) -> SimConfig:
       stages: stages that must fit.
 
     Returns:
-      The settings with both numbers: at least 5 and 4, so that a curriculum's stages share a
-      program and its checkpoints.
+      The settings with both numbers. These are at least 5 and 4, so that the stages of a curriculum
+      share a program and its checkpoints.
     """
     robots = max([sim.robots, *(stage.robots for stage in stages)])
     obstacles = max([sim.obstacles, *(stage.obstacles for stage in stages)])

@@ -66,7 +66,7 @@ def load_levels[C: Section](
     Args:
       cls: the command's dataclass, with `stage` and `suite`.
       overrides: `key=value` words.
-      stage: plain data of the default stage; None for that of the command's file.
+      stage: plain data of the default stage; None for the stage of the command's file.
 
     Raises:
       ConfigError: a word is invalid, or a suite is given together with a key that it sets itself.
@@ -144,7 +144,7 @@ def _member(name: str) -> dict[str, Any]:
 
 
 def name_of(choice: str) -> str:
-    """Returns the name of a choice of the group `stage`: its own, or that of its file."""
+    """Returns the name of a choice of the group `stage`; the name of a path is that of its file."""
     return Path(choice).stem if files.is_path(choice) else choice
 
 

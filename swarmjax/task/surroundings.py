@@ -2,7 +2,8 @@
 
 The critic may see the full state, since only the actor is deployed (Pinto et al. 2017, "Asymmetric
 Actor Critic for Image-Based Robot Learning"). The nearest robots and walls are listed, nearest
-first. The list has the same length in every arena, so a critic can continue in another one.
+first. The list has the same length in every arena, so a critic can continue its training in another
+arena.
 """
 
 from typing import Any
@@ -33,7 +34,7 @@ def look(pose: Array, level: Level, arrived: Array) -> Array:
 
     Args:
       pose: [R, 3] x (m), y (m), yaw (rad).
-      level: of the episode.
+      level: level of the episode.
       arrived: [R] whether the robot has arrived.
 
     Returns:
@@ -49,7 +50,7 @@ def look(pose: Array, level: Level, arrived: Array) -> Array:
 
 
 def _shown(x: Array, y: Array) -> tuple[Array, Array]:
-    """Moves points farther away than `REACH` to that distance."""
+    """Moves points that are farther away than `REACH` to that distance."""
     scale = jnp.minimum(1.0, REACH / jnp.maximum(jnp.hypot(x, y), REACH))
     return scale * x, scale * y
 
@@ -113,7 +114,7 @@ def _nearest(distance: Array, is_there: Array, count: int) -> tuple[Array, Array
 
 
 def _listed(rows: tuple[Any, ...], is_there: Array, count: int) -> Array:
-    """Interleaves rows of F numbers, [R, n] each, into [R, count * F]; absent ones are 0."""
+    """Interleaves rows of F numbers, [R, n] each, into [R, count * F]; absent rows are 0."""
     every = tuple(jnp.where(is_there, row, 0.0) for row in rows)
     # Compute each number before interleaving. Neighbouring GPU threads that compute different
     # numbers would wait for each other.

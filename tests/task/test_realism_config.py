@@ -356,11 +356,11 @@ def test_help_gives_range_unit_and_choices(cls, command, robot, realism, mass):
     assert f"robot={robot} (paper, planar, planar_v2, wheeled, wheeled_v2)" in overview
     lines = [" ".join(line.split()) for line in help_text(cls, command, ["realism"]).splitlines()]
     assert (
-        f"realism.mass={mass} kg; per robot and episode "
+        f"realism.mass={mass} mass, kg; per robot and episode "
         "(a range [low,high] of numbers more than 0.01, at most 100 or null)" in lines
     )
     assert (
-        f"realism.action_latency={mass} control steps; per robot and episode "
+        f"realism.action_latency={mass} latency of commands, control steps; per robot and episode "
         "(a range [low,high] of whole numbers 0 to 1000 or null)" in lines
     )
     stall = "[0.1,0.3]" if mass == "null" else mass

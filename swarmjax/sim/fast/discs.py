@@ -3,19 +3,19 @@
 A hull is a sphere between upright faces, so in the plane it is a disc. Its contacts (condim 1) push
 through its centre, so they move it along x and y and never turn it. MJX's own step builds every
 contact in space, and factorises one matrix for all robots at every iteration of Newton's method.
-That takes nine tenths of its time. The contact forces are the solution of MuJoCo's convex problem
-in its dual form (MuJoCo's documentation, Computation, "Dual problem"),
+These two take nine tenths of its time. The contact forces are the solution of MuJoCo's convex
+problem in its dual form (MuJoCo's documentation, Computation, "Dual problem"),
 
     minimise over f >= 0:  1/2 f' (J M^-1 J' + R) f + f' (J a0 - aref).
 
-It has one unknown per contact, and most states have no contact. Projected Gauss-Seidel (MuJoCo's
-second solver, PGS) updates the forces one by one,
+The dual form has one unknown per contact, and most states have no contact. Projected Gauss-Seidel
+(MuJoCo's second solver, PGS) updates the forces one by one,
 
     f_i <- max(0, f_i + (aref_i - J_i a - R_i f_i) / (J_i M^-1 J_i' + R_i)),
 
-where a is the acceleration under the current forces. The problem has a single minimum, so this ends
-where Newton's method does. `planar_jax` implements it in JAX, `planar_warp` in Warp. A sweep
-goes through the fixtures one by one, for all robots, and then through the pairs of robots.
+where a is the acceleration under the current forces. The problem has a single minimum, so PGS and
+Newton's method reach the same solution. `planar_jax` implements PGS in JAX, `planar_warp` in Warp.
+A sweep goes through the fixtures one by one, for all robots, and then through the pairs of robots.
 """
 
 import functools
@@ -35,8 +35,8 @@ from swarmjax.sim.geometry import CONTACT_HEIGHT
 
 # Sweeps stop when no force changes by more than this share of the largest; float32 rounds at 1e-7.
 TOLERANCE = 1e-6
-# m; MuJoCo pushes a centre up or down if it is deeper within a box than this, which is its distance
-# to the box's top or bottom. No joint moves that way.
+# m; distance of a hull's centre to the nearer of a box's top and bottom. MuJoCo pushes a centre
+# that lies deeper within the box than this up or down, where no joint moves.
 DEEPEST = min(CONTACT_HEIGHT, 2.0 * sim_model.HALF_HEIGHT - CONTACT_HEIGHT)
 
 
@@ -44,15 +44,17 @@ class Discs(NamedTuple):
     """Constants of a program.
 
     Attributes:
-      radius: of the hulls, m.
+      radius: radius of the hulls, m.
       timestep: one physics step, s.
       sweeps: largest number of sweeps.
       body: [R] rows of the hulls among the model's bodies.
-      opponent: [N, R] the robot that each robot meets in a round; itself for none.
+      opponent: [N, R] the robot that each robot meets in a round; a robot that meets none has its
+        own index.
       solref: time constant (s) and damping ratio of all contacts.
       solimp: impedance of all contacts: smallest, largest, width (m), midpoint, power.
       solve: `push_apart` of a solver. It takes these constants, the robots of an arena, its side []
-        (m) and obstacles [M, 5] (x, y, yaw, half edges), and returns accelerations with contacts.
+        (m) and obstacles [M, 5] (x, y, yaw, half edges), and returns the accelerations including
+        contacts.
     """
 
     radius: float
@@ -73,8 +75,8 @@ class Model:
       body_mass: [B] kg.
       body_inertia: [B, 3] kg m^2.
       body_invweight0: [B, 2] 1 / kg, 1 / (kg m^2).
-      pair_friction: [P, 5] the same for all pairs; the first two are along the face. None for hulls
-        without friction.
+      pair_friction: [P, 5] friction, the same for all pairs; the first two numbers are along the
+        face. None for hulls without friction.
     """
 
     body_mass: Array
@@ -89,9 +91,9 @@ class Data:
 
     Attributes:
       qpos: [Q] x (m), y (m), yaw (rad) of each robot in turn.
-      qvel: [V] velocities of these.
+      qvel: [V] velocities of the positions in `qpos`.
       qacc_warmstart: [V] accelerations of the previous step.
-      qfrc_applied: [V] N, N, N m, all forces except those of contacts.
+      qfrc_applied: [V] all forces except contact forces, N, N, N m.
     """
 
     qpos: Array
@@ -105,7 +107,7 @@ class Rubbing(NamedTuple):
 
     Attributes:
       agility: [R] 1 / moment of inertia, 1 / (kg m^2).
-      friction: [] between hulls and everything that they touch.
+      friction: [] friction between hulls and everything that they touch.
     """
 
     agility: Array
@@ -143,7 +145,7 @@ def load(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve: Solve)
     Args:
       model: compiled, one arena.
       ids: rows of objects in the model.
-      radius: of the hulls, m.
+      radius: radius of the hulls, m.
       solve: `push_apart` of the solver for these hulls.
 
     Returns:
@@ -185,7 +187,7 @@ def load_engine(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve:
     Args:
       model: compiled, one arena.
       ids: rows of objects in the model.
-      radius: of the hulls, m.
+      radius: radius of the hulls, m.
       solve: `push_apart` of the solver for these hulls.
 
     Returns:
@@ -201,10 +203,11 @@ def load_engine(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve:
 
 
 def _rounds(robots: int) -> np.ndarray:
-    """Builds a tournament: the robot that each robot meets in each round, [N, R]; itself for none.
+    """Builds a tournament: the robot that each robot meets in each round, [N, R].
 
     With an odd number N of robots, two robots meet in the round that equals their sum modulo N (the
-    circle method). The robot left over rests. With an even number, it meets the last robot instead.
+    circle method). The robot left over meets none and gets its own index. With an even number, it
+    meets the last robot instead.
     """
     rounds = robots - 1 + robots % 2
     player = np.arange(rounds)
@@ -222,8 +225,8 @@ def step(discs: Discs, model: Model, data: Data, side: Array, obstacle: Array) -
     Args:
       discs: constants.
       model: provides masses and inverse weights.
-      data: the arena; `qfrc_applied` holds all forces except those of contacts.
-      side: [] of the arena, m.
+      data: the arena; `qfrc_applied` holds all forces except contact forces.
+      side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
@@ -255,8 +258,8 @@ def _robots(discs: Discs, model: Model, data: Data) -> DiscRobots:
 def spring(discs: Discs) -> tuple[float, float]:
     """Returns stiffness and damping, which are the same for all contacts.
 
-    MuJoCo's documentation, Modeling, "Solver parameters": k and b from `solref`, which is at least
-    two physics steps (`refsafe`).
+    MuJoCo's documentation, Modeling, "Solver parameters": k and b from `solref`, whose time
+    constant is at least two physics steps (`refsafe`).
 
     Args:
       discs: constants.

@@ -1,9 +1,10 @@
 """Shortest paths around obstacles in Warp; replaces the JAX code of `task/geodesic.py`.
 
 For each pair of corners, a thread checks whether they see each other. For each robot, a thread
-settles the corners outwards from its target (Dijkstra 1959, "A Note on Two Problems in Connexion
-with Graphs"). Another thread per robot finds the first corner of its path. It checks obstacles
-only for corners that could shorten the path. XLA would take minutes to compile this for a GPU.
+settles the corners outwards from the robot's target (Dijkstra 1959, "A Note on Two Problems in
+Connexion with Graphs"). Another thread per robot finds the first corner of the robot's path. This
+thread checks obstacles only for corners that could shorten the path. XLA would take minutes to
+compile this for a GPU.
 """
 
 from functools import partial
@@ -25,8 +26,8 @@ def find_legs(corner: Array, side: Array, frame: Array, widened: float) -> Array
 
     Args:
       corner: [K, 2] x and y, m.
-      side: [] of the arena, m.
-      frame: [M, 6] of obstacles: x (m), y (m), cosine and sine of yaw, half edges (m).
+      side: [] side of the arena, m.
+      frame: [M, 6] obstacles: x (m), y (m), cosine and sine of yaw, half edges (m).
       widened: width added around obstacles, m.
 
     Returns:
@@ -44,10 +45,10 @@ def settle(
 
     Args:
       target: [R, 2] x and y, m.
-      side: [] of the arena, m.
+      side: [] side of the arena, m.
       corner: [K, 2] x and y, m.
-      frame: [M, 6] as for `find_legs`.
-      legs: [K, K] from `find_legs`.
+      frame: [M, 6] obstacles, as for `find_legs`.
+      legs: [K, K] result of `find_legs`.
       widened: width added around obstacles, m.
 
     Returns:
@@ -70,12 +71,12 @@ def measure(
     """Measures the shortest paths.
 
     Args:
-      place: [R, 2] of the robots, x and y, m.
-      side: [] of the arena, m.
+      place: [R, 2] places of the robots: x and y, m.
+      side: [] side of the arena, m.
       target: [R, 2] x and y, m.
       corner: [K, 2] x and y, m.
-      to_go: [R, K] from each corner to each target, m.
-      frame: [M, 6] as for `find_legs`.
+      to_go: [R, K] distance from each corner to each target, m.
+      frame: [M, 6] obstacles, as for `find_legs`.
       widened: width added around obstacles, m.
 
     Returns:
@@ -100,7 +101,7 @@ def _settle(widened: float, target: Array, side: Array, *given: Array) -> Array:
     corner, frame, legs = given
     size = (arenas, robots, corner.shape[1])
     call = wp.jax_kernel(_settle_corners, num_outputs=2)
-    del side  # an argument only because `of_arenas` counts arenas by it
+    del side  # an argument only because `of_arenas` takes the number of arenas from it
     shapes = {"state": size, "to_go": size}
     found = call(
         target, corner, frame, legs, widened, launch_dims=(arenas, robots), output_dims=shapes

@@ -1,7 +1,7 @@
 """Contacts of planar robots in JAX: all robots of an arena at once, sweep by sweep.
 
-`discs` describes the problem and the order of a sweep. Each fixture is one row for all robots. So
-is each round of the tournament, in which each robot meets one other robot.
+`discs` describes the problem and the order of a sweep. Each fixture is one row for all robots. Each
+round of the tournament is also one row; in a round, each robot meets one other robot.
 """
 
 import operator
@@ -22,9 +22,9 @@ class DiscGap(NamedTuple):
     """Gap between a robot and an object that it may touch.
 
     Attributes:
-      x: of the unit vector along which the robot is pushed.
-      y: of the same unit vector.
-      distance: between the surfaces, m; negative for contact.
+      x: x of the unit vector along which the robot is pushed.
+      y: y of the same unit vector.
+      distance: distance between the surfaces, m; negative for contact.
     """
 
     x: Array
@@ -36,8 +36,8 @@ class Contact(NamedTuple):
     """A gap, and the contact's parameters if it is closed.
 
     Attributes:
-      gap: between the two.
-      give: R, softness: acceleration by which a unit of force misses the demand, 1 / kg.
+      gap: gap between the two.
+      give: softness R, the acceleration by which a unit of force misses the demand, 1 / kg.
       demand: aref, requested acceleration along the gap, m/s^2.
       stiffness: J M^-1 J' + R, effect of a unit of force, 1 / kg.
     """
@@ -61,11 +61,12 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
     Args:
       discs: constants.
       robots: their state, and their accelerations without contacts.
-      side: [] of the arena, m.
+      side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
-      [R, 3] of x and y, m/s^2, and of yaw, rad/s^2; the latter is that of `robots.free`.
+      [R, 3] accelerations of x and y, m/s^2, and of yaw, rad/s^2. Contacts do not change the
+      acceleration of yaw.
     """
     one = contacts(discs, robots, sim_model.fixture_rectangles(side, obstacle, jnp))
     free, before = (Motion(m[:, 0], m[:, 1]) for m in (robots.free, robots.before))
@@ -90,7 +91,7 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
 
 
 def contacts(discs: Discs, robots: DiscRobots, fixture: Array) -> Contact:
-    """Returns all contacts [K, R] of robots: with each fixture [F, 5], then in each round."""
+    """Returns all contacts [K, R] of robots: with each fixture [F, 5], then of each round."""
     x, y, other = robots.place[:, 0], robots.place[:, 1], discs.opponent
     to_fixture = _from_box(x, y, turned(fixture[:, None], jnp), discs.radius)
     meets = other - np.arange(len(x))
@@ -158,10 +159,10 @@ def _from_box(x: Array, y: Array, box: Box, radius: float) -> DiscGap:
 
 
 def _from_disc(x: Array, y: Array, ahead: Array, radius: float) -> DiscGap:
-    """Returns the gap between robots that are x and y, m, away from others.
+    """Returns the gap between robots and others; x and y (m) lead from the others to the robots.
 
-    Two hulls at the same place push each other along x, as in MuJoCo. Of each pair, one robot has
-    `ahead` 1 and the other -1; the former is pushed towards the negative end.
+    Two hulls at the same place push each other along x, as in MuJoCo. In each pair, one robot has
+    `ahead` 1 and the other -1; the one with 1 is pushed towards the negative end.
     """
     apart = jnp.sqrt(x * x + y * y)
     along_x = jnp.where(apart > 0.0, x / apart, -ahead)
@@ -173,7 +174,7 @@ def _contact(discs: Discs, gap: DiscGap, rate: Motion, weight: Array, mobility: 
 
     Args:
       discs: constants.
-      gap: between robots and others.
+      gap: gap between robots and others.
       rate: velocity of the robots relative to the others, m/s.
       weight: sum of both inverse weights, 1 / kg.
       mobility: sum of both 1 / mass, 1 / kg.

@@ -38,11 +38,12 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
     Args:
       discs: constants.
       robots: their state, and their accelerations without contacts.
-      side: [] of the arena, m.
+      side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
-      [R, 3] of x and y, m/s^2, and of yaw, rad/s^2; the latter is that of `robots.free`.
+      [R, 3] accelerations of x and y, m/s^2, and of yaw, rad/s^2. Contacts do not change the
+      acceleration of yaw.
     """
     many = of_arenas(functools.partial(_solve, discs))
     return many(*jax.tree.map(lambda x: x[None], (robots, side, obstacle)))[0]
@@ -58,8 +59,8 @@ def of_arenas(solve: Any) -> Any:
             return x if has else jnp.broadcast_to(x, (size, *x.shape))
 
         whole = jax.tree.map(widen, given, tuple(batched))
-        shape = whole[1].shape  # of the sides: [size, arenas]
-        arenas = shape[0] * shape[1]  # reshape cannot infer it, as there may be no obstacles
+        shape = whole[1].shape  # shape of the sides: [size, arenas]
+        arenas = shape[0] * shape[1]  # reshape cannot infer it if there are no obstacles
         found = many(*jax.tree.map(lambda x: x.reshape(arenas, *x.shape[2:]), whole))
         return found.reshape(*shape, *found.shape[1:]), True
 
@@ -90,12 +91,12 @@ class WarpArena:
       mobility: [A, R] 1 / mass.
       weight: [A, R] inverse weight.
       numbers: radius (m), stiffness (1/s^2), damping (1/s), and `solimp`.
-      row: [K, A] of each contact: x and y of the unit vector along which it pushes, aref, and
-        J M^-1 J' + R.
+      row: [K, A] numbers of each contact: x and y of the unit vector along which it pushes, aref,
+        and J M^-1 J' + R.
       soft: [K, A] R, and the force, N.
       between: [K, A] the robot pushed along the vector, and the one pushed back; -1 for none.
       found: [A, R] acceleration of x, y and yaw.
-      index: of the thread, [A].
+      index: [A] index of the thread.
     """
 
     place: wp.array2d[wp.vec3]
@@ -160,7 +161,7 @@ def _push_apart(  # noqa: PLR0913  # JAX passes arrays one by one
 
 @wp.func
 def _let_go(arena: WarpArena, free: wp.array2d[wp.vec3]) -> None:
-    """Sets accelerations to those without contacts."""
+    """Sets the accelerations to their values without contacts."""
     for i in range(free.shape[1]):
         arena.found[arena.index, i] = free[arena.index, i]
 
@@ -192,7 +193,7 @@ def obstacle_box(obstacle: wp.array3d[float], arena: int, m: int) -> WarpBox:
 
 @wp.func
 def wall_box(side: float, k: int) -> WarpBox:
-    """Returns the wall east, north, west or south, as in `model.fixture_rectangles`."""
+    """Returns the east, north, west or south wall, as in `model.fixture_rectangles`."""
     box = WarpBox()
     box.cos = wp.where(k % 2 == 1, 0.0, wp.where(k == 0, 1.0, -1.0))
     box.sin = wp.where(k % 2 == 0, 0.0, wp.where(k == 1, 1.0, -1.0))
@@ -252,10 +253,10 @@ def from_box(place: wp.vec3, box: WarpBox, radius: float) -> wp.vec3:
 
 @wp.func
 def from_disc(x: float, y: float, radius: float) -> wp.vec3:
-    """Returns the unit vector from the second robot to the first, x and y m away, and their gap, m.
+    """Returns the unit vector from the second robot to the first, and their gap, m.
 
-    Two hulls at the same place push each other along x, as in MuJoCo; the first is pushed towards
-    the negative end.
+    x and y (m) lead from the second robot to the first. Two hulls at the same place push each other
+    along x, as in MuJoCo; the first is pushed towards the negative end.
     """
     apart = wp.length(wp.vec2(x, y))
     along = wp.vec2(-1.0, 0.0)

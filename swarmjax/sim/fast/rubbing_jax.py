@@ -1,15 +1,15 @@
 """Contacts of planar robots with friction, in JAX; `planar_jax` is the version without friction.
 
-A contact has two forces within the cone |rub| <= friction * push: a push along the normal and a
-rub along the face. This is MuJoCo's elliptic cone of condim 3. The third force is vertical, where
-no joint moves, and stays 0. The push acts through the centre, the rub with an arm. Neither moves
-the robot in the way that the other does, so for one contact
+A contact has two forces within the cone |rub| <= friction * push: a push along the normal and a rub
+along the face. This is MuJoCo's elliptic cone of condim 3. The third force is vertical, where no
+joint moves, and stays 0. The push acts through the centre, the rub with an arm. Push and rub move
+the robot in different ways, so for one contact the problem
 
     minimise over the cone:  1/2 f' (J M^-1 J' + R) f + f' (J a0 - aref)
 
-is two separate parabolas. Their least point in the cone has a closed form (`project`). Projected
-Gauss-Seidel then goes through contacts instead of forces. It sets each contact to its best forces
-while the other forces stay the same.
+is two separate parabolas. The least point of their sum in the cone has a closed form (`project`).
+Projected Gauss-Seidel then goes through contacts instead of forces. A step sets one contact to its
+best forces while the other forces stay the same.
 
 Wedged robots pass a force back and forth, a little less of it in each sweep. An arena may take up
 to 200 sweeps, and all arenas of a call wait for it. So between sweeps, forces leap to where the
@@ -32,11 +32,12 @@ from swarmjax.sim.fast.discs import TOLERANCE, DiscRobots, Discs, Rubbing, sprin
 from swarmjax.sim.fast.planar_jax import Contact, DiscGap
 
 KEPT = 3  # sweeps that a leap uses; a fourth saves 3 % in s6 (docs/performance.md)
-# Relative increase of a sum of squares that rounding may leave at 0: ten times float32's rounding.
+# Relative increase of a sum of squares. Without it, rounding may leave 0. It is ten times float32's
+# rounding.
 ROUNDING = 1e-6
 # Relative error of an acceleration after two roundings in float32. Without this limit, 3 of 20,000
-# random crowds never came to rest. They had hulls that were grazed at speed. All arenas wait for
-# such a crowd.
+# random crowds never came to rest. These crowds had hulls that were grazed at speed. All arenas
+# wait for such a crowd.
 FLOOR = 2.4e-7
 
 
@@ -44,7 +45,7 @@ class Rub(NamedTuple):
     """Parameters of a contact along its face, counter-clockwise around the robot.
 
     Attributes:
-      arm: from the robot's centre to the contact, m; 0 without contact.
+      arm: lever arm from the robot's centre to the contact, m; 0 without contact.
       demand: aref, requested acceleration along the face, m/s^2.
       stiffness: J M^-1 J' + R, effect of a unit of force, 1 / kg.
     """
@@ -101,7 +102,7 @@ class Search(NamedTuple):
 
 
 class PlaneMotion(NamedTuple):
-    """Velocities or accelerations of robots, or relative to others (`turn`: sum of both)."""
+    """Velocities or accelerations of robots, or those relative to others (`turn` is then a sum)."""
 
     x: Array
     y: Array
@@ -114,11 +115,11 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
     Args:
       discs: constants.
       robots: their state, accelerations without contacts, and `rubbing`.
-      side: [] of the arena, m.
+      side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
-      [R, 3] of x and y, m/s^2, and of yaw, rad/s^2.
+      [R, 3] accelerations of x and y, m/s^2, and of yaw, rad/s^2.
     """
     return solve(discs, robots, side, obstacle)[0]
 
@@ -129,11 +130,12 @@ def solve(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> tup
     Args:
       discs: constants.
       robots: their state, accelerations without contacts, and `rubbing`.
-      side: [] of the arena, m.
+      side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
-      [R, 3] of x and y, m/s^2, and of yaw, rad/s^2; and [] sweeps, int32.
+      [R, 3] accelerations of x and y, m/s^2, and of yaw, rad/s^2; and the number of sweeps [],
+      int32.
     """
     touch = touches(discs, robots, sim_model.fixture_rectangles(side, obstacle, jnp))
     free, before = (PlaneMotion(*move.T) for move in (robots.free, robots.before))
@@ -154,7 +156,7 @@ def solve(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> tup
 
 
 def _least_change(touch: Touch, motion: PlaneMotion) -> Array:
-    """Returns the force, N, that rounding of such accelerations can cause; ignore less than it."""
+    """Returns the force, N, that rounding of accelerations can cause; ignore smaller changes."""
     size = jnp.abs(motion.x) + jnp.abs(motion.y) + touch.rub.arm * jnp.abs(motion.turn)
     closed = touch.push.gap.distance < 0.0
     return FLOOR * jnp.max(jnp.where(closed, size / touch.push.stiffness, 0.0))
@@ -179,8 +181,8 @@ def _go_on(discs: Discs, touch: Touch, robots: DiscRobots, least: Array, now: Se
 def _leap(touch: Touch, robots: DiscRobots, swept: Swept, now: Search, leaps: Array) -> Force:
     """Returns the mix of the last three sweeps' forces that should change least in the next sweep.
 
-    This assumes that a sweep is a linear map. That holds as long as no contact starts or stops
-    pushing, sticking or slipping.
+    This assumes that a sweep is a linear map. A sweep is linear as long as no contact starts or
+    stops pushing, sticking or slipping.
     """
     newer, older = _minus(swept.change, now.last.change), _minus(now.last.change, now.before.change)
     by_newer, by_older = (jnp.where(leaps, x, 0.0) for x in _weights(swept.change, newer, older))
@@ -336,7 +338,8 @@ def project(force: Force, push: Array, rub: Array, friction: Array) -> Force:
 
     Returns:
       The forces themselves, if they lie in the cone. Otherwise the nearest point of the cone's edge
-      on their side, where the parabola along (1, friction) is least, or the cone's tip.
+      on the same side, or the cone's tip. On the edge, this is where the parabola along (1,
+      friction) is least.
     """
     size = jnp.abs(force.rub)
     edge = push * force.push + friction * rub * size

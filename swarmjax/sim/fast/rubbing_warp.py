@@ -34,11 +34,11 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
     Args:
       discs: constants.
       robots: their state, accelerations without contacts, and `rubbing`.
-      side: [] of the arena, m.
+      side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
-      [R, 3] of x and y, m/s^2, and of yaw, rad/s^2.
+      [R, 3] accelerations of x and y, m/s^2, and of yaw, rad/s^2.
     """
     many = planar_warp.of_arenas(functools.partial(_solve, discs))
     return many(*jax.tree.map(lambda x: x[None], (robots, side, obstacle)))[0]
@@ -71,16 +71,17 @@ class WarpRubbingArena:
       mobility: [A, R] 1 / mass.
       weight: [A, R] inverse weight.
       agility: [A, R] 1 / moment of inertia.
-      friction: between hulls and everything that they touch.
+      friction: friction between hulls and everything that they touch.
       numbers: radius (m), stiffness (1/s^2), damping (1/s), and `solimp`.
-      row: [K, A] of each contact: x and y of the unit vector along which it pushes, its arm (m), R.
+      row: [K, A] numbers of each contact: x and y of the unit vector along which it pushes, its arm
+        (m), R.
       asked: [K, A] aref of push and rub, and J M^-1 J' + R of both.
       force: [K, A] push and rub, N.
       between: [K, A] the robot pushed along the vector, and the one pushed back; -1 for none.
       past: [KEPT, K, A] push and rub after a sweep, and their changes in that sweep, N; sweep i is
         in row i modulo KEPT.
       found: [A, R] acceleration of x, y and yaw.
-      index: of the thread, [A].
+      index: [A] index of the thread.
     """
 
     place: wp.array2d[wp.vec3]
@@ -181,7 +182,7 @@ def _push_apart(  # noqa: PLR0913  # JAX passes arrays one by one
 
 @wp.func
 def _let_go(arena: WarpRubbingArena) -> None:
-    """Sets accelerations to those without contacts."""
+    """Sets the accelerations to their values without contacts."""
     for i in range(arena.free.shape[1]):
         arena.found[arena.index, i] = arena.free[arena.index, i]
 
@@ -313,7 +314,7 @@ def _solve_contacts(arena: WarpRubbingArena, count: int, sweeps: int) -> None:
 
 @wp.func
 def _least_change(arena: WarpRubbingArena, count: int) -> float:
-    """Returns the force, N, that rounding can cause (`rubbing_jax`); ignore less than it."""
+    """Returns the force, N, that rounding can cause (`rubbing_jax`); ignore smaller changes."""
     largest = wp.float32(0.0)
     for k in range(count):
         apart = _apart(arena, arena.free, arena.between[k, arena.index])

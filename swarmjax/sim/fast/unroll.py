@@ -1,7 +1,8 @@
 """Processes a short axis of objects in slices, so that XLA makes one kernel of the computation.
 
 On a GPU, a minimum over four obstacles becomes its own kernel, which reads its inputs from memory.
-One object at a time, all operations are elementwise, and XLA keeps the values in registers.
+If objects are processed one at a time, all operations are elementwise, and XLA keeps the values in
+registers.
 """
 
 from typing import Any

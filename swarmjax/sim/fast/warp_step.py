@@ -41,7 +41,7 @@ def load_engine(model: mujoco.MjModel, robots: int, arenas: int) -> Engine:
 
 
 def install() -> None:
-    """Makes MJX step models as their `opt.solver` selects; does nothing the second time."""
+    """Makes MJX take the step that a model's `opt.solver` selects; a second call does nothing."""
     forward.mjwarp.step = step
 
 

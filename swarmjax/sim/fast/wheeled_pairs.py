@@ -153,7 +153,7 @@ def _side(problem: Problem, arena: int, row: int, side: int) -> wp.vec3i:
 
 @wp.func
 def _overlap(problem: Problem, together: Together, arena: int, i: int, j: int, sides: int) -> float:
-    """Returns the effect of pair j along pair i, in the robot on these sides of both pairs."""
+    """Returns the effect of pair j along pair i, in the robot that `sides` picks in each."""
     row = together.pair[arena, i]
     mine = _side(problem, arena, row, sides % 2)
     theirs = _side(problem, arena, together.pair[arena, j], sides // 2)

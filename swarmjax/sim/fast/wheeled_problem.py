@@ -8,26 +8,27 @@ from typing import Any
 
 import warp as wp
 
-JOINTS = wp.constant(8)  # of a robot: six of a free body, and two wheels
-FREE = wp.constant(6)  # of these, the joints of the free body
+JOINTS = wp.constant(8)  # joints of a robot: six of a free body, and two wheels
+FREE = wp.constant(6)  # the joints of the free body among these
 _INERTIA = wp.constant(35)  # entries of a robot's M, without the zero between both wheels
 SHARED = wp.constant(-2)  # in place of a wheel, in a row between two robots
 # Entries of `Problem.scaled` that follow a row's entries.
 AREF = wp.constant(8)
 GAP = wp.constant(9)
 SLOPE = wp.constant(10)
-_GEOMS = 5  # of a robot: hull, two wheels, two skids
+_GEOMS = 5  # geoms of a robot: hull, two wheels, two skids
 SEARCHES = wp.constant(12)  # largest number of trials for a step's length
 # Slopes below this share of the initial slope count as zero. float32 rounds at 1e-7, and the grips
 # of a robot are 1e3 times as stiff as its mass.
 FLAT = wp.constant(1e-4)
-# Shares of the acceleration. A step below the first may be the last; one below the second is only
-# rounding.
+# Shares of the acceleration. A step below `_SHORT` may be the last; a step below `_ROUNDING` is
+# only rounding.
 _SHORT = wp.constant(1e-2)
 _ROUNDING = wp.constant(1e-5)
-# Contacts between robots that become separate terms. Further ones are added to the robots' blocks,
-# which takes more and shorter steps. Five robots have ten pairs; larger swarms use Newton's method
-# (`dispatch.MOST_WHEELED`). The number equals JOINTS, so one size of matrix serves both.
+# Number of contacts between robots that become separate terms. Further contacts are added to the
+# robots' blocks, and the method then takes more and shorter steps. Five robots have ten pairs;
+# larger swarms use Newton's method (`dispatch.MOST_WHEELED`). The number equals JOINTS, so one size
+# of matrix serves both.
 PAIRS = wp.constant(8)
 
 
@@ -54,15 +55,15 @@ class Problem:
       J_column: [A, 1, E].
       D: [A, N] weight of a row.
       aref: [A, N] acceleration that a row demands.
-      first: [A, N] for a row between two robots, the `side` (as for `entries_of`) of the robot with
-        the higher number.
+      first: [A, N] the `side` (as for `entries_of`) of the robot with the higher number, for a row
+        between two robots.
       second: [A, N] the `side` of the other robot.
       own: [A, R] number of rows of a robot.
       row: [A, R, K] indices of these rows, and where the robot's entries are in them.
       touches: [A, R] whether any row also involves another robot.
-      scaled: [K, 11, A R] for each row, times the root of D: the robot's entries and aref, and
-        during `_relax` also J a - aref and J times the step. Values that threads read at the same
-        time are adjacent.
+      scaled: [K, 11, A R] numbers of each row, multiplied by the root of D: the robot's entries and
+        aref, and during `_relax` also J a - aref and J times the step. Values that threads read at
+        the same time are adjacent.
     """
 
     force: wp.array2d[float]
@@ -135,7 +136,7 @@ def gather(m: Any, d: Any, robots: int) -> Any:
 
 
 def _most_rows(m: Any, robots: int) -> int:
-    """Counts the rows of a robot, at most: 4 per wheel, 1 per skid, 1 per object near its hull."""
+    """Returns the most rows of a robot: 4 per wheel, 1 per skid, 1 per object near its hull."""
     others = m.ngeom - 1 - _GEOMS * robots  # without the floor
     return 2 * 4 + 2 + robots - 1 + others
 
@@ -169,7 +170,10 @@ def does_switch(gap: float, slope: float) -> bool:
 
 @wp.func
 def goes_on(moves: bool, step: float, acceleration: float) -> bool:
-    """Returns whether to continue: a long step leaves rounding errors; a tiny one is only that."""
+    """Returns whether to continue.
+
+    A long step leaves rounding errors. A tiny step is only rounding.
+    """
     return (moves or step > _SHORT * acceleration) and step > _ROUNDING * acceleration
 
 
@@ -218,7 +222,7 @@ def entries_of(problem: Problem, arena: int, side: wp.vec3i) -> Vector:
       arena: index of the arena.
       side: three numbers. The first is the robot or the row and is not read here. The second is the
         place of the body's six entries, which are stored from the last joint to the first. The
-        third is the wheel whose entry precedes them.
+        third is the wheel whose entry precedes those six.
     """
     found = Vector()
     for i in range(6):

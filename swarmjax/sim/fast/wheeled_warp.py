@@ -49,13 +49,13 @@ from swarmjax.sim.fast.wheeled_problem import (
 
 NUMBER = -1  # value of `opt.solver` for this solver; MuJoCo does not use it
 _ITERATIONS = 20  # limit of Newton's method; touching robots usually need six, at most 18 so far
-_BLOCK = 64  # threads; their work is long and uneven, so small blocks wait less
+_BLOCK = 64  # threads per block; their work is long and uneven, so small blocks wait less
 
 
 def step(m: Any, d: Any) -> None:
     """Advances all arenas of wheeled robots by one physics step (MuJoCo's semi-implicit Euler).
 
-    It ignores the external forces `xfrc_applied`, since nothing here uses them.
+    The step ignores the external forces `xfrc_applied`, since nothing here uses them.
 
     Args:
       m: Warp's model: only robots, with eight joints each; a sparse Jacobian.
@@ -127,8 +127,8 @@ def _count(problem: Problem, arena: int) -> int:
 def _sides(problem: Problem, arena: int, row: int) -> tuple[wp.vec3i, wp.vec3i]:
     """Returns the `side` of a row's robots, as for `entries_of`; the higher number comes first.
 
-    A row has a body's six entries, preceded by the wheel's entry for a wheel's row; or twelve
-    entries for two robots.
+    A row has the six entries of a body. A wheel's row has the wheel's entry before them. A row of
+    two robots has twelve entries.
     """
     first = problem.J_first[arena, row]
     joint = problem.J_column[arena, 0, first]

@@ -27,8 +27,9 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     """Draws a corridor along x with a bay on its left.
 
     Args:
-      uniforms: [K] in [0, 1).
-      site: the arena; reads `gap` (of the corridor), `width` (at the bay) and `length` (of it).
+      uniforms: [K] uniform numbers in [0, 1).
+      site: the arena; the layout reads `gap` (of the corridor), `width` (at the bay) and `length`
+        (of the bay).
       xp: `numpy` or `jax.numpy`.
 
     Returns:

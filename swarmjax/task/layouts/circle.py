@@ -9,7 +9,7 @@ from swarmjax.task.layouts.site import ArenaLayout, Demand, Drawn, Site, pick
 
 Array = Any
 _TURN = 5040  # directions around the circle; divisible by 2 to 10, 12, 14, 15, 16, 18 and 20 robots
-_ONE = 2**14  # scale of the sine table; times a radius of 2 m (2**13 units) it fits an int32
+_ONE = 2**14  # scale of the sine table; times a radius of 2 m (2**13 units), it fits an int32
 _ANGLE = np.arange(_TURN) * (2.0 * math.pi / _TURN)
 _TABLE = np.round(_ONE * np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=-1)).astype(np.int32)
 _WALL = 0.07  # m, from the circle to the walls: a hull of 0.045 m and some spare space
@@ -19,8 +19,8 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     """Places robots evenly on a circle with a random first direction.
 
     Args:
-      uniforms: [1] in [0, 1).
-      site: the arena; reads `radius`.
+      uniforms: [1] uniform numbers in [0, 1).
+      site: the arena; the layout reads `radius`.
       xp: `numpy` or `jax.numpy`.
 
     Returns:

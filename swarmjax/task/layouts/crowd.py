@@ -14,15 +14,15 @@ from swarmjax.task.placement import Gap, place, score_things
 
 Array = Any
 _LATTICE = 40  # points along a side: 3 cm apart in an arena of 1.2 m
-_FILLING = 0.5  # largest area share of discs as wide as `apart`; random discs jam at 0.547
+_FILLING = 0.5  # largest share of the area for discs as wide as `apart`; random discs jam at 0.547
 
 
 def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     """Places targets, then starts.
 
     Args:
-      uniforms: [K] in [0, 1).
-      site: the arena; reads `apart`.
+      uniforms: [K] uniform numbers in [0, 1).
+      site: the arena; the layout reads `apart`.
       xp: `numpy` or `jax.numpy`.
 
     Returns:

@@ -29,8 +29,8 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     """Draws a wall across the arena with a door in it.
 
     Args:
-      uniforms: [K] in [0, 1).
-      site: the arena; reads `gap` (of the door) and `apart` (from targets to the door).
+      uniforms: [K] uniform numbers in [0, 1).
+      site: the arena; the layout reads `gap` (of the door) and `apart` (from targets to the door).
       xp: `numpy` or `jax.numpy`.
 
     Returns:

@@ -35,7 +35,7 @@ class LaidOut(NamedTuple):
 
 
 class LayoutArrays(NamedTuple):
-    """One layout's numbers in stages, [S, ...] or [...].
+    """Numbers of one layout in all stages, [S, ...], or in one stage, [...].
 
     Attributes:
       chosen: whether the stage has this layout, bool.
@@ -68,8 +68,8 @@ class Kind(NamedTuple):
     """The part of a layout that is compiled in.
 
     Attributes:
-      name: in `LAYOUTS`.
-      cells: along a side of a maze; 0 for other layouts.
+      name: name in `LAYOUTS`.
+      cells: number of cells along a side of a maze; 0 for other layouts.
       narrow: whether there are bars, so that an arena may be narrower than it is long.
     """
 
@@ -111,7 +111,7 @@ def uniform_count(kind: Kind, robots: int) -> int:
 
 
 def before_own(robots: int) -> int:
-    """Returns how many of them precede the layout's own: lengths, the turn and headings."""
+    """Returns how many uniform numbers precede the layout's: lengths, the turn and headings."""
     return LENGTHS + 1 + robots
 
 
@@ -122,10 +122,10 @@ def draw(
 
     Args:
       kind: the compiled part.
-      of: the layout's numbers, fields [...] of one stage.
+      of: the layout's numbers in one stage, with fields [...].
       uniforms: [uniform_count(kind, R)] float32 in [0, 1), or more; the only source of randomness.
       present: [R] whether the robot is present.
-      sizes: of robots and targets.
+      sizes: sizes of robots and targets.
       xp: `numpy` or `jax.numpy`; both draw the same arena.
 
     Returns:

@@ -29,12 +29,13 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     """Draws a fence.
 
     Args:
-      uniforms: [K] in [0, 1).
-      site: the arena; reads `length`.
+      uniforms: [K] uniform numbers in [0, 1).
+      site: the arena; the layout reads `length`.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      The layout, with starts on one side and targets on the other, none in the way around the end.
+      The layout, with starts on one side and targets on the other. None of them lies in the way
+      around the end.
     """
     count = site.present.shape[0]
     place, shifts, targets, starts = split(uniforms, [1, 4, count, count])

@@ -19,14 +19,14 @@ from swarmjax.task.layouts.site import (
 )
 
 Array = Any
-_PASSAGE = 0.20  # m, least free width: a robot can pass one that parks in the middle
+_PASSAGE = 0.20  # m, least free width: a robot can pass another that parks in the middle
 
 
 def edges(cells: int) -> np.ndarray:
     """Lists the pairs of neighbouring cells of a maze.
 
     Args:
-      cells: along a side.
+      cells: number of cells along a side.
 
     Returns:
       [E, 2] indices of cells, which count row by row from below. Pairs along x come first.
@@ -41,8 +41,8 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     """Draws a maze.
 
     Args:
-      uniforms: [K] in [0, 1).
-      site: the arena, a square; reads `cells`.
+      uniforms: [K] uniform numbers in [0, 1).
+      site: the arena, a square; the layout reads `cells`.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
@@ -55,7 +55,7 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     edge = 2 * site.half[0] // cells
     corner = -site.half[0]
     chosen = xp.argsort(rooms, stable=True)[: 2 * count].astype(xp.int32)
-    if cells * cells < 2 * count:  # more robots are compiled in than the maze has room for
+    if cells * cells < 2 * count:  # the program has more robots than the maze has room for
         lacking = xp.zeros(2 * count - cells * cells, xp.int32)
         chosen = xp.concatenate([chosen, lacking])
     centre = xp.stack([chosen % cells, chosen // cells], axis=-1) * edge + corner + edge // 2

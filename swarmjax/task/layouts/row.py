@@ -28,8 +28,8 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     """Draws a corridor that ends at the arena's wall.
 
     Args:
-      uniforms: [K] in [0, 1).
-      site: the arena; reads `gap` (of the corridor) and `apart` (of the targets).
+      uniforms: [K] uniform numbers in [0, 1).
+      site: the arena; the layout reads `gap` (of the corridor) and `apart` (of the targets).
       xp: `numpy` or `jax.numpy`.
 
     Returns:

@@ -10,7 +10,7 @@ from swarmjax.task.placement import MARGIN, UNITS, Gap, Gaps, place, score_thing
 
 Array = Any
 NUMBERS = ("gap", "width", "depth", "length", "radius", "apart")  # settings of a stage, m
-THICKNESS = math.ceil(0.02 * UNITS)  # of walls within an arena, units
+THICKNESS = math.ceil(0.02 * UNITS)  # thickness of walls within an arena, units
 LATTICE = 24  # points along each edge of an area
 
 
@@ -20,9 +20,9 @@ class Numbers(NamedTuple):
     Attributes:
       gap: free width of a door or a corridor.
       width: free width of a trap, or of a corridor at its bay.
-      depth: of a trap.
-      length: of a fence, or of a bay along its corridor.
-      radius: of the circle on which robots start.
+      depth: depth of a trap.
+      length: length of a fence, or of a bay along its corridor.
+      radius: radius of the circle on which robots start.
       apart: distance between targets, or from targets to a door.
     """
 
@@ -39,8 +39,8 @@ class Site(NamedTuple):
 
     Attributes:
       half: [2] half of the arena's extent along x and y.
-      numbers: of this level.
-      cells: along a side of a maze; 0 for other layouts.
+      numbers: numbers of this level.
+      cells: number of cells along a side of a maze; 0 for other layouts.
       present: [R] whether the robot is present.
       hull: radius of the robots.
       clear: least distance between a robot's centre and a wall at the start.
@@ -81,8 +81,8 @@ class Demand(NamedTuple):
       robots: number of robots.
       side: smallest extent along x.
       breadth: smallest extent along y.
-      cells: along a side of a maze.
-      numbers: smallest and largest of the numbers that the layout reads.
+      cells: number of cells along a side of a maze.
+      numbers: smallest and largest value of each number that the layout reads.
     """
 
     robots: int
@@ -97,13 +97,13 @@ class ArenaLayout(NamedTuple):
 
     Attributes:
       draw: draws the layout from uniform numbers [K] in [0, 1), a site and the array module.
-      parts: returns the parts of its uniform numbers, in order, for a number of robots and cells:
-        what a part places, and its length. A mutation may change single numbers of `wall`, `room`,
-        `target` and `start`. The other parts are `area` (shift of a lattice's points) and `aside`
-        (offset from the middle of a way).
-      walls: largest number of walls, for the cells of a maze.
-      reads: the `NUMBERS` of a stage that it uses.
-      least: the smallest side and breadth with room for a demand, m.
+      parts: takes a number of robots and cells, and returns the parts of the layout's uniform
+        numbers in order: what a part places, and its length. A mutation may change single numbers
+        of `wall`, `room`, `target` and `start`. The other parts are `area` (shift of a lattice's
+        points) and `aside` (offset from the middle of a way).
+      walls: returns the largest number of walls for a number of cells (of a maze).
+      reads: the `NUMBERS` of a stage that the layout uses.
+      least: returns the smallest side and breadth with room for a demand, m.
       most_robots: largest number of robots, however large the arena.
       square: whether the arena must be square.
     """
@@ -117,7 +117,7 @@ class ArenaLayout(NamedTuple):
     square: bool = False
 
     def uniforms(self, robots: int, cells: int) -> int:
-        """Returns how many uniform numbers it takes for these robots and cells."""
+        """Returns how many uniform numbers the layout takes for these robots and cells."""
         return sum(count for _, count in self.parts(robots, cells))
 
 
@@ -150,9 +150,9 @@ def points(
     """Spreads points evenly over a rectangle, shifted by a part of their spacing.
 
     Args:
-      low: its corner with the smallest x and y, units.
-      high: its corner with the largest x and y, units.
-      shift: [2] in [0, 1), as a share of the spacing.
+      low: corner of the rectangle with the smallest x and y, units.
+      high: corner of the rectangle with the largest x and y, units.
+      shift: [2] shift in [0, 1), as a share of the spacing.
       xp: `numpy` or `jax.numpy`.
       count: points along each edge.
 

@@ -28,8 +28,8 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     """Draws a trap.
 
     Args:
-      uniforms: [K] in [0, 1).
-      site: the arena; reads `width` and `depth`.
+      uniforms: [K] uniform numbers in [0, 1).
+      site: the arena; the layout reads `width` and `depth`.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
