@@ -18,14 +18,14 @@ class SwarmTorchEnv:
         observation = env.reset(seed=0)  # [N, O]
         came = env.step(policy(observation))  # [N, 2]
 
-    Each robot is a row. All may share a policy. A step returns a `RobotStep`: act on `observation`,
-    bootstrap from `last` where `truncated`, and learn where `valid`. A robot is `terminated` in the
-    step in which it arrives. After that it is not `valid` and its reward is 0, until its arena is
-    `over` and starts the next episode automatically. Absent robots are left out.
+    Each robot is a row. All robots may share one policy. A step returns a `RobotStep`: act on
+    `observation`, bootstrap from `last` where `truncated`, and learn where `valid`. A robot is
+    `terminated` in the step in which it arrives. After that it is not `valid` and its reward is 0,
+    until its arena is `over` and starts the next episode automatically. Absent robots are left out.
 
-    JAX assumes that its arrays never change. So do not write into a tensor from here, or into an
-    action before the next step has returned. Actions are read without gradients, from the device on
-    which JAX computes.
+    JAX assumes that its arrays never change. So do not write into a tensor that this class has
+    returned, or into an action before the next step has returned. Actions must lie on the device on
+    which JAX computes, and their gradients are ignored.
 
     Attributes:
       arena: [N] the arena of each row.

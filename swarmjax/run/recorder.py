@@ -156,7 +156,8 @@ def history(
     Args:
       run: the run directory.
       update: updates done at the checkpoint.
-      logs: bytes of each log at the checkpoint. Without them, rows are selected by their update.
+      logs: bytes of each log at the checkpoint. Without these lengths, rows are selected by their
+        update.
 
     Raises:
       CheckpointError: if a log is damaged.
