@@ -19,7 +19,7 @@ def check(action: Any, shape: tuple[int, ...], whose: str = "") -> None:
     Args:
       action: action of one or several robots.
       shape: the expected shape.
-      whose: prefix of the error message.
+      whose: text at the start of the error message, such as the name of an agent.
 
     Raises:
       ValueError: if the action has another shape.

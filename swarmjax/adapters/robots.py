@@ -66,7 +66,7 @@ class RobotRow:
         return self._gather(state.observation)
 
     def step(self, state: SwarmState, action: Array) -> tuple[SwarmState, RobotStep]:
-        """Steps all arenas once. Arenas whose episode ends start the next one.
+        """Steps all arenas once. An arena whose episode ends starts its next episode.
 
         Args:
           state: the state before the step.

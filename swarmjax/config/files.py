@@ -215,7 +215,7 @@ def read_preset(group: str, choice: str) -> dict[str, Any]:
 
 
 def preset_of(group: str, held: Section) -> str:
-    """Returns the name of the preset whose values a section has, or `custom` if there is none."""
+    """Returns the name of the preset whose values a section has; `custom` if no preset has them."""
     derived = section.keys(type(held), derived=True)
 
     def numbers(of: Section) -> dict[str, Any]:
@@ -388,7 +388,7 @@ def _parse(word: str) -> object:
 
 
 def _hydra(command: str, overrides: list[str]) -> tuple["DictConfig", dict[str, str]]:
-    """Composes with a separate Hydra instance, and restores the caller's, if there is one.
+    """Composes with a separate Hydra instance, and then restores the caller's instance, if any.
 
     Hydra also returns the choice of each group, because a file may choose files of other groups.
     """

@@ -13,7 +13,7 @@ from swarmjax.config.section import Section
 def group_words(
     cls: type[Section], group: str, held: Section, typed: Sequence[str], skip: Iterable[str] = ()
 ) -> list[str]:
-    """Writes the values of a section as words, except those that a typed choice of a file sets.
+    """Writes a section's values as words, except values that a typed choice of a file sets.
 
     Args:
       cls: the command's dataclass.

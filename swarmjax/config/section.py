@@ -102,13 +102,13 @@ def about(  # noqa: PLR0913  # most calls give two or three
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A group of settings, whose numbers are checked against their bounds when it is made.
+    """A group of settings. When it is made, its numbers are checked against their bounds.
 
     Attributes:
       command: name of the command's file in configs/, if the section holds all keys of a command.
       removed: why a key was removed, by its old name.
       renamed: new names of keys, by old name.
-      inherited: where a section's values come from if no word sets them, by the section's name.
+      inherited: for each section by name, where its values come from if no word sets them.
     """
 
     command: ClassVar[str] = ""

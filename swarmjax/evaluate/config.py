@@ -86,7 +86,7 @@ class EvaluateConfig(Section):
 
     @property
     def step_limit(self) -> int:
-        """Control steps of an episode, unless a cell of a suite has its own."""
+        """Control steps of an episode, unless a cell of a suite has its own number of steps."""
         return STEPS if self.steps is None else self.steps
 
     def _check(self) -> None:

@@ -146,7 +146,7 @@ def _compile(config: EvaluateConfig, half: np.ndarray) -> tuple[mujoco.MjModel, 
     spec.option.iterations = SOLVER_ITERATIONS
     # Numbers that are not finite are better than a robot silently reset to its first place.
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-    # Compiled in rather than set later, so that MuJoCo derives its bounds from them.
+    # The half edges are compiled in, not set later, so that MuJoCo derives its bounds from them.
     for i, edges in enumerate(half):
         spec.geom(f"obstacle{i}_box").size[:2] = edges
     compiled = spec.compile()

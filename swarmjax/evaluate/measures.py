@@ -28,8 +28,8 @@ class Outcome(NamedTuple):
         within its target.
       arrival: [A, R] control steps until the robot arrived, 0 if it has not; with `hold`, control
         steps until it was within its target and stayed there.
-      contacts: [A, R, 3] contacts of each kind of `gaps.KINDS`, including those after arrival.
-      touched: [A, R, 3] control steps that ended in touch, including those after arrival.
+      contacts: [A, R, 3] contacts of each kind of `gaps.KINDS`, also after arrival.
+      touched: [A, R, 3] control steps at whose end the robot touched something, also after arrival.
       impulse: [A, R, 3] normal impulse of the contacts, N s; nan if the engine does not compute it.
       sensed: [A, R] control steps before arrival in which an infrared ray met something in range.
       moving: [A, R] control steps before arrival; with `hold`, control steps that began outside the

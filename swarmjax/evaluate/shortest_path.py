@@ -18,9 +18,8 @@ CORNER = 4  # points for each round corner
 GOAL = 24  # points on the circle around a target, used if the straight way to its centre is blocked
 _SLACK = 1e-6  # m; touching does not block
 _SIGNS = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
-# These three numbers change the computing time, never the result. Times the straight line: paths up
-# to this length are tried first, because most paths are shorter.
-_DETOUR = 1.1
+# These three numbers change the computing time, never the result.
+_DETOUR = 1.1  # times the straight line: paths up to this length are tried first, most are shorter
 _NEAREST = 8  # each line is tested first against this many nearest boxes, which block most lines
 # With more pairs of a line and a box than this, testing the nearest boxes first is faster.
 _MANY = 1000

@@ -26,10 +26,10 @@ draw               each resample                               the interval is a
 =================  ==========================================  ==================================
 
 Drawing dependent values independently makes an interval too narrow. For example, if all runs meet
-the same levels, a hard level is hard for all of them, but `tasks_per_run` would average that out
-over the runs. The last two draws err on the wide side, because they count the spread of single
-values twice (Davison & Hinkley 1997, "Bootstrap Methods and their Application", section 3.8; Owen
-2007, "The pigeonhole bootstrap"). This matters little if there are many tasks.
+the same levels, a hard level is hard for all of them, but `tasks_per_run` would average this
+difficulty out over the runs. The last two draws err on the wide side, because they count the spread
+of single values twice (Davison & Hinkley 1997, "Bootstrap Methods and their Application", section
+3.8; Owen 2007, "The pigeonhole bootstrap"). This matters little if there are many tasks.
 
 Values may be inf, for example the steps to a threshold that was never reached. Inf counts as larger
 than every number. A mean that includes inf is inf, and an end of an interval is inf if too many
@@ -199,7 +199,7 @@ def paired(
     resamples: int = 2000,
     seed: int = 0,
 ) -> Interval[float]:
-    """Computes the interval of a difference: the statistic of b minus that of a.
+    """Computes the interval of a difference: the statistic of b minus the statistic of a.
 
     Both are resampled with the same draws, so that shared influences (a level, a policy) cancel in
     the difference. Values at the same place form a pair.

@@ -90,7 +90,7 @@ def _about(config: EvaluateConfig, suite: str | None) -> dict[str, Any]:
 
 
 def about_cell(config: EvaluateConfig, trial: Trial) -> dict[str, Any]:
-    """Describes the levels of a trial, and counts those that no robot could solve.
+    """Describes the levels of a trial, and counts the levels that no robot could solve.
 
     Args:
       config: Settings of the evaluation.

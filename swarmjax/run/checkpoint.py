@@ -103,8 +103,8 @@ def binding(run: Path) -> Binding | None:
 class Checkpoints:
     """Writes the checkpoints of one run directory, in a `with` block.
 
-    A thread writes them while training continues. The newest ones and the one with the highest
-    score are kept.
+    A thread writes them while training continues. The newest checkpoints and the one with the
+    highest score are kept.
 
     Attributes:
       write_seconds: time to write the newest checkpoint.

@@ -26,7 +26,8 @@ from swarmjax.run.errors import CheckpointError
 CONFIG, SUMMARY, LOCK = "config.json", "summary.json", ".lock"
 METRICS, DECISIONS, EPISODES = "metrics.jsonl", "curriculum.jsonl", "episodes.jsonl"
 LOGS = (METRICS, DECISIONS, EPISODES)
-SAVED = "checkpoints.jsonl"  # a row for each checkpoint written, including those removed since
+# A row for each checkpoint that was written, even if it has been removed since.
+SAVED = "checkpoints.jsonl"
 # Keys of a stored config that may change when a run is resumed: they do not affect past results.
 MAY_CHANGE = ("budget", "devices", "resume", "run", "streams")
 

@@ -533,7 +533,7 @@ def _go_on_or_begin(
 
 
 def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
-    """Refuses to resume a run with settings that differ from its own, and names the keys."""
+    """Refuses to resume a run with other settings than its own, and names the keys that differ."""
     mine, its = (
         leaves({k: v for k, v in each.items() if k not in MAY_CHANGE}) for each in (typed, stored)
     )
