@@ -96,7 +96,7 @@ def to_torch(array: jax.Array) -> Any:
 def to_jax(tensor: Any) -> jax.Array:
     """Gives JAX a tensor without its gradient.
 
-    The tensor is not copied if its memory is contiguous. On a CPU it must also begin at a multiple
-    of 64 bytes. Whole PyTorch tensors do.
+    The tensor is not copied if its memory is contiguous. On a CPU the memory must also begin at a
+    multiple of 64 bytes, as it does in whole PyTorch tensors.
     """
     return jax.dlpack.from_dlpack(tensor.detach().contiguous())
