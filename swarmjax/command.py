@@ -89,8 +89,8 @@ def run(
     Args:
       name: name of the command, such as `train`.
       main: takes the arguments and returns the exit code.
-      settings: the dataclass of the command's keys, for `--help`.
-      also: further errors that the user can fix.
+      settings: the dataclass that defines the command's keys, for `--help`.
+      also: types of further errors that the user can fix.
 
     Returns:
       The exit code: 2 for the user's errors, which are printed in one sentence.
@@ -111,7 +111,7 @@ def run(
     except OSError as error:
         if error.filename is None:
             raise
-        # A file that cannot be read or written, where no command handles the error itself.
+        # A file cannot be read or written, and the command has not handled the error itself.
         name, reason = reading.called(str(error.filename)), error.strerror
         sys.stderr.write(f"{module}: error: {name} cannot be used: {reason}.\n")
         return USER_ERROR

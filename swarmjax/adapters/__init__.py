@@ -1,6 +1,6 @@
 """Adapters that let other libraries step the swarm, one file per library (docs/adapters.md).
 
 Each adapter takes the result of `swarmjax.make_env`. `robots.py` lists the robots of all arenas in
-one row, and `session.py` steps them from the host. Each other file is named after its library. This
-package may import `environment`. `import swarmjax` imports nothing from here.
+one row, and `session.py` steps them from the host. Every other file is named after the library that
+it serves. This package may import `environment`. `import swarmjax` imports nothing from here.
 """

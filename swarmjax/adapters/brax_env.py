@@ -18,7 +18,7 @@ _DROPPED = "device_put_replicated"
 
 
 class SwarmBraxEnv(_base.Env):
-    """Each robot is an environment; all share the policy.
+    """Each robot is one Brax environment, and all robots share one policy.
 
         environment = SwarmBraxEnv(swarmjax.make_env("s1", arenas=64))
         with mended_jax():
@@ -28,12 +28,13 @@ class SwarmBraxEnv(_base.Env):
             )
 
     Use `wrap_env=False`, because this class already maps and restarts the arenas. When an episode
-    ends, the returned observation belongs to the next one. Brax's evaluator ends a robot's episode
-    when the robot arrives. Its `eval/episode_reached` is the share of targets reached.
+    ends, the returned observation belongs to the next episode. Brax's evaluator ends a robot's
+    episode when the robot arrives. The evaluator's metric `eval/episode_reached` is the share of
+    targets reached.
 
-    A robot that has arrived waits for the others, and its transitions must not be learned from.
-    Brax has no mask for that. So these transitions are marked as truncated, which gives them zero
-    advantage and zero value error in Brax, but they stay in its batch. Absent robots are left out.
+    A robot that has arrived waits for the others, and nothing must be learned from its transitions
+    while it waits. Brax cannot mask transitions, so these are marked as truncated. They stay in
+    Brax's batch, but with zero advantage and zero value error. Absent robots are left out.
     """
 
     def __init__(self, swarm: Swarm) -> None:
@@ -56,7 +57,7 @@ class SwarmBraxEnv(_base.Env):
 
     @property
     def backend(self) -> str:
-        """Name of the backend. Brax requires one of its own names."""
+        """Name of the backend, which must be a name that Brax knows."""
         return "mjx"
 
     def reset(self, rng: Array) -> Any:
@@ -106,8 +107,8 @@ class SwarmBraxEnv(_base.Env):
 def mended_jax() -> Iterator[None]:
     """Restores `device_put_replicated` to JAX in a `with` block, if JAX lacks it.
 
-    Brax 0.14.2 calls this function, but JAX 0.10 has removed it. It put a stacked copy on each
-    device.
+    Brax 0.14.2 calls this function, but JAX 0.10 has removed it. The function put one copy of an
+    array on each device, stacked along a new axis.
     """
 
     def replicate(tree: Any, devices: Sequence[Any]) -> Any:

@@ -15,19 +15,19 @@ _batch_space: Any = find("gymnasium.vector.utils", "gymnasium", "batch_space")
 
 
 class SwarmVectorEnv(_vector.VectorEnv):
-    """A vector environment with one sub-environment per robot. All may share a policy.
+    """A vector environment with one sub-environment per robot. All robots may share one policy.
 
         envs = SwarmVectorEnv(swarmjax.make_env("s1", arenas=64))
         observation, info = envs.reset(seed=0)
         observation, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
 
     All robots of an arena end together, when its episode ends. A robot that has arrived stands
-    still until then: its reward is 0, `info["valid"]` is False, and its actions are ignored. In the
-    last step it is `terminated`. Robots that ran out of time are `truncated`.
+    still until then: its reward is 0, `info["valid"]` is False, and its actions are ignored. It is
+    `terminated` in the last step of the episode. Robots that ran out of time are `truncated`.
 
     Autoreset is `SAME_STEP`: when an episode ends, the returned observation belongs to the next
-    one, and `info["final_obs"]` holds the last observation of the old one. Absent robots are left
-    out.
+    one, and `info["final_obs"]` holds the last observation of the old episode. Absent robots are
+    left out.
 
     Attributes:
       arena: [N] the arena of each sub-environment.

@@ -84,7 +84,10 @@ class SwarmMultiAgentEnv(_base):
     def step_env(
         self, key: Array, state: SwarmState, actions: _ByAgent
     ) -> tuple[_ByAgent, SwarmState, _ByAgent, _ByAgent, _ByAgent]:
-        """Does the same as `step`, but at an episode's end returns its last observation."""
+        """Makes a step as `step` does.
+
+        If it ends the episode, it returns the episode's last observation.
+        """
         state, came = self.robots.step(state, self._stack(actions))
         info = {name: getattr(came, name) for name in ("valid", "terminated", "truncated")}
         dones = self._by_agent(_is_done(came)) | {"__all__": came.over[0]}
@@ -95,7 +98,7 @@ class SwarmMultiAgentEnv(_base):
         return self._by_agent(self.robots.observe(state))
 
     def get_avail_actions(self, state: SwarmState) -> _ByAgent:
-        """Returns [U] by agent: False if the robot has arrived and does not act."""
+        """Returns for each agent whether its actions [U] are available; False after its arrival."""
         arrived = state.arenas.arrived[0, self.robots.index]
         free = ~arrived | (self.robots.swarm.world.task.arrival == "hold")
         return self._by_agent(jnp.repeat(free[:, None], self.robots.action_size, axis=1))
@@ -113,5 +116,5 @@ class SwarmMultiAgentEnv(_base):
 
 
 def _is_done(came: RobotStep) -> Array:
-    """Returns [N] whether each robot is done: it has arrived, or has run out of time."""
+    """Returns, for each robot [N], whether it is done: it has arrived, or has run out of time."""
     return came.terminated | came.truncated | ~came.valid | came.over

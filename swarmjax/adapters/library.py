@@ -5,7 +5,7 @@ from typing import Any
 
 
 def fault(action: Any, shape: tuple[int, ...]) -> str | None:
-    """Describes what is wrong with an action's shape or dtype; None if nothing is."""
+    """Describes what is wrong with an action's shape or dtype; None if both are right."""
     if tuple(action.shape) != shape:
         return f"action has the shape {tuple(action.shape)}: give {shape}, speed and turn rate."
     if "float" not in str(action.dtype):
@@ -19,7 +19,7 @@ def check(action: Any, shape: tuple[int, ...], whose: str = "") -> None:
     Args:
       action: action of one or several robots.
       shape: the expected shape.
-      whose: prefix of the error message.
+      whose: text at the start of the error message, such as the name of an agent.
 
     Raises:
       ValueError: if the action has another shape.
@@ -34,7 +34,7 @@ def find(module: str, extra: str, name: str | None = None) -> Any:
     """Imports a module of another library, or one name from it.
 
     Raises:
-      ImportError: if it is missing or too old. The message names the extra to install.
+      ImportError: if the library is missing or too old. The message names the extra to install.
     """
     try:
         found = importlib.import_module(module)

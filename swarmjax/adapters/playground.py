@@ -16,22 +16,24 @@ _config: Any = find("ml_collections.config_dict", "playground", "create")
 
 
 class SwarmMjxEnv(_playground.MjxEnv):
-    """A Playground environment of one arena. A single policy sees and drives all its robots.
+    """A Playground environment of one arena.
+
+    A single policy observes and drives all robots of the arena.
 
         environment = SwarmMjxEnv(swarmjax.make_env("s1", arenas=1))
         wrap = functools.partial(wrapper.wrap_for_brax_training, full_reset=True)
         ppo.train(environment, wrap_env_fn=wrap, episode_length=environment.episode_length, ...)
 
-    Playground has one agent per environment, and its wrappers map over environments. The
-    observation joins those of all robots, [N O], and the action does the same, [N 2]. The reward is
-    the sum over robots. A robot that has arrived stands still: it earns 0, and its actions are
-    ignored. `done` means that all robots have arrived, or that the physics broke.
+    Playground has one agent per environment, and its wrappers map over environments. So an
+    observation here joins the observations of all robots, [N O], and an action joins their actions,
+    [N 2]. The reward is the sum over robots. A robot that has arrived stands still: it earns 0, and
+    its actions are ignored. `done` means that all robots have arrived, or that the physics broke.
 
     Playground's wrapper handles the time limit, as for its own environments. Give the wrapper an
-    `episode_length` no larger than the environment's. With `full_reset=True` it draws new levels,
-    but then Playground 0.2.0 ignores that time ran out, and does not bootstrap. By default it
-    repeats the first level of each environment. For a policy that controls one robot, use
-    `swarmjax.adapters.brax_env`.
+    `episode_length` no larger than the environment's. With `full_reset=True` the wrapper draws new
+    levels, but Playground 0.2.0 then ignores time-outs and does not bootstrap after them. By
+    default the wrapper repeats the first level of each environment. For a policy that controls one
+    robot, use `swarmjax.adapters.brax_env`.
 
     `state.data` is a `SwarmState`, so `render` is not supported. Use `swarmjax.replay`.
     """
@@ -71,7 +73,8 @@ class SwarmMjxEnv(_playground.MjxEnv):
           action: [N 2] speed and turn rate of each robot, floats, clipped to -1..1.
 
         Returns:
-          The state after the step. `metrics["reached"]` is the share of robots that arrived in it.
+          The state after the step. `metrics["reached"]` is the share of robots that arrived in this
+          step.
 
         Raises:
           ValueError: if the action has a wrong shape.
@@ -91,7 +94,7 @@ class SwarmMjxEnv(_playground.MjxEnv):
 
     @property
     def xml_path(self) -> str:
-        """Empty: the model is built by code."""
+        """Empty, because no XML file holds the model: code builds it."""
         return ""
 
     @property

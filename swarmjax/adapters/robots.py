@@ -17,7 +17,8 @@ class RobotStep(NamedTuple):
     """The outcome of a control step, robot by robot.
 
     Attributes:
-      observation: [N, O] the observation to act on. If `over`, it belongs to the next episode.
+      observation: [N, O] the observation to act on. Where `over` is True, it belongs to the next
+        episode.
       last: [N, O] the observation after the step, before any reset.
       reward: [N] the reward; 0 for robots that had already arrived.
       terminated: [N] whether the robot arrived in this step.
@@ -65,11 +66,11 @@ class RobotRow:
         return self._gather(state.observation)
 
     def step(self, state: SwarmState, action: Array) -> tuple[SwarmState, RobotStep]:
-        """Steps all arenas once. Arenas whose episode ends start the next one.
+        """Steps all arenas once. An arena whose episode ends starts its next episode.
 
         Args:
           state: the state before the step.
-          action: [N, U] actions, clipped to -1..1, which spans the range of commands.
+          action: [N, U] actions, clipped to -1..1; -1 and 1 are the ends of the range of commands.
 
         Returns:
           The state after the step, and the outcome.
@@ -103,7 +104,7 @@ def line_up_arena(swarm: Swarm) -> RobotRow:
     """Lists the robots of a swarm with one arena.
 
     Raises:
-      ValueError: if there are more arenas.
+      ValueError: if the swarm has more than one arena.
     """
     if swarm.num_arenas != 1:
         raise ValueError(

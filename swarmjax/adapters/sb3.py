@@ -19,18 +19,19 @@ class SwarmVecEnv(_base):
         model = PPO("MlpPolicy", SwarmVecEnv(swarmjax.make_env("s1", arenas=16)))
         model.learn(500_000)
 
-    Robots that have arrived are handled as by SuperSuit's `black_death`. All robots of an arena are
-    done together, when its episode ends. A robot that has arrived stands still until then: its
-    reward is 0, its actions are ignored, and its steps stay in the batch. In the last step, each
-    info has `terminal_observation`. Its `TimeLimit.truncated` says whether the robot ran out of
-    time. The returned observation then belongs to the next episode. Absent robots are left out.
+    Robots that have arrived are handled as SuperSuit's `black_death` handles them. All robots of an
+    arena are done together, when its episode ends. A robot that has arrived stands still until
+    then: its reward is 0, its actions are ignored, and its steps stay in the batch. In the last
+    step, each info has `terminal_observation`. The info's entry `TimeLimit.truncated` says whether
+    the robot ran out of time. The returned observation then belongs to the next episode. Absent
+    robots are left out.
 
     Attributes:
       arena: [N] the arena of each environment.
       valid: [N] whether the robot was on its way in the last step.
     """
 
-    render_mode = None  # the base class reads it and assigns it again
+    render_mode = None  # the base class reads this attribute and assigns it again
 
     def __init__(self, swarm: Swarm) -> None:
         robots = line_up(swarm)

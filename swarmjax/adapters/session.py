@@ -1,6 +1,6 @@
 """Steps the robots of a swarm from the host with NumPy arrays, for libraries that use them.
 
-All errors are Gymnasium's, for Gymnasium, PettingZoo and Stable-Baselines3 alike.
+All errors have Gymnasium's types, also those for PettingZoo and Stable-Baselines3.
 """
 
 from typing import Any
@@ -16,7 +16,7 @@ errors: Any = find("gymnasium.error", "gymnasium")
 
 
 def spaces(robots: RobotRow) -> tuple[Any, Any]:
-    """Makes Gymnasium's spaces of one robot's observation [O] and action [2]."""
+    """Makes the Gymnasium spaces for one robot's observation [O] and action [2]."""
     box = find("gymnasium.spaces", "gymnasium").Box
     seen, action = robots.swarm.observation_space, robots.swarm.action_space
     return box(-np.inf, np.inf, seen.shape, np.float32), box(action.low, action.high)

@@ -18,14 +18,14 @@ class SwarmTorchEnv:
         observation = env.reset(seed=0)  # [N, O]
         came = env.step(policy(observation))  # [N, 2]
 
-    Each robot is a row. All may share a policy. A step returns a `RobotStep`: act on `observation`,
-    bootstrap from `last` where `truncated`, and learn where `valid`. A robot is `terminated` in the
-    step in which it arrives. After that it is not `valid` and its reward is 0, until its arena is
-    `over` and starts the next episode automatically. Absent robots are left out.
+    Each robot is a row. All robots may share one policy. A step returns a `RobotStep`: act on
+    `observation`, bootstrap from `last` where `truncated`, and learn where `valid`. A robot is
+    `terminated` in the step in which it arrives. After that it is not `valid` and its reward is 0,
+    until its arena is `over` and starts the next episode automatically. Absent robots are left out.
 
-    JAX assumes that its arrays never change. So do not write into a tensor from here, or into an
-    action before the next step has returned. Actions are read without gradients, from the device on
-    which JAX computes.
+    JAX assumes that its arrays never change. So do not write into a tensor that this class has
+    returned, or into an action before the next step has returned. Actions must lie on the device on
+    which JAX computes, and their gradients are ignored.
 
     Attributes:
       arena: [N] the arena of each row.
@@ -96,7 +96,7 @@ def to_torch(array: jax.Array) -> Any:
 def to_jax(tensor: Any) -> jax.Array:
     """Gives JAX a tensor without its gradient.
 
-    The tensor is not copied if its memory is contiguous. On a CPU it must also begin at a multiple
-    of 64 bytes. Whole PyTorch tensors do.
+    The tensor is not copied if its memory is contiguous. On a CPU the memory must also begin at a
+    multiple of 64 bytes, as it does in whole PyTorch tensors.
     """
     return jax.dlpack.from_dlpack(tensor.detach().contiguous())

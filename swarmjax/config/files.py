@@ -21,11 +21,12 @@ if TYPE_CHECKING:
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
-# Limits on a word of the command line. Hydra's grammar takes seconds to read longer ones.
+# Limits on a word of the command line. Hydra's grammar takes seconds to read longer words.
 _MOST_KEY = 200  # letters
 _MOST_VALUE = 5000  # letters
 _MOST_DEPTH = 32  # nested brackets
-# In all words together. A reference may contain several others, so a few more fill the memory.
+# In all words together. A reference may contain several others, so a few references more would fill
+# the memory.
 _MOST_REFERENCES = 16
 
 # Takes the composed data and the choice of each group, and returns the keys and values to check.
@@ -39,7 +40,7 @@ def compose(
 
     Args:
       cls: the command's dataclass, which defines its keys.
-      command: name of its file in configs/.
+      command: name of the command's file in configs/.
       overrides: `key=value` words.
 
     Returns:
@@ -56,7 +57,7 @@ def compose(
     for key in words.keys() - groups.keys():
         _parse(words[key])
     for group, choice in (defaults(command) | groups).items():
-        read_choice(group, choice)  # its error names a broken file; Hydra's does not
+        read_choice(group, choice)  # this error names a broken file, but Hydra's error does not
     forced = [word if key in groups else f"++{word}" for key, word in words.items()]
     composed, chosen = _hydra(command, [word for word in forced if not _is_of(word, own)])
     mapping = _resolve(composed)
@@ -98,8 +99,8 @@ def load[C: Section](cls: type[C], overrides: Sequence[str], complete: Complete 
     Args:
       cls: the command's dataclass. Its `command` names the file in configs/.
       overrides: the words.
-      complete: takes the composed data and the choice of each group, and returns the keys and
-        values to check. None checks the composed data.
+      complete: a function that takes the composed data and the choice of each group, and returns
+        the keys and values to check. None checks the composed data itself.
 
     Returns:
       The settings.
@@ -158,10 +159,10 @@ def read_file(name: str) -> dict[str, Any]:
     """Reads one file of configs/ without composing it.
 
     Args:
-      name: its path there without the ending, such as `stage/s6`.
+      name: path of the file in configs/, without the ending, such as `stage/s6`.
 
     Raises:
-      ConfigError: if it cannot be read.
+      ConfigError: if the file cannot be read.
     """
     return read_yaml(_config_dir() / f"{name}.yaml")
 
@@ -174,7 +175,7 @@ def read_choice(group: str, choice: str) -> dict[str, Any]:
       choice: the name of a file in it, or the path of another file.
 
     Raises:
-      ConfigError: if it cannot be read, or if it is a user's file that chooses other files.
+      ConfigError: if the file cannot be read, or if it is a user's file that chooses other files.
     """
     if not is_path(choice):
         return read_file(f"{group}/{choice}")
@@ -191,7 +192,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """Reads a file of keys and values without composing it.
 
     Raises:
-      ConfigError: if it cannot be read, or does not hold keys and values.
+      ConfigError: if the file cannot be read, or does not hold keys and values.
     """
     mapping = reading.read_yaml(path)
     if mapping is None:
@@ -214,7 +215,7 @@ def read_preset(group: str, choice: str) -> dict[str, Any]:
 
 
 def preset_of(group: str, held: Section) -> str:
-    """Returns the name of the preset whose values a section has, or `custom` if there is none."""
+    """Returns the name of the preset whose values a section has; `custom` if no preset has them."""
     derived = section.keys(type(held), derived=True)
 
     def numbers(of: Section) -> dict[str, Any]:
@@ -250,7 +251,7 @@ def check_choice(group: str, choice: str, key: str) -> None:
     Args:
       group: a folder of configs/.
       choice: the name of a file in it, or the path of another file.
-      key: its name in messages.
+      key: name of the setting in messages.
 
     Raises:
       ConfigError: if there is no such file.
@@ -387,7 +388,7 @@ def _parse(word: str) -> object:
 
 
 def _hydra(command: str, overrides: list[str]) -> tuple["DictConfig", dict[str, str]]:
-    """Composes with a separate Hydra instance, and restores the caller's, if there is one.
+    """Composes with a separate Hydra instance, and then restores the caller's instance, if any.
 
     Hydra also returns the choice of each group, because a file may choose files of other groups.
     """

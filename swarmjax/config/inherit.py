@@ -13,12 +13,12 @@ from swarmjax.config.section import Section
 def group_words(
     cls: type[Section], group: str, held: Section, typed: Sequence[str], skip: Iterable[str] = ()
 ) -> list[str]:
-    """Writes the values of a section as words, except those that a typed choice of a file sets.
+    """Writes a section's values as words, except values that a typed choice of a file sets.
 
     Args:
       cls: the command's dataclass.
-      group: the section's name in it, such as `robot`.
-      held: the section of the run or policy.
+      group: name of the section in that dataclass, such as `robot`.
+      held: the section with the values of the run or policy.
       typed: the words of the command line.
       skip: keys of the section to leave out.
 
@@ -27,7 +27,7 @@ def group_words(
     """
     words = files.split_words(cls, typed)
     own = files.read_choice(group, files.choice_of(words[group])) if group in words else {}
-    left = {*skip, *own.get(group, own)}  # a file for the whole config nests its groups
+    left = {*skip, *own.get(group, own)}  # in a file for the whole config, each group is nested
     cls_held = type(held)
     default, derived = section.to_dict(cls_held()), section.keys(cls_held, derived=True)
     return [
@@ -42,8 +42,8 @@ def preset_words(cls: type[Section], group: str, held: Any, typed: Sequence[str]
 
     Args:
       cls: the command's dataclass.
-      group: the section's name in it, such as `realism`.
-      held: the section of the run or policy. Its `name` is the name of its preset.
+      group: name of the section in that dataclass, such as `realism`.
+      held: the section with the values of the run or policy. Its `name` is the name of its preset.
       typed: the words of the command line.
 
     Returns:

@@ -15,9 +15,9 @@ from typing import Any, BinaryIO
 
 from swarmjax.config.section import ConfigError, show
 
-MOST_TYPED = 2**20  # bytes of a file that a person writes; files of configs/ are 1000 times smaller
-MOST_MADE = 2**24  # bytes of a file that the project writes, such as a run's config
-_MOST_LINE = 2**24  # bytes of a line in a file with one object per line
+MOST_TYPED = 2**20  # bytes in a file that a person writes; files of configs/ are 1000 times smaller
+MOST_MADE = 2**24  # bytes in a file that the project writes, such as a run's config
+_MOST_LINE = 2**24  # bytes in one line of a file with one object per line
 _MOST_NODES = 200_000  # values in a YAML file, after its aliases are expanded
 _MOST_DEPTH = 32  # nested lists and mappings
 _MOST_SCALAR = 5000  # letters of one value; a path may have 4096
@@ -31,7 +31,7 @@ def read_bytes(path: Path, most: int = MOST_TYPED) -> bytes:
       most: maximum size, bytes.
 
     Raises:
-      ConfigError: if it is missing, not a regular file, too large or unreadable.
+      ConfigError: if the file is missing, not a regular file, too large or unreadable.
     """
     with _explained(path), _open(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -71,7 +71,7 @@ def read_text(path: Path, most: int = MOST_TYPED) -> str:
       most: maximum size, bytes.
 
     Raises:
-      ConfigError: as `read_bytes`, or if it is not UTF-8 text.
+      ConfigError: as in `read_bytes`, or if the file is not UTF-8 text.
     """
     try:
         return read_bytes(path, most).decode()
@@ -96,7 +96,7 @@ def read_json(path: Path, most: int = MOST_MADE) -> Any:
       most: maximum size, bytes.
 
     Raises:
-      ConfigError: as `read_text`, or if it is not JSON.
+      ConfigError: as in `read_text`, or if the file is not JSON.
     """
     return parse_json(read_text(path, most), called(path))
 
@@ -106,10 +106,11 @@ def parse_json(text: str, where: str) -> Any:
 
     Args:
       text: the whole text.
-      where: its name in messages.
+      where: name of the text in messages.
 
     Raises:
-      ConfigError: if it is not JSON, is nested too deeply, or holds a number with too many digits.
+      ConfigError: if the text is not JSON, is nested too deeply, or holds a number with too many
+        digits.
     """
     try:
         found = json.loads(text)
@@ -154,7 +155,8 @@ def read_lines(path: Path) -> Iterator[bytes]:
       path: the file.
 
     Raises:
-      ConfigError: if it is missing, not a regular file or unreadable, or if a line is too long.
+      ConfigError: if the file is missing, not a regular file or unreadable, or if a line is too
+        long.
     """
     with _explained(path), _open(path) as file:
         while line := file.readline(_MOST_LINE + 1):
@@ -176,7 +178,7 @@ def read_yaml(path: Path) -> Any:
       Its content as plain data. Text such as `1e6` is read as a number, and a date as text.
 
     Raises:
-      ConfigError: as `read_text`, or if it is not YAML or expands to too many values.
+      ConfigError: as in `read_text`, or if the file is not YAML or expands to too many values.
     """
     import yaml
 

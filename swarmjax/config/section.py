@@ -16,16 +16,17 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
 MAX_COUNT = 2**31 - 1  # counts and seeds are int32 on the device
-# Other numbers are float32. It holds nothing larger, and a device rounds smaller sizes to 0.
+# Other numbers are float32, which holds nothing beyond `_LARGEST`. A device rounds numbers nearer
+# to 0 than `_SMALLEST` to 0.
 _LARGEST, _SMALLEST = 3.4e38, 1.2e-38
 _MOST_NAME = 255  # bytes in a file name, on Linux, macOS and Windows
 _MOST_PATH = 4095  # bytes in a path on Linux, which allows the most
-_MOST_BITS = 13_000  # of a number to print; Python refuses to print more than 4300 digits
+_MOST_BITS = 13_000  # bits of a number to print; Python refuses to print more than 4300 digits
 _SHOWN = 80  # letters of a value to show in a message
 
 
 class ConfigError(ValueError):
-    """Says in one sentence, to the person who typed it, why a setting is refused."""
+    """Tells the user in one sentence why a setting is refused."""
 
 
 @dataclass(frozen=True)
@@ -85,11 +86,11 @@ def about(  # noqa: PLR0913  # most calls give two or three
 
     Args:
       meaning: the meaning of the key, with its unit.
-      low: the smallest number it accepts.
-      high: the largest number it accepts.
-      above: a number that it must exceed.
-      below: a number that it must stay below.
-      derived: whether the chosen files determine it, so that the command line cannot set it.
+      low: the smallest number that the key accepts.
+      high: the largest number that the key accepts.
+      above: a number that the value must exceed.
+      below: a number that the value must stay below.
+      derived: whether the chosen files determine the value, so that the command line cannot set it.
       stored: whether `to_dict` keeps it. Other fields are computed again.
       renamed: new names of values, by old name.
       reason: why `high` is the limit and how to raise it, for the error message.
@@ -101,13 +102,13 @@ def about(  # noqa: PLR0913  # most calls give two or three
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A group of settings, whose numbers are checked against their bounds when it is made.
+    """A group of settings. When it is made, its numbers are checked against their bounds.
 
     Attributes:
       command: name of the command's file in configs/, if the section holds all keys of a command.
       removed: why a key was removed, by its old name.
       renamed: new names of keys, by old name.
-      inherited: where a section's values come from if no word sets them, by the section's name.
+      inherited: for each section by name, where its values come from if no word sets them.
     """
 
     command: ClassVar[str] = ""
@@ -127,11 +128,17 @@ class Section:
         self._check()
 
     def _check(self) -> None:
-        """Refuses invalid combinations of values. Messages name keys within this section."""
+        """Refuses invalid combinations of values.
+
+        Messages give the keys without the section's name.
+        """
 
 
 class ByName(dict[str, Any]):
-    """Values by names that the section does not define. Never edited, so that settings can hash."""
+    """A mapping to values from names that no section defines.
+
+    It is never changed, so that settings are hashable.
+    """
 
     def __hash__(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         return hash(frozenset(self.items()))
@@ -152,7 +159,7 @@ def _leaves(value: object) -> Iterator[object]:
 
 
 def _ranges(hint: object, value: object) -> Iterator[tuple[Any, ...]]:
-    """Yields the value if it is a range, or the ranges that it holds."""
+    """Yields the value itself if it is a range, otherwise the ranges within it."""
     if isinstance(value, tuple) and _is_list(hint):
         for item in value:
             yield from _ranges(typing.get_args(hint)[0], item)
@@ -309,7 +316,7 @@ class KeyLine(NamedTuple):
     Attributes:
       key: the dotted key.
       default: its default as it would be typed, or the source of its default in angle brackets.
-      meaning: its meaning, with its unit; empty if the field has none.
+      meaning: meaning and unit of the key; empty if the field states none.
       allowed: the type and bounds of its values.
     """
 
@@ -358,7 +365,7 @@ def describe_keys(cls: type[Section], chosen: Collection[str] | None = None) -> 
 
 
 def unknown_key(key: str, cls: type[Section], where: str = "") -> ConfigError:
-    """Makes the error for a key that does not exist, with the key that was probably meant.
+    """Makes the error for a key that does not exist, and names the key that was probably meant.
 
     Args:
       key: the key as it was given, without its prefix.
@@ -423,7 +430,7 @@ def convert(hint: object, value: object, key: str) -> object:
     Args:
       hint: the type.
       value: the data.
-      key: its name in messages.
+      key: name of the setting in messages.
 
     Raises:
       ConfigError: if the data cannot be converted.
@@ -461,7 +468,7 @@ def _listed(hint: object, value: object, key: str) -> tuple[object, ...]:
 
 
 def _by_name(hint: object, value: object, key: str) -> "ByName":
-    """Converts values of one type, by names that the section does not define."""
+    """Converts a mapping from names, which no section defines, to values of one type."""
     if not isinstance(value, Mapping):
         raise ConfigError(f"{key} is {show(value)}: give values by name, as in {key}.NAME=1.")
     for name in value:
@@ -494,15 +501,15 @@ def _scalar(hint: object, value: object) -> object:
 
 
 def check_text(key: str, text: str) -> None:
-    """Refuses text that cannot be a path or name, before anything is done with it.
+    """Refuses text that cannot be a path or name, before the text is used.
 
     Args:
-      key: its name in messages.
+      key: name of the setting in messages.
       text: a path, a name, or several separated by commas.
 
     Raises:
-      ConfigError: if it has a control character, is not valid Unicode, or is too long for a file
-        name or path.
+      ConfigError: if the text has a control character, is not valid Unicode, or is too long for a
+        file name or path.
     """
     if any(ord(letter) < 32 or 127 <= ord(letter) < 160 for letter in text):
         raise ConfigError(f"{key} is {show(text)}: give text without control characters.")

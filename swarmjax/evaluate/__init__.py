@@ -1,7 +1,7 @@
-"""The judge of policies: levels that they never trained on, and another engine than training's.
+"""Judges policies on levels that they never trained on, in another engine than that of training.
 
-It imports `task`, `sim` and policy files, and no JAX. Two modules differ: `engine_mjx.py` judges on
-the device and imports `training` and `ppo` too, and `trials.py` stores its programs in `run`'s
-cache. `cells.py` draws or reads the levels, `trials.py` runs the episodes, and `measures.py` and
-`statistics.py` compute the figures. Start with `evaluation.evaluate`.
+It imports `task`, `sim` and policy files, and no JAX. Two modules import more: `engine_mjx.py`
+judges on the device and imports `training` and `ppo` too, and `trials.py` stores its programs in
+`run`'s cache. `cells.py` draws or reads the levels, `trials.py` runs the episodes, and
+`measures.py` and `statistics.py` compute the figures. Start with `evaluation.evaluate`.
 """

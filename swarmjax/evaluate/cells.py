@@ -30,10 +30,10 @@ from swarmjax.task.stage_config import StageConfig
 FORMAT = 1
 _NEWER = ("steps", "hull_friction")  # keys of a cell that files of the first version lack
 _TARGET_RADIUS = TaskConfig().target_radius
-_LARGEST_HALF = 2.5  # m, of a box: longer than half the largest arena
-MAX_BYTES = 2**30  # of all levels of a file; a thousand levels of s6 take 0.2 MB
-_LEAST_ROOM = 2**22  # bytes to which any file may unpack, plus `_PACKED` times its own
-_PACKED = 20  # most that packing may shrink: random numbers halve, never to a thousandth
+_LARGEST_HALF = 2.5  # m, largest half edge of a box: longer than half the largest arena
+MAX_BYTES = 2**30  # bytes of all levels of a file; a thousand levels of s6 take 0.2 MB
+_LEAST_ROOM = 2**22  # bytes to which any file may unpack, plus `_PACKED` times its own size
+_PACKED = 20  # most times by which packing may shrink a file: random numbers only halve
 
 
 class Cell(NamedTuple):
@@ -43,12 +43,12 @@ class Cell(NamedTuple):
       name: Name of the cell.
       stage: Settings of the stage.
       shape: Shape of the obstacles.
-      realism: Name of a preset, or None for the command's.
+      realism: Name of a preset, or None for the command's preset.
       seed: Seed of the levels.
       episodes: [E] numbers of the levels.
-      levels: [E] levels, with obstacles as the boxes that they consist of.
-      steps: Control steps of an episode, or None for the command's.
-      hull_friction: Friction of the robots' hulls, or None for the command's.
+      levels: [E] levels, in which each obstacle is given as the boxes that it consists of.
+      steps: Control steps of an episode, or None for the command's number.
+      hull_friction: Friction of the robots' hulls, or None for the command's value.
     """
 
     name: str
@@ -68,17 +68,17 @@ class Cell(NamedTuple):
 
     @property
     def half(self) -> np.ndarray:
-        """[M, 2] half edges of the first level's boxes, m; those of other levels may differ."""
+        """[M, 2] half edges of the first level's boxes, m; boxes of other levels may differ."""
         return self.levels.obstacle[0, :, 3:]
 
     @property
     def largest_half(self) -> np.ndarray:
-        """[M, 2] largest half edges of each box in any level, m."""
+        """[M, 2] for each box, the largest half edges that it has in any level, m."""
         return self.levels.obstacle[..., 3:].max(axis=0)
 
 
 class Suite(NamedTuple):
-    """A list of cells with a name, or None as the name if they come from a single stage."""
+    """A named list of cells. The name is None if the cells come from a single stage."""
 
     name: str | None
     cells: tuple[Cell, ...]
@@ -165,7 +165,7 @@ def draw_stage(config: EvaluateConfig, numbers: Sequence[int]) -> Cell:
 
 
 def draw_cell(cell: CellConfig) -> Cell:
-    """Draws the levels of a cell of a suite, without checking its digest."""
+    """Draws the levels of a suite's cell, without checking the cell's digest."""
     numbers, radii = cell.episodes or range(cell.levels), (epuck.HULL_RADIUS, _TARGET_RADIUS)
     levels = _draw(cell.stage, cell.shape, cell.seed, numbers, radii)
     episodes = np.array(numbers)
@@ -190,7 +190,7 @@ def _draw(
 
 
 def split(levels: Level) -> list[Level]:
-    """Takes stacked levels [E] apart."""
+    """Splits stacked levels [E] into a list of single levels."""
     return [Level(*each) for each in zip(*levels, strict=True)]
 
 
@@ -272,7 +272,7 @@ def _unpack(content: bytes) -> dict[str, np.ndarray]:
                 each.filename.removesuffix(".npy"): policy.read_array(archive, each)
                 for each in members
             }
-    except Exception as error:  # zipfile and NumPy raise many kinds for a damaged file
+    except Exception as error:  # zipfile and NumPy raise many types of errors for a damaged file
         reason = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
         raise ConfigError(f"it cannot be read: {reason}.") from None
 

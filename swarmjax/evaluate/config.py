@@ -13,8 +13,8 @@ from swarmjax.task.shapes import Shape
 from swarmjax.task.stage_config import StageConfig
 
 MOST_STEPS = 1_000_000  # control steps of an episode; nine hours
-STEPS = 1500  # of an episode by default; Table 1
-MOST_EPISODES = 1_000_000  # their levels take some gigabytes
+STEPS = 1500  # control steps of an episode by default; Table 1
+MOST_EPISODES = 1_000_000  # the levels of so many episodes take some gigabytes
 # Values that `witness.load` takes from the policies.
 AS_TRAINED = {
     "stage": "its last stage",
@@ -86,7 +86,7 @@ class EvaluateConfig(Section):
 
     @property
     def step_limit(self) -> int:
-        """Control steps of an episode, unless a cell of a suite has its own."""
+        """Control steps of an episode, unless a cell of a suite has its own number of steps."""
         return STEPS if self.steps is None else self.steps
 
     def _check(self) -> None:

@@ -9,11 +9,11 @@ from swarmjax.evaluate.statistics import Interval, Statistic, bootstrap, checked
 
 
 def area_under(steps: ArrayLike, values: ArrayLike) -> np.ndarray:
-    """Computes the mean height of learning curves: their area by trapezoids over their width.
+    """Computes the mean height of learning curves: area (by trapezoids) divided by width.
 
     Args:
-      steps: [points] rising steps of the curves' points.
-      values: [..., points] of any unit, finite.
+      steps: [points] the steps at which the curves have their points, rising.
+      values: [..., points] finite values of the curves, in any unit.
 
     Returns:
       [...] in the unit of values.
@@ -32,8 +32,8 @@ def steps_to(steps: ArrayLike, values: ArrayLike, threshold: float) -> np.ndarra
     should be means over enough episodes.
 
     Args:
-      steps: [points] rising steps of the curves' points.
-      values: [..., points] of any unit, finite.
+      steps: [points] the steps at which the curves have their points, rising.
+      values: [..., points] finite values of the curves, in any unit.
       threshold: threshold to reach from below, in the same unit.
 
     Returns:
@@ -77,11 +77,11 @@ def curve(
 ) -> Interval[np.ndarray]:
     """Computes the interval of a statistic over runs at each point of their curves.
 
-    All points use the same draws, so runs are drawn with their whole curves. The band holds at each
-    point by itself, not at all points at once.
+    All points use the same draws, so each drawn run contributes its whole curve. The confidence
+    holds for each point by itself, not for all points at once.
 
     Args:
-      values: [runs, points] of any unit, at least three runs.
+      values: [runs, points] values in any unit, of at least three runs.
       statistic: as in `bootstrap`, called on [..., runs, 1].
       confidence: as in `bootstrap`.
       resamples: as in `bootstrap`.

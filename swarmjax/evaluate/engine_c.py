@@ -46,7 +46,7 @@ class Arenas(NamedTuple):
       target: [A, R, 2] x (m), y (m).
       obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
       level: [A] levels that the episodes started from.
-      seed: [A] uint32 of the levels.
+      seed: [A] seeds of the levels, uint32.
       pose: [A, R, 3] x (m), y (m), yaw (rad).
       observation: [A, R, O].
       apart: [A, R, 3] time since the last contact of each kind, s.
@@ -116,7 +116,7 @@ def simulate(
 ) -> Outcome:
     """Runs episodes side by side, each until all its robots have arrived or the time is out.
 
-    With `task.arrival=hold` they have arrived once all robots are within their targets.
+    With `task.arrival=hold` an episode ends once all its robots are within their targets.
 
     Args:
       judge: Data that the arenas share.
@@ -124,7 +124,7 @@ def simulate(
       controller: Controller of the robots; None: the judge's policy.
 
     Returns:
-      The outcomes of the episodes, in their order.
+      The outcomes of the episodes, in the order of `levels`.
 
     Raises:
       ConfigError: The physics of an episode breaks down.
@@ -234,7 +234,10 @@ def _models(judge: Judge, factors: Factors, half: np.ndarray) -> np.ndarray:
 
 
 def _with_boxes(judge: Judge, half: np.ndarray) -> np.ndarray:
-    """Returns models [A] with boxes of these half edges [A, M, 2]; only one if all are alike."""
+    """Returns models [A] with boxes of these half edges [A, M, 2].
+
+    All arenas whose boxes equal those in the judge's model share that model.
+    """
     models = np.full(len(half), judge.model, object)
     compiled = judge.model.geom_size[judge.ids.obstacle_geom, :2]
     for i in np.flatnonzero((half != compiled).any(axis=(1, 2))):
@@ -256,7 +259,7 @@ def place(
       model: Model of the arena.
       pose: [R, 3] x (m), y (m), yaw (rad).
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m; equal to the model's).
-      side: Side of the arena, m; None: the stage's.
+      side: Side of the arena, m; None: the side that the stage gives.
 
     Returns:
       The arena, with positions up to date.
@@ -277,7 +280,8 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
     Args:
       judge: Data that the arenas share.
       arenas: Their state before.
-      action: [A, R, U] of the robots, -1..1; None: actions of a policy without memory.
+      action: [A, R, U] actions of the robots, -1..1; None: the policy, which must have no memory,
+        chooses them.
 
     Returns:
       Their state after.
@@ -336,12 +340,12 @@ def _hear(
     if not settings.count:
         return sight
     hidden = rays.hidden(judge.scene, data, pose, obstacle, settings.range)
-    present = np.ones(pose.shape[:2], bool)  # the judge has no other robots
+    present = np.ones(pose.shape[:2], bool)  # in the judge no robot is absent
     return sight._replace(heard=hearing.reachable(pose, present, hidden, said, settings, np))
 
 
 class _Step(NamedTuple):
-    """The events of a control step, [A, R] each, with three kinds of contact or K rays.
+    """The events of a control step: [A, R], and for contacts [A, R, 3] by kind, for rays [A, R, K].
 
     `arrived` tells which robots have arrived after the step, and `near` which rays met something.
     """
@@ -408,7 +412,10 @@ def _drive(
 
 
 class _Pushes(NamedTuple):
-    """Pushing contacts [N] of an arena in a physics step: geoms [N, 2] and normal forces, N."""
+    """The N pushing contacts of an arena in a physics step.
+
+    Their geoms are [N, 2], and their normal forces [N] are in newtons.
+    """
 
     geom: np.ndarray
     force: np.ndarray
@@ -420,7 +427,7 @@ def _advance(
     """Moves one arena by a control step; returns the contacts of each physics step."""
     data.ctrl = ctrl
     pushes = []
-    # The two halves of mj_step, in reverse order: the rays of this control step then see the
+    # The two halves of mj_step run in reverse order, so that the rays of this control step see the
     # positions from which the next step starts. Between the halves, the forces belong to the listed
     # contacts.
     for _ in range(judge.substeps):
@@ -458,7 +465,7 @@ def _impulses(judge: Judge, pushes: list[_Pushes], arenas: int) -> np.ndarray:
       arenas: A.
 
     Returns:
-      [A, R, 3]; when two robots touch each other, both have the impulse.
+      [A, R, 3]; when two robots touch each other, the impulse counts for both.
     """
     counts = [len(each.force) for each in pushes]
     arena = np.repeat(np.arange(len(pushes)) // judge.substeps, counts)
@@ -507,7 +514,7 @@ def look(
     Args:
       judge: Data that the arenas share.
       data: [A] of `MjData`, positions up to date.
-      factors: [A] of the episodes.
+      factors: [A] factors of the episodes' robots.
       pose: [A, R, 3] x (m), y (m), yaw (rad).
       target: [A, R, 2] x (m), y (m).
       obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).

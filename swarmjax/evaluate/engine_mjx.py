@@ -1,9 +1,9 @@
-"""Judges policies on the device and in the engine that trains: many arenas at once.
+"""Judges policies on the training device and in the training engine, many arenas at once.
 
-The levels are those of `swarmjax.evaluate`, drawn by the same function from the same seed, and the
-rules and figures are the same. The engine differs: it is the training engine, with its analytic
-sensors and few solver steps. Published results come from MuJoCo C. This engine is cheap, which
-suits studies that judge their policies again and again while they learn.
+The levels are the same as in `swarmjax.evaluate`, drawn by the same function from the same seed,
+and the rules and figures are the same. The engine differs: it is the training engine, with its
+analytic sensors and few solver steps. Published results come from MuJoCo C. This engine is cheap,
+which suits studies that judge their policies again and again while they learn.
 """
 
 import functools
@@ -41,7 +41,7 @@ from swarmjax.task.level import Level, Spacing
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import rollout
 
-LARGEST_BOX = 0.3  # m; the largest that a stage allows
+LARGEST_BOX = 0.3  # m; largest size of a box that a stage allows
 _ACTIVATIONS = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}
 
 
@@ -67,7 +67,8 @@ def draw_levels(world: World, stage: StageConfig, seed: int, episodes: int) -> L
     """Draws the levels of `swarmjax.evaluate`, padded to the world's robots and obstacles.
 
     Args:
-      world: the compiled environment, from a config with this stage or one with obstacles as large.
+      world: the compiled environment. Its config has this stage, or a stage with obstacles as
+        large.
       stage: stage of the levels.
       seed: seed of the evaluation.
       episodes: E.
@@ -234,7 +235,7 @@ def _act(
     memory: Any,
     arenas: EnvState,
 ) -> tuple[Any, Array]:
-    """Returns the actions [E, R, U]; if they are drawn, from the judge's random numbers."""
+    """Returns the actions [E, R, U]: drawn with the judge's random numbers, or the means."""
     memory, action = mean(memory, arenas.observation)
     if log_std is None:
         return memory, action
@@ -252,7 +253,7 @@ def _mean_action(
     memory: Any,
     observation: Array,
 ) -> tuple[Any, Array]:
-    """Computes `policy.step` without noise, [E, R, U], in full precision on every device."""
+    """Computes the actions [E, R, U] of `policy.step` without noise, always in full precision."""
     layers, mean, std, params, hearing, parts = weights
     robots = slice(observation.shape[-2])
     x = jnp.clip((observation - mean[robots]) / std[robots], -limit, limit)
@@ -280,7 +281,7 @@ def _hear(activate: Callable[[Array], Array], layer: Any, count: int, x: Array) 
 
 
 def _dense(x: Array, layer: tuple[ArrayLike, ArrayLike], robots: slice) -> Array:
-    """Applies a dense layer [E, R, in] -> [E, R, out], of one learner or of one for each robot."""
+    """Applies a dense layer [E, R, in] -> [E, R, out], shared by all robots or one per robot."""
     kernel, bias = (jnp.asarray(part)[robots] for part in layer)
     kernel = jnp.broadcast_to(kernel, (x.shape[-2], *kernel.shape[1:]))
     return jnp.einsum("eri,rio->ero", x, kernel, precision=jax.lax.Precision.HIGHEST) + bias
@@ -299,8 +300,8 @@ def outcomes(
 
     The function is pure: `jit` it with `world`, `config` and `steps` bound, and `vmap` it over the
     seeds of `learners`. With `impl=warp`, load the world for the number of arenas that are judged
-    together (E, or E for every seed), because MJX-Warp sizes its memory of contacts for that
-    number. The world's `task.step_limit` is ignored.
+    together (E, or E times the number of seeds), because MJX-Warp sizes its memory of contacts for
+    that number. The world's `task.step_limit` is ignored.
 
     Args:
       world: the compiled environment.
@@ -311,7 +312,8 @@ def outcomes(
       sampled: whether to draw the actions from the policies; otherwise they are their means.
 
     Returns:
-      [E] outcomes. An episode whose physics breaks ends there, with its robots where they were.
+      [E] outcomes. An episode whose physics breaks ends at that step, with its robots where they
+      were before it.
     """
     act = partial(_choose, config, learners, sampled=sampled)
     memory = networks.begin_memory(config, levels.present.shape)
@@ -351,7 +353,7 @@ class _Counts(NamedTuple):
     still: Array
 
 
-# Takes a memory [E, R, H] or None, and arenas; returns the memory after, and actions.
+# Takes a memory [E, R, H] or None, and arenas; returns the new memory, and actions.
 _Actor = Callable[[Any, EnvState], tuple[Any, Array]]
 
 

@@ -22,8 +22,8 @@ class Evaluation(NamedTuple):
 
     Attributes:
       result: Plain data for JSON; docs/interface.md lists it.
-      entrants: The policies, of both sides for a comparison.
-      trials: Results, one for each cell; rows as in `entrants`.
+      entrants: The policies; in a comparison, the policies of both sides.
+      trials: The results for each cell, with one row for each policy in `entrants`.
     """
 
     result: dict[str, Any]
@@ -42,8 +42,8 @@ def evaluate(
     Args:
       settings: Settings of the evaluation.
       progress: Progress display; None shows nothing.
-      announce: Called once all inputs are checked, before the first episode, with the number of
-        cells already judged, and the number of all cells.
+      announce: Called once all inputs are checked, before the first episode, with two numbers: of
+        the cells already judged, and of all cells.
       keep: Folder to save each finished cell in, from which the same evaluation resumes; None
         saves nothing.
 
@@ -61,7 +61,7 @@ def evaluate(
 
 
 def judge_entrants(settings: EvaluateConfig, entrants: list[Entrant]) -> Evaluation:
-    """Judges policies that have been read already, of one recipe.
+    """Judges policies of one recipe that have already been read from their files.
 
     Args:
       settings: Settings of the evaluation; its `policy` is ignored.
@@ -109,7 +109,7 @@ def _judge(
 def _show_bars(
     progress: Progress, all_cells: Sequence[Cell], done: Collection[int], policies: int
 ) -> tuple[Callable[[int], None], Callable[[int], None]]:
-    """Shows the progress; returns functions that advance the episodes and the cells."""
+    """Shows the progress; returns functions that count finished episodes and cells."""
     episodes = [policies * len(cell.episodes) for cell in all_cells]
     before = sum(episodes[row] for row in done)
     bars = (
@@ -164,7 +164,7 @@ def list_files(key: str, text: str) -> list[str]:
       text: Paths and patterns such as `runs/a-seed*.npz`, separated by commas.
 
     Returns:
-      The paths; those of a pattern in alphabetical order.
+      The paths. Paths that match the same pattern are in alphabetical order.
 
     Raises:
       ConfigError: A pattern matches nothing, or a file is named twice.

@@ -54,13 +54,14 @@ def intervals(result: Mapping[str, Any]) -> Figure:
 
 
 def _mark(axes: Axes, cells: Sequence[Mapping[str, Any]], name: str) -> None:
-    """Draws a row for each cell: intervals as bars."""
+    """Draws a row for each cell, with intervals as bars."""
     found = [cell["measures"][name] for cell in cells]
     rows = np.arange(len(cells))
     for key, mark, colour, shift in (("mean", "o", _MARK, -0.12), ("iqm", "|", "0.35", 0.12)):
         middle = np.array([each[key] for each in found])
         ends = np.array([each[f"{key}_interval"] or [each[key]] * 2 for each in found])
-        # A percentile interval need not contain the estimate, so its bar is drawn by itself.
+        # A percentile interval need not contain the estimate, so bar and estimate are drawn
+        # separately.
         label = f"{key if key == 'mean' else 'IQM'}, 95 %"
         axes.hlines(rows + shift, ends[:, 0], ends[:, 1], color=colour)
         axes.plot(middle, rows + shift, mark, color=colour, label=label)

@@ -27,7 +27,7 @@ from swarmjax.task.electronics import Electronics
 from swarmjax.task.observation import View
 from swarmjax.task.stage_config import StageConfig
 
-SOLVER_ITERATIONS = 100  # at most, MuJoCo's default; it stops at its tolerance of 1e-8
+SOLVER_ITERATIONS = 100  # at most, MuJoCo's default; the solver stops at its tolerance of 1e-8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,18 +37,19 @@ class Judge:
     Attributes:
       config: Settings of the evaluation.
       policy: The policy that drives.
-      stage: Stage of the levels, fields [].
+      stage: Stage of the levels, with scalar fields [].
       spacing: Sizes for drawing levels.
       drive: The robot's drive, with the range of commands that the policy was trained for.
       electronics: The electronics between policy and world, with the observations of the policy's
         training.
       model: The compiled arena.
-      ids: Rows of its moving bodies.
+      ids: Rows of the model's moving bodies.
       scene: The scene for infrared rays.
       geom_robot: For each geom, the robot whose contact geom it is, else -1.
       geom_kind: For each geom, the index in `gaps.KINDS` of the thing that it belongs to.
       substeps: Physics steps of a control step.
-      own: Observations of an extension, [A, R, E] from a view [A]; None without any.
+      own: Function that computes the extension's observations [A, R, E] from a view [A]; None if
+        there are none.
     """
 
     config: EvaluateConfig
@@ -72,8 +73,8 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
     Args:
       config: Settings of the evaluation.
       trained: The policy to judge.
-      half: [M, 2] half edges of the boxes in the coming levels, m; None: those of the stage and
-        its `shape`.
+      half: [M, 2] half edges of the boxes in the coming levels, m; None: the half edges that stage
+        and `shape` give.
 
     Returns:
       The judge.
@@ -136,7 +137,7 @@ def substeps(config: EvaluateConfig) -> int:
 
 
 def _compile(config: EvaluateConfig, half: np.ndarray) -> tuple[mujoco.MjModel, sim_model.Ids]:
-    """Compiles the arena for boxes of these half edges [M, 2]."""
+    """Compiles the arena with boxes of these half edges [M, 2]."""
     largest = task_stage.largest_half([config.stage])
     size = sim_model.ArenaSize(config.stage.robots, len(half), largest)
     timestep = config.task.control_step / substeps(config)
@@ -145,7 +146,7 @@ def _compile(config: EvaluateConfig, half: np.ndarray) -> tuple[mujoco.MjModel, 
     spec.option.iterations = SOLVER_ITERATIONS
     # Numbers that are not finite are better than a robot silently reset to its first place.
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-    # Compiled in rather than set later, so that MuJoCo derives its bounds from them.
+    # The half edges are compiled in, not set later, so that MuJoCo derives its bounds from them.
     for i, edges in enumerate(half):
         spec.geom(f"obstacle{i}_box").size[:2] = edges
     compiled = spec.compile()
@@ -194,7 +195,7 @@ def check_policy(
 
     Raises:
       PolicyError: It has other observations, or too few learners.
-      ConfigError: A part of an extension that it needs is missing.
+      ConfigError: The policy needs a part of an extension that is missing.
     """
     extensions, needs = extension.load(config.extensions), trained.meta.get("extensions", {})
     extension.check_needs(needs, extensions, str(path), ["observation", "network"])

@@ -14,7 +14,7 @@ import numpy as np
 
 from swarmjax.task.level import Level
 
-CELL = 0.015  # m, of the grid; the narrowest door, 0.10 m, leaves a hull's centre 0.023 m
+CELL = 0.015  # m, of the grid; in the narrowest door, 0.10 m, a hull's centre can move by 0.023 m
 _SPARE = 0.0016  # m, added to the hull: between two cells a disc comes up to 1.5 mm nearer a corner
 _NEVER = np.iinfo(np.int32).max // 2
 _ORDERS = 30  # orders of robots to try: a robot that parks first may block others
@@ -59,7 +59,7 @@ def find(level: Level, hull_radius: float, target_radius: float) -> list[Move] |
       target_radius: Radius within which a robot has arrived, m.
 
     Returns:
-      Moves in their order; None if none was found, which does not prove that none exists.
+      The moves in order; None if no plan was found, although a plan may still exist.
     """
     grid = _grid(level, hull_radius, target_radius)
     robots = np.flatnonzero(level.present)
@@ -105,7 +105,7 @@ def _pass(
     left: list[int],
     aside: Move,
 ) -> list[Move] | None:
-    """Lets another robot arrive past one that steps aside, if that one can arrive later."""
+    """Lets one robot step aside so that another can arrive, if the first can still arrive later."""
     for other in left:
         if other == aside.robot:
             continue
@@ -180,7 +180,7 @@ def _near(grid: _Grid, free: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 
 def _spread(free: np.ndarray, goal: np.ndarray, until: np.ndarray) -> np.ndarray:
-    """Counts steps from the nearest goal, [N, N], until it meets a cell of `until`."""
+    """Counts each cell's steps to the nearest goal, [N, N]; stops at the first cell of `until`."""
     far = np.where(goal, 0, _NEVER).astype(np.int32)
     edge, steps = goal, 0
     while edge.any() and not (far[until] < _NEVER).any():
@@ -205,7 +205,7 @@ def _descend(grid: _Grid, far: np.ndarray, place: np.ndarray) -> np.ndarray | No
 
 
 def _walk(far: np.ndarray, cell: tuple[int, ...], place: np.ndarray) -> list[np.ndarray]:
-    """Lists the places after a cell, down to where `far` is 0."""
+    """Lists the places on the way from a cell to a goal, where `far` is 0."""
     found = []
     while far[cell]:
         around = [(cell[0] + i, cell[1] + j) for i, j in _STEPS]
@@ -225,7 +225,7 @@ def check(level: Level, moves: list[Move], hull_radius: float, target_radius: fl
       target_radius: Radius within which a robot has arrived, m.
 
     Returns:
-      The plan's fault; None if there is none.
+      What is wrong with the plan; None if nothing is wrong.
     """
     place = level.start[:, :2].astype(np.float64)
     robots = np.flatnonzero(level.present)

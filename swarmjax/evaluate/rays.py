@@ -21,7 +21,7 @@ class RayScene:
 
     Attributes:
       model: The compiled arena.
-      ids: Rows of its moving bodies.
+      ids: Rows of the model's moving bodies.
       hull_radius: Radius of the hulls, m.
       side: Side of the smallest arena, m.
       reach: Length of the rays, m.
@@ -43,10 +43,10 @@ def cast_rays(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Casts the infrared sensors' rays with MuJoCo.
 
-    A ray that starts inside something reads 0. For such a ray MuJoCo reports where it leaves, on a
-    face whose normal points along the ray. So each sensor casts two rays, ahead and back, and is
-    inside something if either of them leaves. Pushing robots overlap a little, so a single ray may
-    enter a second thing before it leaves the first.
+    A ray that starts inside something reads 0. For such a ray MuJoCo reports the place where the
+    ray leaves that thing, at a face whose normal points along the ray. So each sensor casts two
+    rays, ahead and back, and is inside something if either ray leaves something. Pushing robots
+    overlap a little, so a single ray may enter a second thing before it leaves the first.
 
     Args:
       scene: The scene.
@@ -85,7 +85,7 @@ def cast_rays(
 def hidden(
     scene: RayScene, data: np.ndarray, pose: np.ndarray, obstacle: np.ndarray, reach: float
 ) -> np.ndarray:
-    """Tells whether a wall or a box is between two robots' centres, with MuJoCo's rays.
+    """Tells, with MuJoCo's rays, whether a wall or a box is between the centres of two robots.
 
     Args:
       scene: The scene.
@@ -101,18 +101,20 @@ def hidden(
     along = place[:, None] - place[:, :, None]
     distance = np.linalg.norm(along, axis=-1)
     middle = 0.5 * (place[:, None] + place[:, :, None])
-    # Compares circles around the line and the box: most pairs need no ray for any box.
+    # First compares circles around line and box, because most pairs of robots then need no ray at
+    # all.
     near = _apart(middle, obstacle[..., :2]) <= half[:, None, None] + 0.5 * distance[..., None]
     asked = (distance <= reach) & np.triu(np.ones(distance.shape[1:], bool), 1)
     found = np.zeros(distance.shape, bool)
     for arena, i, j, box in zip(*np.nonzero(near & asked[..., None]), strict=True):
         geom, where = scene.ids.obstacle_geom[box], cast("mujoco.MjData", data[arena])
         start = np.array([*place[arena, i], epuck.SENSOR_HEIGHT])
-        toward = np.array([*along[arena, i, j], 0.0])  # as long as the line: 1 is its end
+        toward = np.array([*along[arena, i, j], 0.0])  # as long as the line, so 1 is the line's end
         frame = (where.geom_xpos[geom], where.geom_xmat[geom], where.model.geom_size[geom])
         kind = where.model.geom_type[geom]
         share = mujoco.mju_rayGeom(*frame, start, toward, kind)
-        # -1 means no hit. A line that starts inside a box gives the place where it leaves.
+        # -1 means no hit. If a line starts inside a box, the result is the place where it leaves
+        # the box.
         found[arena, i, j] |= 0.0 <= share < 1.0
     return found | found.swapaxes(1, 2)
 
@@ -143,7 +145,7 @@ def brightness(scene: RayScene, shades: infrared.Reflectance, geom: np.ndarray) 
 def _near(
     scene: RayScene, middle: np.ndarray, place: np.ndarray, obstacle: np.ndarray
 ) -> np.ndarray:
-    """Tells [A, R, K] whether a ray may meet anything, by circles around the ray and all things.
+    """Tells which rays [A, R, K] may meet anything, from circles around the rays and all things.
 
     Casting rays is the slowest part, and most rays meet nothing. For the walls, the stage's
     smallest arena is assumed.

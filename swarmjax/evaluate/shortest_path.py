@@ -19,18 +19,19 @@ GOAL = 24  # points on the circle around a target, used if the straight way to i
 _SLACK = 1e-6  # m; touching does not block
 _SIGNS = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
 # These three numbers change the computing time, never the result.
-_DETOUR = 1.1  # times the straight line: paths up to this length are tried first; most are shorter
-_NEAREST = 8  # nearest boxes to test a line against first: few lines get past them among walls
-_MANY = 1000  # pairs of a line and a box above which this is faster
+_DETOUR = 1.1  # times the straight line: paths up to this length are tried first, most are shorter
+_NEAREST = 8  # each line is tested first against this many nearest boxes, which block most lines
+# With more pairs of a line and a box than this, testing the nearest boxes first is faster.
+_MANY = 1000
 
 
 class _Boxes(NamedTuple):
-    """The boxes of an arena, with the least distance of the disc's centre.
+    """The boxes of an arena, and the least distance that the disc's centre keeps from them.
 
     Attributes:
       box: [M, 5] x (m), y (m), yaw (rad), half edges (m).
       half: [2, M] the half edges, m.
-      radius: Radius of the disc, less the slack, m.
+      radius: Radius of the disc minus `_SLACK`, m.
     """
 
     box: np.ndarray
@@ -198,7 +199,7 @@ def _way_through(
     first = _legs(boxes, _fan(begin, some))
     length = np.concatenate([[0.0], _search(arena, rows, first, rest, last)])
     best = (length + last).min()
-    # Where the straight line is blocked, paths to the other points of the circle may be shortest.
+    # If the straight line is blocked, a path to another point of the circle may be the shortest.
     far = np.linalg.norm(points.place[:, None] - circle.place, axis=-1) + length[:, None]
     row, column = np.nonzero((far < best) & np.isinf(last)[:, None])
     around = length[row] + _legs(boxes, _Lines(points, row, circle, column))
@@ -222,19 +223,21 @@ def _search(
     """Computes the lengths [W] of the shortest paths from the start to points of an arena, m.
 
     This is A* on the visibility graph: the algorithm of Dijkstra 1959, "A note on two problems in
-    connexion with graphs". It leaves out points that are too far away even if a straight line led
-    on from there (Hart, Nilsson & Raphael 1968, "A formal basis for the heuristic determination of
-    minimum cost paths").
+    connexion with graphs". The search leaves out points that are too far away even if a straight
+    line led from them to the target (Hart, Nilsson & Raphael 1968, "A formal basis for the
+    heuristic determination of minimum cost paths").
 
     Args:
       arena: Arena of the points; it stores the results for the lines between them.
       rows: [W] rows of the points.
-      first: [W] straight from the start, inf if blocked.
+      first: [W] lengths of the straight lines from the start, m; inf if blocked.
       rest: [W] lower bounds of the distances to the target.
-      last: [1 + W] straight to the target from the start and from the points, inf if blocked.
+      last: [1 + W] lengths of the straight lines to the target from the start and from the points,
+        m; inf if blocked.
 
     Returns:
-      The lengths. A length may be too long if no path through its point is the shortest.
+      The lengths. The length for a point may be too large if the shortest path does not lead
+      through the point.
     """
     length, least, best = first.copy(), first + rest, last[0]
     place = arena.outline.place[rows]
@@ -260,7 +263,7 @@ def _are_free(arena: _Arena, point: int, others: np.ndarray) -> np.ndarray:
 
 
 def _circle(target: np.ndarray, reach: float, inside: float) -> np.ndarray:
-    """Returns points [V, 2] around a target: `GOAL` points, and those where walls stop the disc."""
+    """Returns `GOAL` points around a target, and the points where walls stop the disc, [V, 2]."""
     angle = np.arange(GOAL) * (2.0 * math.pi / GOAL)
     around = [reach * np.stack([np.cos(angle), np.sin(angle)], axis=-1)]
     for axis, wall in ((axis, wall) for axis in (0, 1) for wall in (-inside, inside)):
@@ -302,7 +305,7 @@ def _nearest(boxes: _Boxes, points: _Points) -> np.ndarray:
 
 
 def _are_barred(boxes: _Boxes, lines: _Lines, pairs: np.ndarray) -> np.ndarray:
-    """Tells whether any of its paired boxes [L, M] blocks each line, [L]."""
+    """Tells for each line [L] whether any of the boxes paired with it, [L, M], blocks it."""
     line, box = np.nonzero(pairs)
     start = lines.first.local[:, lines.begin[line], box]
     way = lines.second.local[:, lines.end[line], box] - start
@@ -360,11 +363,11 @@ def _barred(first: np.ndarray, second: np.ndarray, box: np.ndarray, hull: float)
 
 
 def _meets(start: np.ndarray, way: np.ndarray, half: np.ndarray, radius: float) -> np.ndarray:
-    """Tells whether lines from `start` by `way` [2, ...] come nearer than a radius to boxes at 0.
+    """Tells whether lines from `start` along `way` [2, ...] come within a radius of boxes at 0.
 
-    They do if they enter the box of half edges [2, ...] widened by the radius. That shape consists
-    of two boxes, each longer by the radius at both ends of one axis, and a circle around each
-    corner.
+    A line does so if it enters the box, with half edges [2, ...], after the box is widened by the
+    radius. That shape consists of two boxes, each longer by the radius at both ends of one axis,
+    and a circle around each corner.
     """
     wide = half[:, None] + radius * np.eye(2).reshape(2, 2, *[1] * (half.ndim - 1))
     pace = np.where(np.abs(way) < 1e-12, 1e-12, way)[:, None]

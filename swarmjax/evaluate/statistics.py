@@ -26,14 +26,15 @@ draw               each resample                               the interval is a
 =================  ==========================================  ==================================
 
 Drawing dependent values independently makes an interval too narrow. For example, if all runs meet
-the same levels, a hard level is hard for all of them, but `tasks_per_run` would average that out
-over the runs. The last two draws err on the wide side, because they count the spread of single
-values twice (Davison & Hinkley 1997, "Bootstrap Methods and their Application", section 3.8; Owen
-2007, "The pigeonhole bootstrap"). This matters little if there are many tasks.
+the same levels, a hard level is hard for all of them, but `tasks_per_run` would average this
+difficulty out over the runs. The last two draws err on the wide side, because they count the spread
+of single values twice (Davison & Hinkley 1997, "Bootstrap Methods and their Application", section
+3.8; Owen 2007, "The pigeonhole bootstrap"). This matters little if there are many tasks.
 
-Values may be inf, for example the steps to a threshold that was never reached. It sorts after every
-number. A mean that includes inf is inf, and an end of an interval is inf if too many resamples are.
-Nothing here turns inf into nan: calls that would have to are refused, and so are nan and -inf.
+Values may be inf, for example the steps to a threshold that was never reached. Inf counts as larger
+than every number. A mean that includes inf is inf, and an end of an interval is inf if too many
+resamples are inf. No function here turns inf into nan: calls in which inf would become nan are
+refused. Values of nan and -inf are refused too.
 """
 
 import math
@@ -44,15 +45,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 BLOCK = 2**20  # values resampled at once: 8 MiB, and a few times as much for their indices
-# Half of all resamples of two runs are one run twice: the interval would just span the two.
+# With two runs, half of all resamples hold one run twice, so the interval would just span both.
 LEAST_DRAWN = 3
 _LAST_TWO = (-2, -1)
 
 type RunDraw = Literal["runs_per_task", "runs"]
 type SharedDraw = Literal["tasks", "runs_and_tasks"]
 type Draw = RunDraw | SharedDraw | Literal["tasks_per_run", "runs_then_tasks"]
-# How a draw treats runs and tasks: keeps them, draws them whole, or draws them for each of the
-# other.
+# How a draw treats runs and tasks: it keeps them, draws them whole, or draws runs separately for
+# each task, and tasks separately for each run.
 _DRAWS = {
     "runs_per_task": ("each", "kept"),
     "runs": ("whole", "kept"),
@@ -88,12 +89,12 @@ class Interval[T](NamedTuple):
 def iqm(x: ArrayLike, axis: int | tuple[int, ...] | None = None) -> np.float64 | np.ndarray:
     """Computes the interquartile mean: the mean without the lowest and the highest quarter.
 
-    A quarter is rounded down to whole values, as in `scipy.stats.trim_mean(x, 0.25)`, which rliable
-    calls the IQM. Three values or fewer are therefore not trimmed.
+    A quarter is rounded down to whole values, as in `scipy.stats.trim_mean(x, 0.25)`. In rliable
+    this mean is called the IQM. Three values or fewer are therefore not trimmed.
 
     Args:
-      x: [...] of any unit; if more than a quarter of it is inf, the result is inf.
-      axis: axes to reduce, several as if they were one; None for all.
+      x: [...] values in any unit; if more than a quarter of them are inf, the result is inf.
+      axis: axes to reduce, all of them together as if they were one; None for all axes.
 
     Returns:
       [...] without the reduced axes, in the unit of x.
@@ -118,13 +119,13 @@ def cvar(
     """Computes the conditional value at risk: the mean of the worst share of the values.
 
     It follows Rockafellar & Uryasev 2000, "Optimization of conditional value-at-risk". The share is
-    rounded up to whole values, so it is never empty. The result includes the luck of each value:
-    over levels that were tried once, it is worse than over the levels' expected values.
+    rounded up to whole values, so it is never empty. The result also reflects chance: if each level
+    was tried only once, it is worse than if it were computed from the levels' expected values.
 
     Args:
       x: [...] of any unit.
       share: share of the values, above 0 and at most 1.
-      axis: axes to reduce, several as if they were one; None for all.
+      axis: axes to reduce, all of them together as if they were one; None for all axes.
       lowest: whether low values are the bad ones; otherwise high values are.
 
     Returns:
@@ -163,13 +164,15 @@ def bootstrap(
     percentile falls between two resamples, the outer one is used.
 
     Args:
-      values: [runs, tasks] of any unit, at least three of what is drawn.
+      values: [runs, tasks] values in any unit; at least three runs if runs are drawn, and at least
+        three tasks if tasks are drawn.
       statistic: called as `statistic(x, axis=(-2, -1))` on x [..., runs, tasks].
       draw: the part to draw, and therefore what the interval is about.
       strata: sizes of groups of consecutive tasks; tasks are drawn within each group (Efron &
         Tibshirani 1993, section 8.3). None draws among all tasks.
       confidence: confidence of the interval, above 0 and below 1.
-      resamples: number of resamples, enough for one beyond either end of the interval.
+      resamples: number of resamples, so large that at least one lies beyond each end of the
+        interval.
       seed: seed of the draws.
 
     Returns:
@@ -196,9 +199,9 @@ def paired(
     resamples: int = 2000,
     seed: int = 0,
 ) -> Interval[float]:
-    """Computes the interval of a difference: the statistic of b minus that of a.
+    """Computes the interval of a difference: the statistic of b minus the statistic of a.
 
-    Both are resampled by the same draws, so that shared influences (a level, a policy) cancel in
+    Both are resampled with the same draws, so that shared influences (a level, a policy) cancel in
     the difference. Values at the same place form a pair.
 
     Args:
@@ -250,7 +253,8 @@ def probability_of_improvement(
     If small values are good, exchange a and b.
 
     Args:
-      a: [n, tasks] of any unit, at least three of what is drawn.
+      a: [n, tasks] values in any unit; at least three runs if runs are drawn, and at least three
+        tasks if tasks are drawn.
       b: [m, tasks] of the same unit.
       draw: `runs_per_task`, `runs`, `tasks` or `runs_and_tasks`, as in `bootstrap`.
       strata: as in `bootstrap`.
@@ -384,7 +388,7 @@ def _distributions(
     seed: int,
     strata: Sequence[int] | None = None,
 ) -> np.ndarray:
-    """Computes statistics [tables, resamples] of tables of one shape, resampled alike."""
+    """Computes statistics [tables, resamples] of tables of one shape, all with the same draws."""
     random = np.random.default_rng(seed)
     found = []
     for count in _blocks(resamples, tables[0].size):
@@ -406,7 +410,7 @@ def _apply(statistic: Statistic, x: np.ndarray) -> np.ndarray:
 def _interval(estimate: float, draws: np.ndarray, confidence: float) -> Interval[float]:
     """Computes the percentile interval of draws [resamples].
 
-    Its ends are draws. Mixtures of two draws would be nan between inf and inf.
+    Its ends are draws, never mixtures of two draws, because a mixture of inf and inf would be nan.
     """
     last = len(draws) - 1
     low = math.floor((1 - confidence) / 2 * last)

@@ -58,7 +58,7 @@ class CellConfig(Section):
         if self.hull_friction is not None:
             build(
                 RobotConfig, {"hull_friction": self.hull_friction}
-            )  # which also has a lower bound
+            )  # which checks the lower bound too
         if self.digest is not None and not re.fullmatch(r"[0-9a-f]{64}", self.digest):
             raise ConfigError(f"digest is {show(self.digest)}: give 64 hexadecimal digits.")
         if self.shape != "box" and self.stage.level == "fixed":

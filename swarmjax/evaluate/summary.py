@@ -90,7 +90,7 @@ def _about(config: EvaluateConfig, suite: str | None) -> dict[str, Any]:
 
 
 def about_cell(config: EvaluateConfig, trial: Trial) -> dict[str, Any]:
-    """Describes the levels of a trial, and counts those that no robot could solve.
+    """Describes the levels of a trial, and counts the levels that no robot could solve.
 
     Args:
       config: Settings of the evaluation.
@@ -118,12 +118,13 @@ def summarize(found: Found, strata: Sequence[int] | None = None) -> dict[str, di
     """Summarises measures.
 
     Args:
-      found: [P, E] of each measure, from policies of one recipe on the same levels.
+      found: Values [P, E] of each measure, from policies of one recipe on the same levels.
       strata: Sizes of groups of consecutive levels; levels are drawn within each group.
 
     Returns:
       For each measure `mean`, `iqm` and `cvar` (mean over the worst 5 % of the levels and
-      policies), each with `_interval`, null if there are too few values for one.
+      policies). Each has its interval under the same name with `_interval`, null if there are too
+      few values.
     """
     return {name: _summary(table, MEASURES[name], strata) for name, table in found.items()}
 
@@ -150,7 +151,10 @@ def _are_enough(table: np.ndarray, strata: Sequence[int] | None) -> bool:
 
 
 def _draw(table: np.ndarray) -> SharedDraw:
-    """Chooses what to draw. Policies share their levels; few policies are not drawn themselves."""
+    """Chooses what to draw.
+
+    All policies have the same levels. If there are few policies, only levels are drawn.
+    """
     return "runs_and_tasks" if len(table) >= LEAST_DRAWN else "tasks"
 
 
@@ -160,10 +164,10 @@ def _join(found: Sequence[Found]) -> dict[str, np.ndarray]:
 
 
 def _pool(*sides: Sequence[Trial]) -> dict[str, Any] | None:
-    """Summarises the levels of all cells together, of one side or of two for a comparison.
+    """Summarises the levels of all cells together, for one side, or for both sides of a comparison.
 
-    Returns None for a single cell, and if cells share levels. Their figures are then not
-    independent, but the intervals draw the levels of each cell independently.
+    Returns None for a single cell, and if cells share levels. Figures of cells that share levels
+    are not independent, but the intervals draw the levels of each cell independently.
     """
     cells = [trial.cell for trial in sides[0]]
     if len(cells) < 2 or any(_share(*pair) for pair in combinations(cells, 2)):
@@ -176,7 +180,7 @@ def _pool(*sides: Sequence[Trial]) -> dict[str, Any] | None:
 
 
 def _share(a: Cell, b: Cell) -> bool:
-    """Tells whether cells share a level, apart from the obstacles' shape and the realism."""
+    """Tells whether cells share a level, even if obstacles' shape and realism differ."""
     alike = a.seed == b.seed and replace(a.stage, name=b.stage.name) == b.stage
     return alike and bool(np.isin(a.episodes, b.episodes).any())
 
@@ -185,14 +189,15 @@ def compare(a: Found, b: Found, strata: Sequence[int] | None = None) -> dict[str
     """Compares two recipes level by level.
 
     Args:
-      a: [P, E] of each measure of the first recipe.
-      b: [P, E] of the second recipe, on the same levels; the same row is the same seed.
+      a: Values [P, E] of each measure for the first recipe.
+      b: Values [P, E] for the second recipe, on the same levels; equal rows have equal seeds.
       strata: As in `summarize`.
 
     Returns:
       For each measure that both have: the means `a` and `b`, `difference` of the means and
-      `difference_iqm` of the interquartile means (b - a), and `improvement`, the probability that
-      b is better on a level. The last three each have `_interval`.
+      `difference_iqm` of the interquartile means (b - a), and `improvement`, the probability that b
+      is better on a level. The last three each have an interval, under the same name with
+      `_interval`.
     """
     return {name: _comparison(name, a[name], b[name], strata) for name in a if name in b}
 

@@ -13,7 +13,7 @@ from swarmjax.config import ConfigError
 from swarmjax.evaluate.measures import MEASURES, Measure
 from swarmjax.evaluate.trials import Entrant, Trial
 
-PLAIN_WIDTH = 160  # columns of a table in a file
+PLAIN_WIDTH = 160  # letters in a line of a table that is written to a file
 
 # Columns of a table with several cells: heading, measure, statistic, and whether to show the
 # interval.

@@ -1,4 +1,4 @@
-"""Runs evaluations: cells times policies, split over processes, or in the training engine."""
+"""Runs every policy on every cell, split over processes or in the training engine."""
 
 import math
 import os
@@ -51,7 +51,7 @@ class Trial(NamedTuple):
 
 
 class _Job(NamedTuple):
-    """Levels for one process and one policy, and whether the process also finds the paths."""
+    """Levels for one process and one policy, and whether the process also finds shortest paths."""
 
     config: EvaluateConfig
     policy: Policy
@@ -69,7 +69,7 @@ def read_policies(files: Sequence[str], extensions: str | None = None) -> list[E
 
     Args:
       files: Their paths.
-      extensions: Value of the key with that name.
+      extensions: Value of the key `extensions`.
 
     Raises:
       PolicyError: A file is unsound.
@@ -126,7 +126,8 @@ def run_each(
     for cell in cells:
         for each in entrants:
             evaluate_judge.check_policy(config, cell.stage, *each)
-    configs = [specialise(config, cell) for cell in cells]  # checks all before the first runs
+    # Checks all cells before the first one runs.
+    configs = [specialise(config, cell) for cell in cells]
     play = _by_mjx if config.engine == "mjx" else _by_c
     for row, outcomes, shortest in play(config, cells, entrants, report):
         yield row, _try(configs[row], cells[row], outcomes, shortest)
@@ -137,8 +138,8 @@ def specialise(config: EvaluateConfig, cell: Cell, path: str | None = None) -> E
 
     Args:
       config: Settings of the evaluation.
-      cell: Cell that sets the stage, shape and seed. It also sets the realism and the hulls'
-        friction if it has them, and the step limit if it has one and `config` has none.
+      cell: Cell that sets the stage, shape and seed. It also sets realism and hull friction if it
+        has values for them, and the step limit if it has one and `config` has none.
       path: Path of the policy.
 
     Returns:
@@ -277,7 +278,7 @@ def work_each[Job, Result](
 
     Args:
       function: Function of a module, so that other processes find it.
-      jobs: Its arguments; they are begun in order.
+      jobs: Arguments of the function for each call; the calls are begun in order.
       workers: Number of processes; 1 means this process alone.
     """
     if workers <= 1:
@@ -296,7 +297,7 @@ def _begin_worker() -> None:
     """Prepares a process that judges."""
     # Ctrl-C ends the process at once and silently; its parent prints the message.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    # Extensions run on JAX. On a GPU, each process would reserve most of its memory.
+    # Extensions run on JAX. On a GPU, each process would reserve most of the GPU's memory.
     os.environ["JAX_PLATFORMS"] = "cpu"
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

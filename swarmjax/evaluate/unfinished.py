@@ -1,4 +1,4 @@
-"""The finished cells of an evaluation, a file for each, kept until the result is written.
+"""Keeps an evaluation's finished cells, one file for each, until the result is written.
 
 The files lie in a folder inside the result's folder, with `evaluation.json`, which describes the
 evaluation. The same command resumes from them. Another command is refused, so that a slip does not
@@ -32,7 +32,7 @@ def place(out: Path) -> Path:
     """Returns the folder for a result's finished cells.
 
     Args:
-      out: Folder of the result, or its file .json.
+      out: Folder of the result, or its .json file.
     """
     return out.with_name(f"{out.name}.{_NAME}") if out.suffix == ".json" else out / _NAME
 
@@ -86,7 +86,7 @@ def read(folder: Path, judged: Mapping[str, Any], cells: Sequence[Cell]) -> dict
       The policies' results, by the row of their cell.
 
     Raises:
-      ConfigError: They belong to another evaluation, or cannot be read.
+      ConfigError: The saved cells belong to another evaluation, or cannot be read.
     """
     paths = {row: _path(folder, row) for row in range(len(cells))}
     paths = {row: path for row, path in paths.items() if path.exists()}
@@ -144,7 +144,7 @@ def _read_trial(path: Path, cell: Cell) -> Trial:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         shortest, arrival = arrays.pop("shortest"), arrays.pop("arrival")
-    except Exception as error:  # zipfile and NumPy raise many kinds for a damaged file
+    except Exception as error:  # zipfile and NumPy raise many types of errors for a damaged file
         raise ConfigError(
             f"{path} cannot be read: {str(error).rstrip('.')}. Remove it; its cell is judged again."
         ) from None

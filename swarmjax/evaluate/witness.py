@@ -21,9 +21,9 @@ from swarmjax.task.config import TaskConfig, describe
 
 # Keys of the task that a judge needs too; rewards and step limit matter only in training.
 _TASK = ("control_step", "target_radius", "arrival", "observations")
-BODY = "wheeled"  # of a judge, unless the command line or a robot file names another
-_TOLD = ("robot", "task", "realism")  # sections whose keys the printed line repeats if typed
-# Each policy has its own values of these, as it has its own network: they fix its inputs.
+BODY = "wheeled"  # a judge's body, unless the command line or a robot file names another
+_TOLD = ("robot", "task", "realism")  # sections whose typed keys the printed line repeats
+# Each policy has its own values of these keys, because they determine its network's inputs.
 _OWN = ("task.history", *(f"task.neighbours.{key}" for key in ("count", "range", "message_size")))
 
 
@@ -34,7 +34,7 @@ class Trained(NamedTuple):
       robot: Settings of the robot.
       task: Settings of the task that a judge needs too.
       realism: Realism of sensors and bodies.
-      stages: Plain data of its stages in order; none if the file names none.
+      stages: Plain data of the training's stages in order; none if the file names none.
     """
 
     robot: RobotConfig
@@ -94,14 +94,15 @@ def load[C: Section](
     Args:
       cls: The command's dataclass, with `policy` and perhaps `compare`.
       typed: `key=value` arguments.
-      entrants: The policies, if they have been read already; None: those that `typed` names.
+      entrants: The policies, if they have been read already; None: the policies that `typed` names.
       stage: Plain data of the stage if `typed` names none; None: the policies' last stage.
 
     Returns:
       The settings, and one line that describes what comes from the policies.
 
     Raises:
-      ConfigError: An argument is unsound, or policies were trained differently and none decides.
+      ConfigError: An argument is unsound, or policies were trained differently and no argument
+        decides.
       PolicyError: A policy is unsound.
     """
     if entrants is None:
@@ -129,7 +130,7 @@ def _paths(cls: type[Section], typed: Sequence[str]) -> list[str]:
 
 
 def _words(cls: type[Section], found: Trained, typed: Sequence[str]) -> list[str]:
-    """Converts the training's settings to arguments; a robot file without a body keeps wheels."""
+    """Converts the training's settings to arguments. Wheels stay if a robot file names no body."""
     choice = files.split_words(cls, typed).get("robot")
     own = {"body": BODY} if choice is None else files.read_choice("robot", files.choice_of(choice))
     return [

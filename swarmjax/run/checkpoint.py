@@ -1,9 +1,12 @@
-"""Checkpoints hold everything that changes in a run, and a digest of it. Resuming is exact.
+"""Checkpoints hold everything that changes in a run, and a digest of their contents.
+
+Resuming is exact.
 
 Orbax writes the steps. This module adds three things that Orbax lacks:
 
 - A digest detects damage. Without it, Orbax restores a flipped bit silently.
-- A binding to update, config and run detects a swapped, renamed or foreign step.
+- Each step records its update, config and run, so that a swapped, renamed or foreign step is
+  detected.
 - Reading falls back to the newest sound step.
 
 A checkpoint is a flat dictionary from names such as `learners/params/actor/mean/kernel` to arrays.
@@ -34,7 +37,7 @@ from swarmjax.policy import digest
 from swarmjax.run import directory, heap, hosts, practised
 from swarmjax.run.errors import CheckpointError, TrainingError
 
-# Importing Orbax takes half a second. A run does it while XLA compiles (`trainer`).
+# Importing Orbax takes half a second. A run imports it while XLA compiles (`trainer`).
 if TYPE_CHECKING:
     import orbax.checkpoint as ocp
 
@@ -42,11 +45,12 @@ Leaves = dict[str, np.ndarray]
 
 FOLDER = hosts.CHECKPOINTS
 ARENAS = "arenas/"  # prefix of the arenas' leaves
-_OLD_META = {"digest", "update"}  # the whole metadata before checkpoints were bound to their run
+_OLD_META = {"digest", "update"}  # all metadata in older checkpoints, which do not name their run
 # The SHA-256 of each file of a step. Orbax fails on damaged files too, but prints the tracebacks
 # of its threads.
 _MANIFEST = "files.json"
-_REMOVAL = 0.5  # s, longest time between removing a directory's checkpoints and its config
+# Seconds, at most, between the removal of a directory's checkpoints and of its config.
+_REMOVAL = 0.5
 _UNFINISHED = "*.orbax-checkpoint-tmp*"  # Orbax renames such a folder when it is complete
 
 
@@ -54,7 +58,7 @@ class Binding(NamedTuple):
     """The run and config that a checkpoint belongs to.
 
     Attributes:
-      run: id of the run; None before runs had one.
+      run: id of the run; None in older versions, whose runs had no id.
       config: digest of the config's fixed keys.
     """
 
@@ -99,8 +103,8 @@ def binding(run: Path) -> Binding | None:
 class Checkpoints:
     """Writes the checkpoints of one run directory, in a `with` block.
 
-    A thread writes them while training continues. The newest ones and the one with the highest
-    score are kept.
+    A thread writes them while training continues. The newest checkpoints and the one with the
+    highest score are kept.
 
     Attributes:
       write_seconds: time to write the newest checkpoint.
@@ -109,9 +113,9 @@ class Checkpoints:
     def __init__(self, run: Path, keep: int, update: int | None = None) -> None:
         """Opens `run`/checkpoints, to keep the `keep` newest.
 
-        A resumed run gives `update`. Later checkpoints were skipped as damaged, and Orbax would
-        save nothing before them, so they are moved aside. Nothing else is done until the first
-        save, so that a run need not wait for Orbax to begin.
+        A resumed run gives the `update` that it continues from. Checkpoints after it were skipped
+        as damaged. They are moved aside, because Orbax would save nothing before them. Nothing else
+        is done until the first save, so that a run need not wait for Orbax to begin.
         """
         self._run, self._keep = run, keep
         self._folder = (run / FOLDER).resolve()
@@ -154,7 +158,7 @@ class Checkpoints:
           logs: bytes of each log at this update, by name.
           score: rates the checkpoint, higher is better; None if unknown.
           rate_scale: factor on the learning rates.
-          of: further entries for its row in the list of checkpoints.
+          of: further entries for the checkpoint's row in the list of checkpoints.
 
         Raises:
           TrainingError: if the previous checkpoint could not be written.
@@ -165,7 +169,8 @@ class Checkpoints:
         self.wait()
         meta = {"update": update, "logs": dict(logs or {}), "rate_scale": rate_scale}
         told = {"score": score, "rate_scale": rate_scale, **(of or {})}
-        # The next call of the program overwrites the state. On a CPU, NumPy may share its memory.
+        # The next call of the program overwrites the state. On a CPU, NumPy may share the state's
+        # memory.
         leaves = {name: np.array(leaf) for name, leaf in to_leaves(state).items()}
         self._pending = self._thread.submit(self._write, leaves, meta, told)
 
@@ -197,7 +202,7 @@ class Checkpoints:
         return self._binding is not None and not (self._run / directory.CONFIG).exists()
 
     def _why(self, error: Exception) -> str:
-        """Explains why a checkpoint could not be written, also after the run was removed."""
+        """Explains why a checkpoint could not be written, even if the run was removed."""
         why = _why(error)
         if not self._is_gone() and why != os.strerror(errno.ENOSPC):
             time.sleep(_REMOVAL)
@@ -256,7 +261,7 @@ class Checkpoints:
 
 
 def _options() -> "ocp.CheckpointManagerOptions":
-    """Makes Orbax's options, so that a process reads and writes without waiting for others."""
+    """Makes the options with which Orbax reads and writes without waiting for other processes."""
     import orbax.checkpoint as ocp
 
     found = ocp.CheckpointManagerOptions(create=False, enable_async_checkpointing=False)
@@ -277,7 +282,10 @@ def _put_aside(step: Path) -> None:
 
 
 def _why(error: Exception) -> str:
-    """Extracts the reason of a failed write. TensorStore gives it at the very end of its text."""
+    """Extracts the reason of a failed write.
+
+    TensorStore gives the reason at the very end of its text.
+    """
     full = os.strerror(errno.ENOSPC)
     if full in str(error):
         return full
@@ -304,7 +312,7 @@ def _quieten() -> None:
 
 
 def _is_sound(leaves: Leaves) -> bool:
-    """Returns whether all learned values are finite, so that a run can go back to them."""
+    """Returns whether all learned values are finite, so that a run can go back to this state."""
     learned = [x for name, x in leaves.items() if name.startswith("learners/")]
     return all(np.isfinite(x).all() for x in learned if np.issubdtype(x.dtype, np.floating))
 
@@ -408,7 +416,7 @@ def of_seed(leaves: Leaves, lane: int, seeds: int) -> Leaves:
 
 
 def restore(run: Path, update: int | None = None) -> tuple[Leaves, int, list[str]]:
-    """Reads the newest sound checkpoint of a run, or the one of `update`, as `find` does.
+    """Reads a run's newest sound checkpoint, or its checkpoint of `update`, as `find` does.
 
     Returns:
       The leaves, the update, and a sentence for each skipped checkpoint.
@@ -427,7 +435,7 @@ def steps(run: Path) -> list[int]:
 
 
 def find(run: Path, update: int | None = None) -> Kept:
-    """Reads the newest sound checkpoint of a run, or the one of `update`.
+    """Reads a run's newest sound checkpoint, or its checkpoint of `update`.
 
     Args:
       run: the run directory.

@@ -1,9 +1,10 @@
 """Keeps compiled programs between runs, so that a second start need not compile.
 
 JAX loads and runs the files in the cache directory, so anyone who can write there can run code
-here. Therefore the directory belongs to the user, and one that others can write is not used. If the
-environment or a surrounding program has already configured JAX's cache, it is left unchanged. Zlib
-compresses the entries, and its checksum detects damaged ones, which are deleted and compiled again.
+here. Therefore the directory belongs to the user, and a directory that others can write is not
+used. If the environment or a surrounding program has already configured JAX's cache, it is left
+unchanged. Zlib compresses the entries, and its checksum detects damaged ones, which are deleted and
+compiled again.
 """
 
 import contextlib
@@ -22,8 +23,9 @@ from jax.experimental.compilation_cache import compilation_cache
 AUTO = "auto"
 LARGEST = 2**30  # bytes; a program of the default run takes one thousandth of this
 _OPTIONS = {
-    # Keep every program. A start compiles only a handful, and on a GPU small ones take a tenth of
-    # a second each. By default, JAX keeps only those that take over a second.
+    # Keep every program. A start compiles only a handful of programs, and on a GPU even small
+    # programs take a tenth of a second each. By default, JAX keeps only programs that take over a
+    # second.
     "jax_persistent_cache_min_compile_time_secs": 0.0,
 }
 _DIRECTORY = "jax_compilation_cache_dir"
@@ -94,7 +96,7 @@ def _shorten(directory: Path) -> None:
     """Deletes the least recently used programs when the cache is too large."""
     found = []
     for _, path in _entries(directory):
-        with contextlib.suppress(FileNotFoundError):  # another run has just deleted it
+        with contextlib.suppress(FileNotFoundError):  # another run has just deleted the file
             found.append((path, path.stat()))
     found.sort(key=lambda entry: max(entry[1].st_atime, entry[1].st_mtime), reverse=True)
     total = 0

@@ -1,6 +1,6 @@
 """Writes a run directory: one process at a time, complete files, and append-only logs.
 
-- A lock keeps a second process out. It is released when its process dies.
+- A lock keeps a second process out. It is released when the process that holds it dies.
 - `config.json` and `summary.json` are replaced completely or not at all.
 - Logs are files of JSON lines. Each checkpoint records their lengths in bytes. A resumed run first
   truncates the logs to those lengths, in one step, and then appends.
@@ -26,7 +26,8 @@ from swarmjax.run.errors import CheckpointError
 CONFIG, SUMMARY, LOCK = "config.json", "summary.json", ".lock"
 METRICS, DECISIONS, EPISODES = "metrics.jsonl", "curriculum.jsonl", "episodes.jsonl"
 LOGS = (METRICS, DECISIONS, EPISODES)
-SAVED = "checkpoints.jsonl"  # a row for each checkpoint written, including those removed since
+# A row for each checkpoint that was written, even if it has been removed since.
+SAVED = "checkpoints.jsonl"
 # Keys of a stored config that may change when a run is resumed: they do not affect past results.
 MAY_CHANGE = ("budget", "devices", "resume", "run", "streams")
 
@@ -85,7 +86,7 @@ def _lock(run: Path, file: IO[str]) -> None:
 
 
 def _is_same(file: IO[str], path: Path) -> bool:
-    """Returns whether an open file is the one at a path."""
+    """Returns whether an open file is still the file at a path."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
     except OSError:
@@ -97,7 +98,8 @@ class Writer(NamedTuple):
 
     Attributes:
       process: its process id on its machine.
-      host: its machine. Locks of older versions do not name it; then it is this machine.
+      host: its machine. Locks of older versions do not name the machine; this machine is then
+        assumed.
     """
 
     process: int
@@ -149,7 +151,7 @@ def _make(run: Path) -> list[Path]:
 
 
 def _sign(file: IO[str]) -> None:
-    """Writes the lock's holder into it, for the message to the next process."""
+    """Writes into the lock which process holds it, for the message to the next process."""
     try:
         file.truncate(0)
         file.write(f"process {os.getpid()}\n{socket.gethostname()}\n")
@@ -173,7 +175,7 @@ def check_regular(run: Path) -> None:
     """Refuses a run directory that holds a pipe or a device, because reading it could block.
 
     Raises:
-      ConfigError: if it holds one.
+      ConfigError: if the directory holds a pipe or a device.
     """
     try:
         found = [path for path in run.iterdir() if not (path.is_file() or path.is_dir())]
@@ -205,7 +207,7 @@ def kept_config(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, 
 
     Args:
       before: the stored config, written by any version.
-      now: the config that the run goes on with.
+      now: the config with which the run goes on.
 
     Returns:
       `before`, with the keys of `MAY_CHANGE` taken from `now`. So the digest still matches the

@@ -28,7 +28,7 @@ _SPEEDS = (
 
 
 class Spread(NamedTuple):
-    """A figure over seeds: its mean, minimum and maximum."""
+    """Mean, minimum and maximum of a figure over the seeds."""
 
     mean: float
     low: float
@@ -40,7 +40,7 @@ class LevelsState(NamedTuple):
 
     Attributes:
       held: levels in the buffer.
-      success: success on them, 0 to 1; None if the buffer is empty.
+      success: success on these levels, 0 to 1; None if the buffer is empty.
       again: share of episodes on kept or mutated levels, among the episodes that ended in the
         newest update; None if none ended.
     """
@@ -55,10 +55,10 @@ class StageState(NamedTuple):
 
     Attributes:
       name: name of the stage.
-      arenas: share of the arenas that are on it, mean over seeds.
-      success: share of targets in its newest measurement, over the seeds that have one; None if no
-        seed has one.
-      levels: state of its level buffer; None without a curriculum over levels.
+      arenas: share of the arenas that are on this stage, mean over seeds.
+      success: share of targets reached in the stage's newest measurement, over the seeds that have
+        measured it; None if no seed has.
+      levels: state of the stage's level buffer; None without a curriculum over levels.
     """
 
     name: str
@@ -83,7 +83,8 @@ def summarize(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
       - `stage`: the newest stage, or the range of newest stages over seeds.
       - `update` and `episodes`: counts.
       - `cohort_targets`: share of targets reached in the newest cohort; None before there is one.
-      - `cohort_complete`: share of its episodes in which all robots arrived; None as above.
+      - `cohort_complete`: share of the cohort's episodes in which all robots arrived; None as
+        above.
       - `ended_targets`, `contacts_per_robot`, `return`: over the episodes that ended; None if none
         ended.
       - `value_loss`, `policy_loss`: the newest losses.
@@ -127,7 +128,7 @@ def _of_seed(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
 
 
 def spread(values: Sequence[float | None]) -> Spread | None:
-    """Returns the spread of the values that are not None; None if there are none."""
+    """Returns the spread of the values that are not None; None if all values are None."""
     there = [value for value in values if value is not None]
     return Spread(sum(there) / len(there), min(there), max(there)) if there else None
 
@@ -177,7 +178,10 @@ def working(what: str, console: Console | None = None) -> Iterator[None]:
 
 
 class _Console(Console):
-    """A console that survives a broken pipe. Rich would end the process, and the run with it."""
+    """A console that survives a broken pipe.
+
+    Rich's own console would end the process, and the run with it.
+    """
 
     def on_broken_pipe(self) -> None:
         """Continues without a reader."""
@@ -264,7 +268,11 @@ def _table(summary: Row, speeds: Row, updates: int, seconds_left: float) -> Grou
 
 
 def _stage_table(stages: Sequence[StageState]) -> Table:
-    """Lists the stages. If there are many: the one with most arenas, the best and the worst."""
+    """Lists the stages.
+
+    If there are many stages, only three are listed: the one with most arenas, the best and the
+    worst.
+    """
     table = Table(
         caption=_counted(stages), caption_justify="left", box=box.SIMPLE_HEAD, show_edge=False
     )

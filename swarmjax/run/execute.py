@@ -50,7 +50,10 @@ def execute(settings: TrainConfig, stop: Stop, *, auto: bool) -> int:
 
 
 def fill(settings: TrainConfig) -> tuple[TrainConfig, str]:
-    """Chooses the number of arenas, and returns the settings with it and the reason."""
+    """Chooses the number of arenas.
+
+    Returns the settings with this number, and the reason for it.
+    """
     available = None if jax.default_backend() == "cpu" else memory.limit()
     with memory.refusal(settings), working("finding out how many arenas fit"):
         return memory.fill(settings, measure, available)
@@ -84,12 +87,12 @@ def _train(run: Path, settings: TrainConfig, stop: Stop) -> int:
 
 
 def _tell(text: str) -> None:
-    """Writes to standard output. The reader of a pipe may be gone."""
+    """Writes to standard output. Ignores it if the reader of a pipe is gone."""
     try:
         sys.stdout.write(text)
         sys.stdout.flush()
     except OSError:
-        # Python would flush it again at exit, fail, and exit with code 120.
+        # Python would flush the output again at exit, fail, and exit with code 120.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

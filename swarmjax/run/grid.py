@@ -13,7 +13,7 @@ from swarmjax.run.settings import TrainConfig, load_run
 
 GRID = "grid."
 MOST_CELLS = 256
-_MOST_LETTERS = 5000  # in one word of the grid
+_MOST_LETTERS = 5000  # letters in one word of the grid
 # Keys that this module sets for each cell.
 _OWN = ("resume", "run.dir", "run.coordinator", "run.processes", "run.process", "run.dry")
 
@@ -23,9 +23,9 @@ class GridCell:
     """One combination of a grid's values.
 
     Attributes:
-      label: the values, as words.
+      label: the values of the combination, as words.
       run: its run directory.
-      words: words for `swarmjax.train`, which begin or continue its run.
+      words: words of the command line of `swarmjax.train` that begin or continue this run.
       settings: the config that these words give.
     """
 

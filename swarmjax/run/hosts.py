@@ -85,7 +85,7 @@ def share(value: int) -> np.ndarray:
     """Shares one number per process among all processes.
 
     Args:
-      value: number of this process, 32 bits.
+      value: the number that this process contributes, 32 bits.
 
     Returns:
       [P] the numbers of all processes, in order.
@@ -111,7 +111,7 @@ def share_text(text: str) -> str:
 
 
 def gather(tree: Any) -> Any:
-    """Gathers arrays that are spread over hosts, on every process."""
+    """Gathers, on every process, arrays that are spread over hosts."""
     if count() == 1:
         return tree
     import jax

@@ -105,7 +105,7 @@ def _train(
     source: Source | None,
     kept: Kept | None,
 ) -> Tally:
-    """Trains from a checkpoint, or from the seed with the networks of `source`, if given."""
+    """Trains from a checkpoint, or from the seed, in which case `source` may give the networks."""
     stop.check()
     with working("building the arenas"):
         program, schedule, init, template = _load(_scaled(settings, kept))
@@ -138,7 +138,7 @@ def _scaled(settings: TrainConfig, kept: Kept | None) -> TrainConfig:
 def _first_sentences(
     program: Built, run: Path, source: Source | None, kept: Kept | None, skipped: list[str]
 ) -> Iterator[str]:
-    """Describes what is trained, what steps the robots, and what the run starts from."""
+    """Describes what is trained, which engine steps the robots, and what the run starts from."""
     settings = program.config
     yield f"{_opening(program)}; into {run}"
     if settings.extensions is not None:
@@ -219,7 +219,8 @@ def _complete(run: Path, settings: TrainConfig, kept: Kept, display: Display) ->
 def _is_summed_up(run: Path, update: int) -> bool:
     """Returns whether the summary says that the budget was spent at this update.
 
-    The summary is the last file that a run writes. If it is current, so are the others.
+    The summary is the last file that a run writes. If the summary is current, the other files are
+    current too.
     """
     try:
         found = json.loads((run / directory.SUMMARY).read_text())
@@ -285,10 +286,10 @@ def _first_state(
 
 
 def find_run(settings: TrainConfig) -> Path:
-    """Finds a writable run directory without another run in it, and writes nothing.
+    """Chooses a run directory that is writable and holds no other run; writes nothing.
 
     Raises:
-      ConfigError: if there is none, or if a library that the config needs is missing.
+      ConfigError: if there is no such directory, or if a library that the config needs is missing.
     """
     weights_and_biases.check(settings)
     every = seeds.numbers(settings)
@@ -369,7 +370,7 @@ def dry_run(settings: TrainConfig, stop: Stop, display: Display) -> int:
 
 
 def _opening(program: Built) -> str:
-    """Describes what is about to be trained, on which device, and what steps the robots."""
+    """Describes what is about to be trained, on which device, and which engine steps the robots."""
     settings, engine = program.config, program.world.physics.engine
     names = ", ".join(stage.name for stage in settings.stage)
     steps, every = settings.arenas * settings.algo.rollout_length, seeds.numbers(settings)

@@ -17,7 +17,8 @@ from typing import Any, Protocol, runtime_checkable
 from swarmjax.run.directory import Row
 
 MOST_PENDING = 100  # how many calls of the program a logger may lag behind
-PATIENCE_S = 60.0  # s, how long a run waits for a logger that lags further, and at the run's end
+# Seconds that a run waits for a logger that lags further behind, and for each at the run's end.
+PATIENCE_S = 60.0
 
 
 @runtime_checkable
@@ -30,12 +31,12 @@ class Logger(Protocol):
     - The rows are those of `metrics.jsonl`, value by value. Each row comes once, in the order of
       the updates, with the seeds of an update together.
     - If a run resumes from a checkpoint, or goes back to one after it diverged, the rows after the
-      checkpoint come again. Then `update` drops, and the later rows are the valid ones. Without
-      divergence they repeat the earlier numbers, except for times in seconds.
+      checkpoint come again. Then `update` drops, and the later rows are the valid ones. If the run
+      did not diverge, the later rows equal the earlier ones, except for times in seconds.
     - A logger that raises an error is not called again, except for `close`. The run prints a
       message and continues.
-    - A run waits for a logger that lags `MOST_PENDING` calls behind, and at its end. After
-      `PATIENCE_S` it continues without the logger.
+    - A run waits for a logger that lags `MOST_PENDING` calls behind, and at its end for every
+      logger. After `PATIENCE_S` it continues without that logger.
 
     Attributes:
       name: name of the logger in messages.
@@ -58,7 +59,7 @@ class Logger(Protocol):
         Args:
           name: name of the figure or page.
           path: path of the file; a figure is a PNG.
-          arena_steps: arena steps per seed that the run had done.
+          arena_steps: arena steps per seed that the run has done so far.
         """
         ...
 
@@ -73,7 +74,7 @@ class Calls:
     name = "log"
 
     def __init__(self, call: Callable[[Row], object]) -> None:
-        """Stores the function. Its return values are ignored."""
+        """Stores the function. What the function returns is ignored."""
         self._call = call
 
     def write(self, rows: Sequence[Row], speeds: Row) -> None:

@@ -17,8 +17,8 @@ from swarmjax.config import ConfigError
 from swarmjax.run.settings import TrainConfig
 
 ON_CPU = 128  # the default. More arenas leave fewer updates and gain little speed on a CPU.
-PROBE = 4096  # most arenas of the two small programs. Every accelerator holds them.
-MARGIN = 0.95  # on the proportional estimate: part of a program's memory does not grow with arenas
+PROBE = 4096  # largest number of arenas in the two small programs. Every accelerator holds them.
+MARGIN = 0.95  # factor on the proportional estimate: part of the memory does not grow with arenas
 # How XLA, CUDA, and Warp through CUDA, report a failed allocation.
 _EXHAUSTED = ("RESOURCE_EXHAUSTED", "OUT_OF_MEMORY", "Failed to allocate")
 
@@ -91,7 +91,8 @@ def check(settings: TrainConfig, needed: int, available: int | None) -> None:
       available: memory of the device, bytes; None if unknown, and then nothing is refused.
 
     Raises:
-      ConfigError: if the program does not fit. The message names a number of arenas that should.
+      ConfigError: if the program does not fit. The message names a number of arenas that should
+        fit.
     """
     if available is not None and needed > available:
         most = MARGIN * settings.arenas * available / needed
@@ -125,8 +126,8 @@ def fill(
     Args:
       settings: the run's config, with any number of arenas.
       measure: returns the memory that training with a config needs, bytes.
-      available: memory of the accelerator, bytes. `run.memory_share` of it is filled. None on a CPU
-        or if unknown: the number is then at most ON_CPU.
+      available: memory of the accelerator, bytes. The share `run.memory_share` of it is filled.
+        None on a CPU, or if the memory is unknown; at most ON_CPU arenas are chosen then.
 
     Returns:
       The config with that number, and a sentence that gives the reason.
@@ -156,14 +157,15 @@ def line(
 
     Args:
       settings: the run's config.
-      sizes: arenas of one or two small programs, rising. With one, the line passes through 0.
+      sizes: numbers of arenas of one or two small programs, rising. With one program, the line
+        passes through 0.
       measure: as in `fill`.
 
     Returns:
       Fixed bytes, and bytes per arena.
     """
-    # One update each. So metrics of a call do not count, and the compiled programs do not depend
-    # on the budget.
+    # Each program does one update, so that the metrics of longer calls are not counted, and the
+    # compiled programs do not depend on the budget.
     control_steps = settings.algo.rollout_length
     needed = [measure(replace(settings, arenas=n, budget=n * control_steps)) for n in sizes]
     if len(sizes) == 1:

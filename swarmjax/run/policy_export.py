@@ -45,7 +45,7 @@ def policy_arrays(leaves: Leaves) -> dict[str, np.ndarray]:
 
 
 def _array_name(name: str) -> str:
-    """Returns the file's name for an array of the actor or of an extension's network."""
+    """Returns the name in the file for an array of the actor or of an extension's network."""
     inner = name.removeprefix("torso/")
     own = inner != name and not re.fullmatch(r"hidden_\d+/(kernel|bias)", inner)
     return f"network/{inner}" if own else f"actor/{inner}"

@@ -63,7 +63,7 @@ def train(
       on_update: called with each row of `metrics.jsonl`; it returns True to stop the run.
       listen: makes the context manager for training, for example one that notices signals, as
         `Stop` does.
-      loggers: they receive the rows too, and are closed when the run is written.
+      loggers: further loggers, which receive the rows too and are closed when the run is written.
       auto: whether the number of arenas is still to be chosen.
 
     Returns:

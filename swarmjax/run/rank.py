@@ -48,10 +48,11 @@ def supervise(stop: Stop) -> int:
     """Runs this command again as a child, and reports how the child died, if it did.
 
     Args:
-      stop: notices signals, which are passed on.
+      stop: notices signals, which are passed on to the child.
 
     Returns:
-      The child's exit code. If the child died: 2 before the processes had connected, 75 afterwards.
+      The child's exit code. If the child died, the code is 2 before the processes had connected,
+      and 75 afterwards.
     """
     read, write = os.pipe()
     child = subprocess.Popen(

@@ -102,8 +102,8 @@ class Recorder:
           update: updates done at the checkpoint.
           arena_steps: arena steps done at the checkpoint, for TensorBoard's axis.
           episodes: whether to log episodes.
-          logs: bytes of each log at the checkpoint. Checkpoints of older versions do not have them;
-            then rows are dropped by their update.
+          logs: bytes of each log at the checkpoint. Checkpoints of older versions do not record
+            them; rows are then dropped by their update.
           loggers: further loggers, which receive the rows and are closed at the end.
         """
         run.mkdir(parents=True, exist_ok=True)
@@ -156,7 +156,8 @@ def history(
     Args:
       run: the run directory.
       update: updates done at the checkpoint.
-      logs: bytes of each log at the checkpoint. Without them, rows are selected by their update.
+      logs: bytes of each log at the checkpoint. Without these lengths, rows are selected by their
+        update.
 
     Raises:
       CheckpointError: if a log is damaged.

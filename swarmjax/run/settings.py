@@ -26,12 +26,13 @@ from swarmjax.task.config import check_realism
 from swarmjax.task.stage_config import make_room
 from swarmjax.training.config import ProgramConfig
 
-# Most arenas of all seeds with run.episodes=true. With more, thousands of episodes end per second.
+# Most arenas of all seeds with run.episodes=true. With more arenas, thousands of episodes end per
+# second.
 MOST_LOGGED = 8192
-AUTO = "auto"  # `arenas` accepts it in place of a number
+AUTO = "auto"  # `arenas` accepts this word in place of a number
 
 
-# The keys that a resumed run accepts. All others determine what it has computed so far.
+# The keys that a resumed run accepts. All other keys determine what the run has computed so far.
 _RESUME_KEYS = tuple("run.*" if key == "run" else key for key in MAY_CHANGE)
 
 
@@ -133,7 +134,7 @@ class RunConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig(ProgramConfig):
-    """All settings of a training run: its program, and where it is written."""
+    """All settings of a training run: what the program does, and where the run is written."""
 
     command: ClassVar[str] = "train"
     renamed: ClassVar[Mapping[str, str]] = {"start": "init_from", "start_std": "init_from_std"}
@@ -353,8 +354,8 @@ def load_train(
 
     Args:
       overrides: the words.
-      auto: whether to accept `arenas=auto`. It sets the smallest possible number of arenas,
-        `algo.num_minibatches`. `memory.fill` chooses the final number later.
+      auto: whether to accept `arenas=auto`. The config then has the smallest possible number of
+        arenas, `algo.num_minibatches`. `memory.fill` chooses the final number later.
       stages: plain data of the stages, in place of a file.
 
     Raises:
@@ -406,7 +407,7 @@ def _inherited(typed: Sequence[str]) -> list[str]:
     if held.algo.memory == "none" or any(
         word.startswith(("algo.memory=", "algo=")) for word in typed
     ):
-        others.append("memory_size")  # it belongs to the kind of memory that was typed
+        others.append("memory_size")  # this key belongs to the kind of memory that was typed
     return [
         *inherit.group_words(TrainConfig, "robot", held.robot, typed),
         *inherit.group_words(TrainConfig, "task", held.task, typed),
@@ -419,7 +420,7 @@ def settle(settings: TrainConfig) -> TrainConfig:
     """Adds the full names and digests of the extension pieces that a run uses.
 
     Args:
-      settings: the config. Digests that it already holds come from a stored run.
+      settings: the config. Digests that the config already holds come from a stored run.
 
     Raises:
       ConfigError: if a piece is missing, or differs from the one that the stored run used.
@@ -482,7 +483,7 @@ def _spread_again(streams: int | None, devices: Any, seeds_by: str) -> dict[str,
 def load_run(
     overrides: Sequence[str], stages: Sequence[dict[str, Any]] | None = None
 ) -> tuple[TrainConfig, bool]:
-    """Makes the configuration of a new run or, with `resume=`, of one that goes on.
+    """Makes the configuration of a new run or, with `resume=`, of a run that goes on.
 
     Args:
       overrides: `key=value` words; with `resume`, only for keys that may change.
@@ -532,7 +533,7 @@ def _go_on_or_begin(
 
 
 def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
-    """Refuses to resume a run with settings that differ from its own, and names the keys."""
+    """Refuses to resume a run with other settings than its own, and names the keys that differ."""
     mine, its = (
         leaves({k: v for k, v in each.items() if k not in MAY_CHANGE}) for each in (typed, stored)
     )

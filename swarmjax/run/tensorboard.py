@@ -14,7 +14,7 @@ BOARDS = 16  # most seeds with a folder, because each one keeps three files open
 
 
 class Boards:
-    """TensorBoard folders by seed; a `Logger`.
+    """A `Logger` that writes one TensorBoard folder for each seed.
 
     If PyTorch is installed, tensorboardX imports it, which takes seconds. So the import waits for
     the first rows and happens in the logger's thread.
@@ -68,8 +68,9 @@ class Boards:
 class Board:
     """One TensorBoard folder.
 
-    The `SummaryWriter` of tensorboardX has a thread that dies on a full disk. Its queue stays full,
-    and the next write waits forever. Its `EventsWriter` has no thread.
+    The `SummaryWriter` of tensorboardX has a thread that dies on a full disk. The thread's queue
+    then stays full, and the next write waits forever. The `EventsWriter` of tensorboardX has no
+    thread.
     """
 
     def __init__(self, folder: Path, purge: int | None) -> None:
@@ -92,7 +93,7 @@ class Board:
         self._writer.write_event(event)
 
     def add_picture(self, name: str, png: bytes, arena_steps: int) -> None:
-        """Writes a PNG. Its first chunk holds its size (PNG specification, 11.2.1)."""
+        """Writes a PNG. The first chunk of a PNG holds its size (PNG specification, 11.2.1)."""
         event = _event(arena_steps)
         image = event.summary.value.add(tag=name).image
         image.width, image.height = struct.unpack(">II", png[16:24])
@@ -120,5 +121,6 @@ def _event(arena_steps: int) -> Any:
     """Makes an empty TensorBoard event."""
     from tensorboardX.proto import event_pb2
 
-    made: Any = event_pb2  # its classes are created at import, so pyright does not see them
+    # The module's classes are created at import, so pyright does not see them.
+    made: Any = event_pb2
     return made.Event(wall_time=time.time(), step=arena_steps)

@@ -38,7 +38,8 @@ Built = Program[TrainConfig]  # the program of a run
 
 CALL_SECONDS = 1.0  # target length of a call with run.chunk=auto: the display's refresh interval
 ALL_SECONDS = 10.0  # longest call with run.chunk=all: a signal waits up to this long
-FIRST_UPDATES = 32  # in the first call with run.chunk=all; its pace sets the length of the others
+# Updates in the first call with run.chunk=all. The pace of this call sets the other calls' length.
+FIRST_UPDATES = 32
 PATIENCE = 10  # a run has diverged after this many updates in a row without learning
 GROWTH = 4  # a call is at most this many times as long as the previous one
 
@@ -74,7 +75,7 @@ class Tally:
       first: updates that were done when this process began.
       compile_s: seconds spent compiling.
       transitions: robot steps that each seed was trained on.
-      targets_reached: newest measured share of each stage's targets, by seed.
+      targets_reached: share of targets reached on each stage, as last measured, by seed.
       earlier_s: seconds of training before this process began.
       seconds: seconds of training in this process, without compilation.
       decisions: promotions and demotions.
@@ -126,7 +127,7 @@ def compile_chunk(
     call = lowered.compile(loop.compiler_options(deterministic=fixed))
     found = call.memory_analysis()
     assert found is not None  # both CPU and GPU report it
-    # The returned state reuses the memory of the donated one. Only the metrics need more.
+    # The returned state reuses the memory of the donated state. Only the metrics need more memory.
     returned = found.output_size_in_bytes - found.alias_size_in_bytes
     work = groups * (found.temp_size_in_bytes + returned)
     if groups > 1:
@@ -217,7 +218,7 @@ def train(
 
     Raises:
       DivergedError: if a seed learned nothing in `PATIENCE` updates in a row. The checkpoint before
-        them is kept.
+        these updates is kept.
       TrainingError: if the directory cannot be written.
     """
     settings, done = program.config, int(state.update[0])
@@ -258,9 +259,9 @@ class Saves:
     """Decides when to write a checkpoint, by time and by share of the budget, and when to wait.
 
     A run that is killed while it writes a checkpoint goes back to the previous one. A kill should
-    cost at most one interval of training. So each checkpoint begins early: by the time that the
-    last one took to write plus the length of the next call, but at most by half the interval. If
-    writing takes longer than that, the run waits for it.
+    cost at most one interval of training. So each checkpoint begins early: its lead is the time
+    that the last checkpoint took to write plus the length of the next call, but at most half the
+    interval. If writing takes longer than that, the run waits until it is done.
     """
 
     def __init__(self, settings: TrainConfig, done: int) -> None:
@@ -279,7 +280,7 @@ class Saves:
           write_seconds: time to write the last checkpoint.
         """
         self._call, self._update = tally.update - self._update, tally.update
-        late = self._call + write_seconds / _pace(tally)  # updates until it is written
+        late = self._call + write_seconds / _pace(tally)  # updates until the checkpoint is written
         due = self._is_over(self._last, tally, late, most=0.5)
         if due:
             self._last, self._before = (time.monotonic(), tally.update), self._last
@@ -422,7 +423,10 @@ def _calls(program: Built, tally: Tally, stop: Stop) -> Iterator[int]:
 
 
 def stop_together(stop: Stop) -> bool:
-    """Returns whether any process of the run was asked to stop. All then exit with one code."""
+    """Returns whether any process of the run was asked to stop.
+
+    All processes then exit with the same code.
+    """
     if hosts.count() == 1:
         return stop.asked
     asked = hosts.share((stop.code or 1) if stop.asked else 0).max()
@@ -517,7 +521,10 @@ def _broke(settings: TrainConfig, row: Row) -> bool:
 
 
 def _speeds(program: Built, rows: list[Row], seconds: float) -> dict[str, float]:
-    """Returns a call's arena, robot and physics steps and transitions per second, all seeds."""
+    """Returns a call's speeds per second, over all seeds.
+
+    They count arena steps, robot steps, physics steps and transitions.
+    """
     settings = program.config
     arena_steps = len(rows) * settings.arenas * settings.algo.rollout_length
     substeps = physics_substeps(settings.robot, settings.sim.substeps)

@@ -23,8 +23,9 @@ from swarmjax.task.config import resolve_encoding
 from swarmjax.training.loop import TrainState
 
 _CARRIED = ("params", "normalizer")  # parts of a learner
-_EXPLORED = "explored"  # another part, if its exploration is scheduled
-_MET = "curriculum/met"  # how many robots have trained; a promotion does not overwrite these
+_EXPLORED = "explored"  # another part of a learner whose exploration is scheduled
+# How many robots have trained; a promotion does not overwrite these robots' learners.
+_MET = "curriculum/met"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -46,11 +46,12 @@ def _sign_in() -> None:
 
 
 class WandbRuns:
-    """W&B runs by seed; a `Logger`.
+    """A `Logger` that writes one W&B run for each seed.
 
-    Each of the first `BOARDS` seeds has a W&B run. All are in one group. Online, a resumed run
-    continues them on the server. Offline, each process writes new W&B runs in the same group. W&B
-    receives nothing about the machine: not its name, load, source code or console output.
+    Each of the first `BOARDS` seeds has a W&B run. All these W&B runs are in one group. Online, a
+    resumed run continues them on the server. Offline, each process writes new W&B runs in the same
+    group. W&B receives nothing about the machine: not its name, load, source code or console
+    output.
     """
 
     name = "W&B"

@@ -5,7 +5,7 @@ from pathlib import Path
 from swarmjax.pages import builder
 from swarmjax.watch.view import NAMES
 
-# The page may load from its own server only: requests of its script, and the frame of a replay.
+# The page may load only from its own server: the requests of its script, and the replay's frame.
 _SOURCES = {"img-src": "'self' data:", "connect-src": "'self'", "frame-src": "'self'"}
 
 

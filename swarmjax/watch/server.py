@@ -1,8 +1,9 @@
 """Serves the page, its data, its figures and its replay to a browser on this machine.
 
 No request reads from disk, so no path leads to a file. Only this machine can connect. A foreign
-page that redirects its own name to this address (DNS rebinding) sends that name as Host and is
-refused. Without rebinding it cannot read answers either, since none of them allows another origin.
+page may redirect its own name to this address (DNS rebinding), but its requests carry that name as
+Host and are refused. Without rebinding it cannot read answers either, since no answer allows
+another origin.
 """
 
 import json
@@ -67,7 +68,7 @@ class Answers(BaseHTTPRequestHandler):
     server_version, sys_version = "swarmjax", ""
     timeout = _TIMEOUT_S
 
-    def do_GET(self) -> None:  # as the library calls it
+    def do_GET(self) -> None:  # the name that the library calls
         """Answers with the content at a path."""
         if self._is_foreign():
             return
@@ -122,5 +123,5 @@ class Answers(BaseHTTPRequestHandler):
         if self.command != "HEAD":
             self.wfile.write(content)
 
-    def log_message(self, format: str, *args: object) -> None:  # as the library has it
+    def log_message(self, format: str, *args: object) -> None:  # the library's names of arguments
         """Logs nothing about requests."""

@@ -51,7 +51,7 @@ def progress(run: Path, seeds: int) -> Progress:
 
     Args:
       run: its directory.
-      seeds: number of seeds, which each log an update.
+      seeds: number of seeds. Each seed logs each update.
     """
     try:
         with (run / directory.METRICS).open("rb") as file:

@@ -37,7 +37,7 @@ class DrawnFigures(NamedTuple):
 
     Attributes:
       version: increases with each drawing.
-      history: the results that they show; None before the first update.
+      history: the results that the figures show; None before the first update.
       figures: PNG files by the names in `NAMES`.
       trouble: why the newest drawing failed; empty if it did not.
     """
