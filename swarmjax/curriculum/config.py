@@ -251,12 +251,14 @@ class CurriculumConfig(Section):
         for key, (modes, default) in _MODE_OPTIONS.items():
             value = getattr(self, key)
             plain = getattr(CurriculumConfig, key)
-            if key in _LEAVING and self.prerequisites:
-                modes = (*modes, "adaptive")
+            takes = modes
+            if key in _LEAVING:
+                takes = (*modes, "adaptive with prerequisites")
+                modes = (*modes, "adaptive") if self.prerequisites else modes
             if self.mode not in modes and value != plain:
                 raise ConfigError(
                     f"{key} is {show(value, quote='')}, but mode is {self.mode}: {key} is an "
-                    f"option of {' and '.join(modes)}, so give {show(plain, quote='')} or "
+                    f"option of {' and '.join(takes)}, so give {show(plain, quote='')} or "
                     f"mode={modes[0]}."
                 )
             if self.mode in modes and value is None:

@@ -4,6 +4,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sentences import refusal
 
 from swarmjax.curriculum import engine as curriculum
 from swarmjax.curriculum.config import CurriculumConfig
@@ -32,7 +34,7 @@ from swarmjax.curriculum.engine import (
 from swarmjax.curriculum.modes import MODES
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.run.settings import TrainConfig
+from swarmjax.run.settings import TrainConfig, load_train
 from swarmjax.sim.config import RobotConfig, SimConfig
 from swarmjax.task import observation
 from swarmjax.task.config import TaskConfig
@@ -237,6 +239,23 @@ def test_prerequisites_are_left_at_the_end_of_a_cohort() -> None:
 def test_a_run_begins_on_its_prerequisites() -> None:
     found = curriculum.init(_schedule(4), AFTER_TWO, MODES["adaptive"])
     assert found.weights.tolist() == [0.5, 0.5, 0.0, 0.0]
+
+
+def test_there_are_fewer_prerequisites_than_stages() -> None:
+    words = ["stage=curriculum", "curriculum.mode=adaptive", "curriculum.prerequisites=6"]
+    assert refusal(load_train, words) == (
+        "curriculum.prerequisites is 6, but the run has 6 stages: give at most 5."
+    )
+    assert load_train([*words, "curriculum.prerequisites=5"]).curriculum.prerequisites == 5
+
+
+def test_adaptive_takes_a_threshold_with_prerequisites_alone() -> None:
+    assert refusal(partial(CurriculumConfig, mode="adaptive", threshold=0.9)) == (
+        "threshold is 0.9, but mode is adaptive: threshold is an option of sequential and mixed "
+        "and adaptive with prerequisites, so give null or mode=sequential."
+    )
+    options = CurriculumConfig(mode="adaptive", threshold=0.9, prerequisites=1)
+    assert (options.threshold, options.budget_share) == (0.9, 0.5)
 
 
 def test_prerequisites_may_take_their_share_of_the_budget() -> None:
