@@ -211,8 +211,8 @@ def test_import_needs_neither_jax_nor_hydra():
          "is 0.1, but mode is sequential: earlier_share is an option of mixed, so give null or "
          "mode=mixed."),
         (["curriculum.mode=adaptive", "curriculum.threshold=0.8"], "curriculum.threshold is 0.8, "
-         "but mode is adaptive: threshold is an option of sequential and mixed, so give null or "
-         "mode=sequential."),
+         "but mode is adaptive: threshold is an option of sequential and mixed and adaptive with "
+         "prerequisites, so give null or mode=sequential."),
         (["curriculum.mode=adaptive", "curriculum.optimizer=reset"], "curriculum.optimizer is "
          "reset, but mode is adaptive: optimizer is an option of sequential and mixed, so give "
          "keep or mode=sequential."),
