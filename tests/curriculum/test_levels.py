@@ -158,6 +158,34 @@ def test_probabilities_are_those_of_prioritised_level_replay(
     np.testing.assert_array_equal(found[2], 0.0)
 
 
+def test_levels_of_one_age_are_replayed_by_their_scores_alone() -> None:
+    buffer = _filled(LEARNABILITY)
+    same = replace(buffer, begun=jnp.full_like(buffer.begun, buffer.clock))
+    found = levels.probabilities(same, _options(staleness=0.3))
+    expected = levels.probabilities(same, _options(staleness=0.0))
+    np.testing.assert_allclose(found, expected, rtol=1e-6)  # float32: 0.7 p + 0.3 p
+
+
+def test_only_levels_that_begin_are_fresh() -> None:
+    buffer = _filled(LEARNABILITY)
+    later = replace(buffer, clock=jnp.int32(9))
+    plays = _plays([2, 7], [0, 1], begun=np.array([True, False]))
+    buffer, _ = UPDATE(later, plays, LEARNABILITY, np.full(2, 0.5, np.float32))
+    expected = np.asarray(later.begun).ravel()
+    expected[2] = 9
+    assert np.asarray(buffer.begun).ravel().tolist() == expected.tolist()
+
+
+def test_means_are_over_the_levels_that_are_held() -> None:
+    plays = _plays([FRESH] * 2, [0, 0], successes=[1, 0], generation=[4, 1])
+    buffer, _ = UPDATE(levels.init(2, 12, 1), plays, LEARNABILITY, np.full(2, 0.5, np.float32))
+    found = levels.describe(buffer, plays)
+    assert found["levels_held"].tolist() == [2, 0]
+    assert float(found["levels_success"][0]) == 0.5
+    assert float(found["levels_generation"][0]) == 2.5
+    assert np.isnan(found["levels_success"][1])
+
+
 def test_levels_are_chosen_as_often_as_they_are_likely() -> None:
     full = _filled(VALUE_LOSS)
     empty = jnp.array([[False] * 6, [False] * 3 + [True] * 3])
