@@ -171,7 +171,7 @@ def test_only_levels_that_begin_are_fresh() -> None:
     later = replace(buffer, clock=jnp.int32(9))
     plays = _plays([2, 7], [0, 1], begun=np.array([True, False]))
     buffer, _ = UPDATE(later, plays, LEARNABILITY, np.full(2, 0.5, np.float32))
-    expected = np.asarray(later.begun).ravel()
+    expected = np.array(later.begun).ravel()
     expected[2] = 9
     assert np.asarray(buffer.begun).ravel().tolist() == expected.tolist()
 
