@@ -159,7 +159,7 @@ def _unlock(
 def _step(
     curriculum: Curriculum, schedule: Schedule, verdict: CohortVerdict, update: Array
 ) -> tuple[Array, Array]:
-    """Returns the stage, which is the next, the previous or the same one, and the reason."""
+    """Returns the next, the previous or the same stage, and the reason."""
     stage, deadline = curriculum.stage, jnp.asarray(schedule.deadline)
     first, last = stage == 0, stage == deadline.shape[0] - 1
     whole = verdict.judged[stage] & (curriculum.cohort - 1 >= curriculum.since)

@@ -32,7 +32,7 @@ ARMS = {
 PAIR = ("curriculum", "baseline")
 TUNED = ("curriculum_expanded", "baseline_expanded")
 MODERN = ("modern_curriculum", "modern_baseline")
-# Keys of a row of the evaluation, each over the row's episodes.
+# Keys of a row of the evaluation. Each is measured over the row's episodes.
 JUDGED = ("targets_reached", "all_reached", "sensed_share", "contacts_per_robot", "return")
 _COUNTS = ("seed", "update", "arena_steps", "steps", "robots")
 _BY_ROBOT = {

@@ -31,7 +31,7 @@ SKID_RADIUS = 0.005  # m; half the height of the box under the Webots e-puck
 _QPOS = 9  # x, y, z, quaternion (w, x, y, z), left wheel, right wheel
 REST_DEPTH = 1e-5  # m; depth of the wheels in the floor at rest; at 16 ms it is 9e-6
 _PENETRATION = 0.5  # share of the penetration that one physics step removes
-_IMPEDANCE = 0.999  # impedance of the grip; it leaves a thousandth of gravity's acceleration
+_IMPEDANCE = 0.999  # impedance of the grip: a thousandth of gravity's acceleration remains
 # m; y of a wheel's frame. The tyre is 5 mm wide, so its geom lies off this frame. MuJoCo would
 # treat a geom compiled at the origin of its body's frame as fixed there, whatever `geom_pos` is.
 _INNER_EDGE = epuck.AXLE_Y - 0.0025

@@ -46,7 +46,7 @@ def test_words_of_the_study_are_told_from_those_of_training() -> None:
         (["curriculum.mode=mixed"], "curriculum.mode cannot be given: choose it by arms"),
         (["arms=final,none"], "arms is 'none': give final, sequential"),
         (["points=1"], "points is 1"),
-        (["label=x"], "label is x, but arms has 4"),
+        (["label=x"], "label is x, but arms names 4 arms"),
     ],
 )
 def test_unsound_words_are_refused(words: list[str], expected: str) -> None:

@@ -166,7 +166,7 @@ def rubs(model: mujoco.MjModel) -> bool:
 
 
 def put(model: mujoco.MjModel) -> tuple[Model, Data]:
-    """Puts the fields that a step reads on the device.
+    """Copies to the device the fields that a step reads.
 
     Args:
       model: compiled, one arena.
