@@ -17,8 +17,8 @@ The paper's obstacles stand still, but robots are obstacles that move. Three rul
    head on thus pass each other. A standing robot is followed like any outline.
 2. If an outline is not sensed for `LOST` metres, it belonged to a robot that has gone, and a new
    line starts here. If a robot has gone all the way round an outline without crossing the line
-   at a point closer to the target, the outline was not the one that blocked it. A new line starts, and the
-   next outline is followed on the other side.
+   at a point closer to the target, the outline was not the one that blocked it. A new line
+   starts, and the next outline is followed on the other side.
 3. If a robot makes no progress for `STUCK` seconds, in front of another robot or between two, it
    does the same as after a full round. This ends most deadlocks, but not all.
 

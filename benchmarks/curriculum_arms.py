@@ -49,7 +49,10 @@ class StudyConfig(Section):
                 f"{self.goal}: give goal={GRID_GOAL}, or other arms."
             )
         if self.label is not None and len(self.arms) > 1:
-            raise ConfigError(f"label is {self.label}, but arms names {len(self.arms)} arms: give one arm with a label.")
+            raise ConfigError(
+                f"label is {self.label}, but arms names {len(self.arms)} arms: give one arm with a "
+                "label."
+            )
 
 
 def parse(words: Sequence[str]) -> tuple[StudyConfig, list[str]]:

@@ -150,7 +150,9 @@ def families_table(arms: dict[str, Line]) -> str:
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     if not arguments:
-        raise ConfigError("no file is given: give files of lines that benchmarks.worlds_study printed.")
+        raise ConfigError(
+            "no file is given: give files of lines that benchmarks.worlds_study printed."
+        )
     arms = merge([line for name in arguments for line in read(Path(name))])
     sys.stdout.write(f"{arms_table(arms)}\n\n{families_table(arms)}\n")
     return 0
