@@ -63,10 +63,12 @@ class RobotConfig(Section):
             2 * LARGEST_HULL,
         ),
     )
-    effective_track: float = field(
-        default=epuck.TRACK,
+    effective_track: float | None = field(
+        default=None,
         metadata=about(
-            "distance between the points where the wheels grip, m", LEAST, 2 * LARGEST_HULL
+            "distance between the points where the wheels grip, m; null: track",
+            LEAST,
+            2 * LARGEST_HULL,
         ),
     )
     motor_lag: float = field(
@@ -109,7 +111,13 @@ class RobotConfig(Section):
         ),
     )
 
+    @property
+    def grip_track(self) -> float:
+        """Distance between the points where the wheels grip, m."""
+        return self.track if self.effective_track is None else self.effective_track
+
     def _check(self) -> None:
+        object.__setattr__(self, "effective_track", self.grip_track)
         if 0.0 < self.hull_friction < LEAST_HULL_FRICTION:
             raise ConfigError(
                 f"hull_friction is {show(self.hull_friction)}, which makes contacts too stiff for "

@@ -80,7 +80,7 @@ def _servos(robot: RobotConfig, timestep: float) -> _Numbers:
     grip = robot.friction * robot.mass * epuck.GRAVITY
     share = servo_share(robot.motor_lag, timestep)
     inertia = np.array([share * robot.mass, robot.mass, share * robot.yaw_inertia])
-    return _Numbers(inertia / timestep, grip * np.array([1.0, 1.0, 0.5 * robot.effective_track]))
+    return _Numbers(inertia / timestep, grip * np.array([1.0, 1.0, 0.5 * robot.grip_track]))
 
 
 def _ratios(chassis: Chassis, robot: RobotConfig, xp: Any) -> _Numbers:
@@ -93,7 +93,7 @@ def _ratios(chassis: Chassis, robot: RobotConfig, xp: Any) -> _Numbers:
     grip = np.ones((1, 1)) * mass * _ratio(chassis.friction, robot.friction)
     if chassis.track is None:
         return _Numbers(mass, grip)
-    arm = _ratio(chassis.track, robot.effective_track)
+    arm = _ratio(chassis.track, robot.grip_track)
     turns = np.array([label == "turn" for label in _SERVOS])
     return _Numbers(mass, grip * xp.where(turns, arm, 1.0))
 
@@ -164,7 +164,7 @@ def _pose(qpos: Array, xp: Any) -> Array:
 def _ctrl(wheels: Array, chassis: Chassis, robot: RobotConfig, xp: Any) -> Array:
     """Returns the velocity of a body that rolls on these wheels without slip."""
     radius = robot.wheel_radius if chassis.wheel_radius is None else chassis.wheel_radius
-    track = robot.effective_track if chassis.track is None else chassis.track
+    track = robot.grip_track if chassis.track is None else chassis.track
     velocity = body_velocity(wheels, radius, track, xp)
     forward, turn = velocity[..., 0], velocity[..., 1]
     return _flat(xp.stack([forward, 0.0 * forward, turn], axis=-1))

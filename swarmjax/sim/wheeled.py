@@ -93,7 +93,7 @@ def _add_wheel(
     wheel.inertia = epuck.WHEEL_INERTIA
     hinge = mujoco.mjtJoint.mjJNT_HINGE
     wheel.add_joint(name=name, type=hinge, axis=[0, 1, 0], armature=ROTOR_INERTIA)
-    place = [0.0, side * (0.5 * robot.effective_track - _INNER_EDGE), 0.0]
+    place = [0.0, side * (0.5 * robot.grip_track - _INNER_EDGE), 0.0]
     sphere = mujoco.mjtGeom.mjGEOM_SPHERE
     add_geom(wheel, name, sphere, [robot.wheel_radius, 0, 0], place, FLOOR_GROUP)
     friction = [robot.friction, robot.friction, *SPIN]

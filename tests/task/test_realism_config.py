@@ -96,6 +96,12 @@ def test_robot_presets_are_the_two_versions(load, name, body, mass, wheel_speed,
     )
 
 
+def test_wheels_grip_where_they_are_unless_a_robot_says_otherwise():
+    assert load_train(["robot.track=0.044"]).robot.effective_track == 0.044
+    both = load_train(["robot.track=0.044", "robot.effective_track=0.05"]).robot
+    assert (both.track, both.effective_track) == (0.044, 0.05)
+
+
 def test_tracks_and_motor_of_the_nominal_robot():
     robot = RobotConfig()
     assert (robot.track, robot.effective_track, robot.motor_lag) == (0.052, 0.052, 0.0)
