@@ -1,8 +1,8 @@
 """swarmjax from Python: environments, training, evaluation and policies.
 
 These functions are available as `swarmjax.make_env` and so on. Settings have the same names as on
-the command line. Where a command refuses a setting, a function raises `SwarmjaxError` with the
-same sentence.
+the command line. If a setting would be refused on the command line, these functions raise
+`SwarmjaxError` with the same message.
 """
 
 import functools
@@ -81,8 +81,8 @@ def make_env(
     `state.observation` [A, R, O] is the policy's input. Arenas start new episodes by themselves.
 
     Args:
-      stage: a name of `configs/stage/`, the path of a .yaml file, a `StageConfig`, or several of
-        these; arena i plays stage i modulo the number of stages.
+      stage: a name of `configs/stage/`, the path of a .yaml file, a `StageConfig`, or a list of
+        such stages. Arena i plays stage i modulo the number of stages.
       robot: `planar`, `wheeled` or another name of `configs/robot/`, or settings by name, as in
         `{"hull_radius": 0.04}`.
       task: settings by name, as in `{"step_limit": 300, "reward": {"contact": -0.1}}`.
@@ -133,9 +133,10 @@ def train_policy(
       on_update: called with each row of `metrics.jsonl`. If it returns True, the run saves and
         stops, as it does on Ctrl-C.
       log: a function that is also called with each row, but in its own thread, so the run does not
-        wait for it. If the function raises, a warning is printed to standard error and the run
-        continues without it. May also be a `Logger` of `swarmjax.run.loggers`, which also receives
-        speeds and is closed at the end, or a list of functions and loggers.
+        wait for the function. If the function raises, a warning is printed to standard error and
+        the run continues without it. Instead of a function, `log` may be a `Logger` of
+        `swarmjax.run.loggers`, or a list of functions and loggers. A `Logger` also receives speeds,
+        and is closed at the end.
       extensions: your own extension pieces: a file, a module, or a list of them.
 
     Returns:
@@ -175,16 +176,17 @@ def evaluate_policy(
         found = swarmjax.evaluate_policy(result.policy, stage="s6", episodes=100)
         found["cells"][0]["measures"]["targets_reached"]["mean"]
 
-    Robot, task and realism are those that the policy was trained with, on the wheeled body.
+    The policy plays with the robot, task and realism that it was trained with, but on the wheeled
+    body.
 
     Args:
-      policy: a `Policy`, the path of a policy file, or several from the same recipe.
-      suite: a name of `configs/suites/`, or a file, instead of a stage.
+      policy: a `Policy`, the path of a policy file, or a list of these from the same recipe.
+      suite: a name of `configs/suites/`, or the path of a file; give it instead of a stage.
       stage: a name, a path or a `StageConfig`; None: the last stage that the policy was trained on.
       extensions: pieces that the policy needs: a file, a module, or a list of them.
       workers: number of processes. Each additional process imports the calling script again, so
         that script needs `if __name__ == "__main__":`.
-      settings: further keys of the command, as `episodes=100`, `realism="real"`.
+      settings: further keys of the command, as in `episodes=100` or `realism="real"`.
 
     Returns:
       The contents of `result.json` (docs/interface.md).
@@ -217,7 +219,7 @@ def load_policy(path: str | Path, extensions: Any = None) -> Policy:
 
     Args:
       path: path of the file.
-      extensions: a file, module or list with the network that the policy needs, if any.
+      extensions: a file, a module or a list with the policy's own network, if it has one.
 
     Raises:
       SwarmjaxError: the file is missing, damaged or inconsistent.
@@ -240,12 +242,15 @@ def _loggers(given: Any) -> "list[Logger]":
 
 
 def _is_one(policy: Any) -> bool:
-    """Returns whether this is a single policy or path, not a list; a policy is a tuple too."""
+    """Returns whether this is one policy or path, not several.
+
+    A policy is itself a tuple, so a tuple need not hold several policies.
+    """
     return isinstance(policy, str | Path | Policy)
 
 
 def _given(settings: Mapping[str, Any]) -> tuple[list[str], list[dict[str, Any]] | None]:
-    """Returns settings as command-line words, and separately the stages that no word can name."""
+    """Returns settings as command-line words, and the stages that no word can name."""
     rest = dict(settings)
     stage = rest.get("stage")
     stages = None if stage is None or isinstance(stage, str | Path) else _stages(rest.pop("stage"))
@@ -255,7 +260,7 @@ def _given(settings: Mapping[str, Any]) -> tuple[list[str], list[dict[str, Any]]
 
 
 def _stages(given: Any) -> list[dict[str, Any]]:
-    """Converts stages to plain data; accepts settings, mappings, or names in a list."""
+    """Converts stages to plain data. They may be settings, mappings, or names in a list."""
     from swarmjax.task import stage_files
 
     every = [given] if isinstance(given, Section | Mapping) else list(given)
@@ -280,13 +285,13 @@ def _mapping(settings: Settings) -> dict[str, Any]:
 
 
 def _flat(given: Mapping[str, Any], where: str = "") -> dict[str, str]:
-    """Flattens settings to values by dotted keys, written as on a command line."""
+    """Flattens nested settings: returns values by dotted key, both written as on a command line."""
     found: dict[str, str] = {}
     for key, value in given.items():
         value = to_dict(value) if isinstance(value, Section) else value
         if isinstance(value, Mapping):
             found |= _flat(value, f"{where}{key}.")
-        elif isinstance(value, str | Path):  # names, paths and what was typed
+        elif isinstance(value, str | Path):  # names, paths and typed values
             found[f"{where}{key}"] = str(value)
         else:
             found[f"{where}{key}"] = inherit.write(value)
@@ -294,5 +299,5 @@ def _flat(given: Mapping[str, Any], where: str = "") -> dict[str, str]:
 
 
 def _signals(stop: Any) -> AbstractContextManager[Any]:
-    """Handles Ctrl-C where that is possible: in the main thread."""
+    """Handles Ctrl-C in the main thread; other threads cannot handle it."""
     return stop if threading.current_thread() is threading.main_thread() else nullcontext()

@@ -1,7 +1,7 @@
 """The swarm as an environment: many arenas stepped together by pure functions.
 
-`make_env` creates one. Axes: A arenas, R robots (the number of the largest stage), O observation
-entries.
+`make_env` creates one. The axes of arrays are A arenas, R robots (as many as the largest stage has)
+and O observation entries.
 """
 
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ from swarmjax.training import program as programs
 from swarmjax.training import rollout
 from swarmjax.training.config import ProgramConfig
 
-_REDRAW = 32  # control steps in which all waiting levels are replaced; episodes take longer
+_REDRAW = 32  # control steps in which every waiting level is replaced once; episodes take longer
 
 
 class Space(NamedTuple):
@@ -64,7 +64,7 @@ class SwarmState:
 
     @property
     def observation(self) -> Array:
-        """Input of the policy, [A, R, O]; after the end of an episode, that of the new one."""
+        """Input of the policy, [A, R, O]; where an episode has ended, that of the new episode."""
         return self.arenas.observation
 
     @property
@@ -99,14 +99,14 @@ class Swarm:
 
     @property
     def observation_space(self) -> Space:
-        """One robot's observation, [O]; with `task.history`, earlier observations follow."""
+        """One robot's observation, [O]; with `task.history`, earlier observations come last."""
         layout, history = self.world.electronics.layout, self.world.task.history
         names = observation.stacked_names(layout.names, history)
         return Space((len(names),), names, layout.units * history, None, None)
 
     @property
     def action_space(self) -> Space:
-        """One robot's action, [U]: the command, clipped to -1..1; -1 and 1 span its range.
+        """One robot's action, [U]: the command, clipped to -1..1, the ends of the command's range.
 
         The numbers that a robot broadcasts, if any, follow the two numbers of the command.
         """
@@ -115,7 +115,7 @@ class Swarm:
         return Space(ones.shape, names, ("1",) * len(names), -ones, ones)
 
     def pose(self, state: SwarmState) -> Array:
-        """Returns poses [A, R, 3], x (m), y (m), yaw (rad); absent robots are parked outside."""
+        """Returns poses [A, R, 3]: x (m), y (m), yaw (rad). Absent robots are parked outside."""
         return jax.vmap(partial(physics.poses, self.world.physics))(state.arenas.sim)
 
     def reset(self, key: Array) -> SwarmState:
@@ -137,12 +137,12 @@ class Swarm:
         )
 
     def step(self, state: SwarmState, action: Array) -> tuple[SwarmState, TimeStep]:
-        """Advances all arenas by one control step; arenas whose episode ends start another.
+        """Advances all arenas by one control step; an arena whose episode ends starts a new one.
 
-        Arenas reset themselves. Where `done` is true, the returned state belongs to the next
-        episode, while the step's observation is the last one of the old episode. The levels of the
-        next episodes are drawn ahead, and each is redrawn every 32 steps. An arena that ends two
-        episodes within 32 steps plays the same level again.
+        Where `done` is true, the returned state belongs to the next episode, while the step's
+        observation is the last one of the old episode. The levels of the next episodes are drawn
+        ahead, and each is redrawn every 32 steps. An arena that ends two episodes within 32 steps
+        plays the same level again.
 
         Args:
           state: before the step.
@@ -162,14 +162,14 @@ class Swarm:
         return SwarmState(arenas=arenas, waiting=waiting, key=key, clock=state.clock + 1), came
 
     def _redraw(self, waiting: EnvState, clock: Array, key: Array) -> EnvState:
-        """Replaces the next few of the waiting episodes, in turn."""
+        """Replaces a few of the waiting episodes, each in its turn."""
         count = -(-self.num_arenas // _REDRAW)
         which = (clock * count + jnp.arange(count)) % self.num_arenas
         fresh = self._draw(key, which)
         return jax.tree.map(lambda old, new: old.at[which].set(new), waiting, fresh)
 
     def _draw(self, key: Array, arena: Array) -> EnvState:
-        """Starts one episode in each of these arenas [N], with `sim` as a `PhysicsState`."""
+        """Starts one episode in each of these arenas [N]; `sim` is then a `PhysicsState`."""
         spacing, stages = self.world.spacing, jax.tree.map(jnp.asarray, self.stages)
         count = len(self.stages.robots)
 
@@ -192,7 +192,7 @@ def load(config: ProgramConfig) -> Swarm:
       The environment.
 
     Raises:
-      ConfigError: a piece of an extension does not fit, or `task.env.load` raises it.
+      ConfigError: a piece of an extension does not fit, or `task.env.load` refuses a setting.
     """
     world = programs.load_world(config)
     stages = task_stage.stack(config.stage, world.drawings)

@@ -11,8 +11,9 @@ HULL_RADIUS = 0.037  # m; Webots E-puck, collision cylinder
 HULL_BOTTOM = 0.0025  # m; lower end of the same cylinder (centre 0.025, height 0.045)
 HULL_TOP = 0.0475  # m; its upper end
 MASS = 0.16  # kg; Webots e-puck guide, version 1: body 0.15 and two wheels of 0.005
-# kg m^2; the body has 9.78585e-5 about its vertical axis. Two 5 g wheels 0.026 m off the axis add
-# 2 * 0.005 * 0.026**2 = 6.8e-6, and 5.1e-7 each about their own axes: 1.06e-4 in all.
+# kg m^2; the body has 9.78585e-5 about its vertical axis. Two wheels of 5 g, 0.026 m off the axis,
+# add 2 * 0.005 * 0.026**2 = 6.8e-6. Each wheel also adds 5.1e-7 about its own axis. The total is
+# 1.06e-4.
 YAW_INERTIA = 1.06e-4
 WHEEL_MASS = 0.005  # kg, each; Webots E-puck
 # The whole body, for `robot=wheeled`: Webots E-puck, version 1, without its wheels. The moments are
@@ -53,7 +54,7 @@ SENSOR_POSES = (
 SENSOR_TILT = 0.16  # rad; upward tilt of every ray, Webots E-puckDistanceSensor
 # Ray length (m), counts, and standard deviation relative to the counts: Webots
 # E-puckDistanceSensor. Webots interpolates linearly and holds the end values beyond the table. The
-# points up to 0.05 m are also in INFRARED_TABLE, driver.cpp of cyberbotics/epuck_ros2 (Apache-2.0).
+# points up to 0.05 m are also in INFRARED_TABLE of cyberbotics/epuck_ros2 (driver.cpp, Apache-2.0).
 INFRARED_TABLE = (
     (0.000, 4095.00, 0.00200),
     (0.005, 2133.33, 0.00300),
@@ -66,10 +67,10 @@ INFRARED_TABLE = (
     (0.060, 104.09, 0.03065),
     (0.070, 67.19, 0.04897),
 )
-# Counts of ps0..ps7 of one e-puck before zeroing, at 0, 1, .. 7 cm from its hull to an object:
-# sensorMean.txt and sensorVar.txt (which holds standard deviations) of
-# mohammad7t/Particle-Filter-for-e-puck-on-Webots, commit 0de64e89. We infer that the robot was a
-# real one: each sensor has its own offset.
+# Counts of ps0..ps7 of one e-puck, before zeroing, with an object 0, 1, .. 7 cm from its hull.
+# Source: sensorMean.txt and sensorVar.txt of mohammad7t/Particle-Filter-for-e-puck-on-Webots,
+# commit 0de64e89; sensorVar.txt holds standard deviations. We infer that the robot was a real one,
+# since each sensor has its own offset.
 MEASURED_GAPS = (0.00, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.07)  # m
 MEASURED_INFRARED = (
     (3779.0, 1382.69, 760.04, 588.15, 519.47, 501.50, 487.47, 482.03),
@@ -93,9 +94,10 @@ MEASURED_INFRARED_SD = (
 )
 # The curve A / (gap + d)^2 + b of ps0..ps7: A (counts m^2), d (m), b (counts). The curve was fitted
 # to the means at 1 to 7 cm by least squares, weighted by the standard deviations. No residual may
-# exceed 13 counts; this limit affects only ps0, which has a residual of 13.1 without the limit. The
-# last two columns are the median of those standard deviations, and the mean at 0 cm, which is the
-# largest reading (counts). tests/sim/test_response.py repeats the fit.
+# exceed 13 counts. This limit affects only ps0, which has a residual of 13.1 counts without the
+# limit. The fourth column is the median of those standard deviations (counts). The last column is
+# the mean at 0 cm, which is the largest reading (counts). tests/sim/test_response.py repeats the
+# fit.
 INFRARED_FIT = (
     (0.16935, 0.0034172, 442.63, 12.06, 3779.0),
     (0.18230, 0.0015093, 179.89, 3.58, 3810.0),

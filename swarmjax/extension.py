@@ -2,8 +2,8 @@
 
 A piece is a function with one of the decorators below; a network is a Flax module. Commands take
 the file as `extensions=FILE`. `make_env` and `train_policy` also take a module or a list of pieces.
-All pieces of a file are used unless a key says otherwise. docs/extending.md has an example of each
-kind. Loading a file executes it. Importing this module does not import JAX.
+All pieces of a file are used unless a setting says otherwise. docs/extending.md has an example of
+each kind. Loading a file executes it. Importing this module does not import JAX.
 """
 
 import ast
@@ -34,7 +34,7 @@ class Piece:
     Attributes:
       kind: the kind of piece, as messages and policy files call it.
       taken: names of this kind that the package itself uses.
-      name: name of the piece in keys and policy files.
+      name: name of the piece in settings and policy files.
       function: the function.
     """
 
@@ -95,7 +95,7 @@ class Observation(Piece):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LevelDrawing(Piece):
-    """A way to draw levels, for one arena: `(swarmjax.task.level.Level, key) -> Level`."""
+    """A way to draw a level of one arena: `(swarmjax.task.level.Level, key) -> Level`."""
 
     kind: ClassVar[str] = "level"
     taken: ClassVar[tuple[str, ...]] = (
@@ -106,7 +106,7 @@ class LevelDrawing(Piece):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Network(Piece):
-    """A Flax module that takes [..., O] and returns features [..., F], for actor and critic."""
+    """A Flax module for actor and critic; it takes [..., O] and returns features [..., F]."""
 
     kind: ClassVar[str] = "network"
     taken: ClassVar[tuple[str, ...]] = ("mlp",)
@@ -172,7 +172,7 @@ def level_drawing(function: Callable) -> LevelDrawing:
 
 
 def network(module: type) -> Network:
-    """Turns a Flax module into a network for actor and critic, which `algo.network` selects."""
+    """Turns a Flax module into a network for actor and critic; `algo.network` selects it."""
     return Network(name=_snake(module.__name__), function=module)
 
 
@@ -213,8 +213,8 @@ NONE = Extensions()
 
 # Loading
 
-_files: dict[tuple[str, str], Extensions] = {}  # by path and SHA-256 of the content
-_handed: dict[str, Extensions] = {}  # pieces from `hand_over`, by the word that stands for them
+_files: dict[tuple[str, str], Extensions] = {}  # keys: path, and SHA-256 of the content
+_handed: dict[str, Extensions] = {}  # pieces from `hand_over`; keys: the words that stand for them
 _HANDED = "python:"  # prefix of the words that `hand_over` returns
 
 
@@ -255,7 +255,7 @@ def hand_over(given: object) -> str | None:
       given: None, a path, a module, a piece, or several pieces.
 
     Raises:
-      ConfigError: if it is something else, or a piece is invalid.
+      ConfigError: if `given` is anything else, or a piece is invalid.
     """
     if given is None or isinstance(given, str):
         return given
@@ -290,8 +290,8 @@ def _import(path: Path, content: bytes, digest: str) -> types.ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
-        # Do not use cached bytecode or lines. Both caches compare only the size of a file and its
-        # time in whole seconds, so they may be out of date.
+        # Do not use cached bytecode or lines. Both caches may be out of date, since they compare
+        # only a file's size and its modification time in whole seconds.
         linecache.cache.pop(str(path), None)
         exec(compile(content, str(path), "exec"), vars(module))
     except Exception as error:
@@ -309,7 +309,7 @@ def describe(error: BaseException) -> str:
 
 
 def _pieces(names: Mapping[str, object]) -> list[Piece]:
-    """Lists the pieces among a module's names, each once."""
+    """Lists the pieces among a module's names, without repeats."""
     found = {id(value): value for value in names.values() if isinstance(value, Piece)}
     return list(found.values())
 
@@ -361,7 +361,7 @@ def _check(piece: Piece, where: str) -> None:
 
 
 def _sources(thing: Any, found: dict[str, str]) -> dict[str, str]:
-    """Returns the syntax trees of a function or class and of all that it uses from its file."""
+    """Returns the syntax trees of a function or class, and of all that it uses from its file."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(thing)))
     except (OSError, TypeError, SyntaxError):
@@ -386,7 +386,7 @@ def _sources(thing: Any, found: dict[str, str]) -> dict[str, str]:
 def _bare(tree: ast.Module) -> ast.Module:
     """Removes the decorator and all docstrings.
 
-    Keys and layouts already record the arguments of the decorator.
+    The decorator's arguments are already recorded in settings and observation layouts.
     """
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):

@@ -15,7 +15,7 @@ from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.geometry import hull_name
 
 Array = Any
-Changes = dict[str, tuple[Any, Array]]  # field of the model: rows, and their new values
+Changes = dict[str, tuple[Any, Array]]  # by field of the model: rows, new values
 
 
 class Chassis(NamedTuple):
@@ -65,7 +65,7 @@ class Servos(NamedTuple):
     """Servos: actuators in MuJoCo C; forces on joints in MJX, where actuators cost time.
 
     Attributes:
-      add: adds the actuators to the robots of these names in a spec, for a physics step (s).
+      add: adds actuators to the robots of these names in a spec; takes the physics step (s).
       force: returns the servo forces on the joints at the beginning of a physics step, [..., R * V]
         N or N m. Takes qpos [..., R * Q], qvel [..., R * V], ctrl [..., R * U], a chassis, the
         config's numbers and the physics step (s).
@@ -82,12 +82,13 @@ class Body:
     Attributes:
       gravity: whether gravity acts along any of the body's joints.
       cone: friction cone of the body's contacts.
-      add: adds a robot of this name to a spec, for a physics step (s); returns its contact geom.
+      add: adds a robot of this name to a spec, and returns its contact geom; takes the physics step
+        (s).
       qpos: joint positions [..., R * Q] of robots at rest at [..., R, 3] x (m), y (m), yaw (rad).
-      pose: the inverse, [..., R, 3].
-      ctrl: controls [..., R * U] for wheel speeds [..., R, 2] (rad/s) of a chassis.
+      pose: poses [..., R, 3] of robots with joint positions [..., R * Q]; the inverse of `qpos`.
+      ctrl: controls [..., R * U] that give a chassis the wheel speeds [..., R, 2] (rad/s).
       changes: changes that a chassis makes to the compiled model; the model is the last argument.
-      servos: servos that follow `ctrl`, if a spec can omit them; None if `add` adds them.
+      servos: servos that follow `ctrl` and that a spec may omit; None if `add` adds the servos.
     """
 
     gravity: bool
@@ -138,8 +139,8 @@ def scale_mass(ratio: Array, rows: Rows, model: mujoco.MjModel) -> Changes:
 
     Returns:
       Changes of the bodies. The changes include the inverse weights. MuJoCo softens contacts with
-      them, and MJX does not recompute them. The weights shrink in proportion to the mass. This
-      scaling is exact except for the share of the wheel motors.
+      these weights, and MJX does not recompute them. The weights shrink in proportion to the mass.
+      This scaling is exact except for the share of the wheel motors.
     """
     bodies, dofs = rows.bodies, rows.dofs
     return {

@@ -15,7 +15,7 @@ _HULL_REASON = (
     "swarmjax/sim/config.py together"
 )
 # Limits for MuJoCo's geometry, float32 and arenas of 0.4 to 4 m. An e-puck drives at 0.13 m/s.
-LEAST = 0.001  # m, m/s, rad/s or friction; lower limit of numbers that code divides by
+LEAST = 0.001  # m, m/s, rad/s or friction; lower limit of the numbers that are used as divisors
 _FASTEST = 5.0  # m/s
 _SPEED_REASON = "a faster robot crosses the largest arena, of 4 m, in less than a second"
 _FASTEST_TURN = 50.0  # rad/s
@@ -23,7 +23,7 @@ _TURN_REASON = "a faster turn makes more than one rotation in a control step of 
 FASTEST_WHEEL = 1000.0  # rad/s
 MOST_FRICTION = 10.0
 FRICTION_REASON = "rubber on rubber has less than 2"
-# Below this value, MuJoCo's pyramidal cone makes a wheeled robot's contact too stiff for float32.
+# With less friction, MuJoCo's pyramidal cone makes a wheeled robot's contact too stiff for float32.
 # The crowds of tests/sim/test_rubbing.py were off by 1e-4 with friction 0.1 and by 1e-3 with 0.05,
 # and not finite with 0.001.
 LEAST_HULL_FRICTION = 0.1
@@ -132,7 +132,8 @@ class RobotConfig(Section):
                     f"{key} is {show(value)}, but hull_radius is {show(hull)} and the wheels lie "
                     f"inside the hull: give less than {show(most * hull)}."
                 )
-        # Each wheel's inertia about its own upright axis, plus that of a point mass on the axle.
+        # For each wheel: its inertia about its own upright axis, plus that of a point mass on the
+        # axle.
         wheels = 2 * (epuck.WHEEL_INERTIA[2] + epuck.WHEEL_MASS * epuck.AXLE_Y**2)
         if self.body == "wheeled" and self.yaw_inertia <= wheels:
             raise ConfigError(

@@ -22,19 +22,21 @@ if TYPE_CHECKING:
     from swarmjax.sim.model import Ids
 
 Array = Any
-# Limits of iterations and line-search steps; docs/design-notes.md has the measurements. With
-# `jax`, the limits stop MJX's Newton method once it is close enough. All others can converge.
+# Limits of iterations and line-search steps; docs/design-notes.md has the measurements. With `jax`,
+# these limits stop MJX's Newton method once its result is close enough. With all other limits,
+# solvers can converge.
 _NEWTON_STEPS = {"planar": (3, 5), "wheeled": (30, 20)}
 _MOST_STEPS = (100, 50)  # MuJoCo's own
-# Limit for discs: the tightest jam of tests/sim/test_solver.py takes 150 to 200 sweeps. Its error
-# was 1.9e-4 with 100 sweeps, 4e-6 with 200, and 2.4e-5 with MJX's own step. On an H200, 200 sweeps
-# cost 1.5 % of training time.
+# Limit for discs: the tightest jam of tests/sim/test_solver.py takes 150 to 200 sweeps. The error
+# of that jam was 1.9e-4 with 100 sweeps and 4e-6 with 200 sweeps; with MJX's own step it was
+# 2.4e-5. On an H200, 200 sweeps cost 1.5 % of training time.
 _MOST_SWEEPS = 200
 # Forces settle more slowly between hulls with friction. A jam with friction 1.5 takes 400 sweeps to
 # get as close as one without friction. With `jax`, MJX's Newton method takes as many steps as for
 # wheels.
 _MOST_RUBBING_SWEEPS = 400
-# In a jam of more wheeled robots, the solver made for them leaves up to 7 mm/s (design note 38).
+# In a jam of more wheeled robots, the solver made for wheels leaves an error of up to 7 mm/s
+# (design note 38).
 MOST_WHEELED = 5
 
 
@@ -161,7 +163,7 @@ def load_engine(
       arenas: number of arenas stepped together.
 
     Returns:
-      MJX's engine for `mjx`; the engine made for the robot's body for `swarm`.
+      The engine: with `mjx`, MJX's own; with `swarm`, the one made for the robot's body.
     """
     from swarmjax.sim import engine
 
@@ -183,7 +185,7 @@ def load_engine(
 
 
 def _push_apart(impl: str, *, rubs: bool) -> Any:
-    """Returns the contact solver for discs; the Warp solvers need Warp to be installed."""
+    """Returns the contact solver for discs. With `warp`, Warp must be installed."""
     name = f"{'rubbing' if rubs else 'planar'}_{impl}"
     return importlib.import_module(f"swarmjax.sim.fast.{name}").push_apart
 
@@ -203,14 +205,14 @@ def load_paths(impl: str) -> ModuleType | None:
 
 
 def pieces(count: int, xp: Any) -> list[slice]:
-    """Splits an axis of objects into the slices that are fastest to process.
+    """Splits an axis of objects into slices of the size that is processed fastest.
 
     Args:
       count: number of objects.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      Slices that cover the axis; a single slice without `fast/unroll.py`.
+      Slices that cover the axis; without `fast/unroll.py`, a single slice.
     """
     try:
         from swarmjax.sim.fast import unroll
@@ -220,7 +222,7 @@ def pieces(count: int, xp: Any) -> list[slice]:
 
 
 def least(values: Iterable[Array], limit: float, xp: Any) -> Array:
-    """Returns the minimum over all objects; their values are split into pieces.
+    """Returns the minimum over all objects, given their values in pieces.
 
     Args:
       values: [..., N] values of objects, one array per piece.

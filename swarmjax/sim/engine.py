@@ -10,12 +10,12 @@ import mujoco
 import numpy as np
 from jax import Array
 
-# Warp stores the contacts of all arenas together. Warp gets memory for this average number of hull
-# contacts per robot, far more than a swarm makes. Floor contacts are counted separately.
+# Warp stores the contacts of all arenas together. It gets memory for this average number of hull
+# contacts per robot, which is far more than a swarm makes. Floor contacts are counted separately.
 CONTACTS_PER_ROBOT = 3
-# Contacts per robot in one arena: a disc touches at most six neighbours of its size at once.
+# Most contacts per robot in one arena. A disc touches at most six neighbours of its size at once.
 ROWS_PER_ROBOT = 6
-FEW_ARENAS = 64  # up to this many arenas may all be crowded, so every pair gets memory
+FEW_ARENAS = 64  # up to this number, all arenas may be crowded, so every pair gets memory
 
 # Types of MJX, in either implementation, or of a faster engine with the same field names.
 Model = Any
@@ -27,7 +27,7 @@ class Engine:
     """Engine for the physics steps of a program.
 
     Attributes:
-      label: description of the engine, in words.
+      label: description of the engine.
       model: model of one arena, on the device.
       template: data of one arena, to fill in.
       step: takes model, data, side [] (m) and obstacles [M, 5], and returns the data one physics
@@ -49,7 +49,7 @@ class Engine:
 
     @property
     def builds_kernels(self) -> bool:
-        """Whether Warp builds MJX's kernels at the first step, once, for half a minute."""
+        """Whether Warp builds MJX's kernels at the first step, which takes half a minute."""
         return self.is_mjx and self.impl == "warp"
 
 
@@ -60,7 +60,7 @@ def load_mjx(model: mujoco.MjModel, robots: int, impl: str, arenas: int) -> Engi
       model: compiled, one arena.
       robots: R.
       impl: `jax` or `warp`.
-      arenas: number of arenas stepped together (they share Warp's contact memory).
+      arenas: number of arenas stepped together; these arenas share Warp's contact memory.
 
     Returns:
       MJX's engine.
@@ -78,7 +78,10 @@ def step_mjx(model: Model, data: Data, _side: Array, _obstacle: Array) -> Data:
 
 
 def import_mjx() -> Any:
-    """Imports MJX lazily: this takes two to four seconds, and planar robots do not need MJX."""
+    """Imports MJX when it is first used; the import takes two to four seconds.
+
+    Planar robots do not need MJX.
+    """
     with contextlib.redirect_stdout(io.StringIO()):  # MJX prints two lines if Warp is missing
         from mujoco import mjx
     return mjx

@@ -13,7 +13,7 @@ CONTACT_PAUSE = 0.1  # s; a contact interrupted for less than this is still the 
 
 
 def gaps(pose: Array, side: Array, obstacle: Array, hull_radius: float, xp: Any) -> Array:
-    """Computes the gap from each hull to the nearest object of each kind; negative for overlap.
+    """Computes the gap from each hull to the nearest object of each kind; overlap is negative.
 
     Args:
       pose: [R, 3] x (m), y (m), yaw (rad); absent robots are parked far away.

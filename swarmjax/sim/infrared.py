@@ -191,13 +191,13 @@ def _cross(at: Array, toward: Array, half: Array, xp: Any) -> tuple[Array, Array
 
 
 def turned(box: Array, xp: Any) -> Box:
-    """Splits rectangles [..., 5] into x (m), y (m), yaw (rad) and half edges (m)."""
+    """Splits rectangles [..., 5]: x (m), y (m), yaw (rad) and half edges (m)."""
     x, y, yaw, half_x, half_y = (box[..., i] for i in range(5))
     return Box(x, y, xp.cos(yaw), xp.sin(yaw), half_x, half_y)
 
 
 def to_box_frame(x: Array, y: Array, box: Box) -> tuple[Array, Array]:
-    """Rotates vectors (x, y) from the world frame into the frames of rectangles, [...] each."""
+    """Rotates vectors x [...] and y [...] from the world frame into the frames of rectangles."""
     return box.cos * x + box.sin * y, box.cos * y - box.sin * x
 
 
@@ -252,9 +252,10 @@ def sights(
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [..., R, K] distance from the sensor's origin to the nearest surface, m, 0..limit; and the
-      reflectance of that surface, 1 without one. At equal distances, a wall takes precedence over a
-      robot, and a robot over an obstacle. Within one kind, the brightest counts.
+      Distance [..., R, K] from the sensor's origin to the nearest surface, m, 0..limit; and the
+      reflectance [..., R, K] of that surface, 1 where there is none. At equal distances, a wall
+      takes precedence over a robot, and a robot over an obstacle. Among objects of one kind, the
+      brightest takes precedence.
     """
     wall, robot, box = _reaches(pose, side, obstacle, hull_radius, mount, xp)
     walls = None if reflectance.wall is None else reflectance.wall[..., None]

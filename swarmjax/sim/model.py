@@ -25,8 +25,8 @@ WALLS = 4
 BODIES: dict[str, Body] = {"planar": PLANAR, "wheeled": WHEELED}
 # Representation of obstacles and walls. When MuJoCo C compiles geoms of the world, it precomputes
 # data for them (`geom_sameframe`, a bounding hierarchy for rays). So in MuJoCo C they are movable
-# bodies. MJX does not use that data, but every body costs time, so there they are geoms of the
-# world. Every actuator costs time too, so a body's `Servos` are left to the engine.
+# bodies. MJX does not use that data, and every body costs time in MJX, so in MJX they are geoms of
+# the world. In MJX, every actuator costs time too, so a body's `Servos` are left to the engine.
 Fixtures = Literal["mocap", "world"]
 
 
@@ -50,7 +50,8 @@ class Ids(NamedTuple):
     Attributes:
       fixture_geom: [M + 4] consecutive rows of `geom_size`: obstacles, then walls east, north,
         west, south.
-      fixture_mocap: [M + 4] rows of `mocap_pos` in the same order; -1 for geoms of the world.
+      fixture_mocap: [M + 4] rows of `mocap_pos`, in the order of `fixture_geom`; -1 for geoms of
+        the world.
       obstacle_geom: [M] the first rows of `fixture_geom`.
       hull_body: [R] bodies of the hulls, for `bodyexclude` of a ray.
       robots: rows of the robots.
@@ -79,8 +80,8 @@ def build(
       timestep: one physics step, s.
       ray_geoms: whether to add the cylinder hulls that rays see; analytic sensors need none.
       fixtures: `mocap` makes obstacles and walls bodies, for MuJoCo C. `world` makes obstacles and
-        walls geoms of the world, for MJX. MJX gets their poses and the forces of the servos at run
-        time.
+        walls geoms of the world, for MJX. At run time, MJX gets the poses of these geoms, and the
+        forces of the servos.
 
     Returns:
       The spec, ready to compile. qpos, qvel and ctrl hold each robot in turn, in its body's layout.
@@ -187,7 +188,7 @@ def _rubbing(friction: float) -> dict[str, Any]:
 
 
 def _set_options(spec: mujoco.MjSpec, timestep: float, body: Body, *, rubs: bool) -> None:
-    """Selects Euler, as servos are discrete, and disables unused features, which cost MJX time."""
+    """Selects Euler, as servos are discrete; disables unused features, which cost MJX time."""
     if rubs:
         spec.option.cone = body.cone
     spec.option.timestep = timestep

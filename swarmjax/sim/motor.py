@@ -12,8 +12,8 @@ from swarmjax.sim.realism_config import RealismConfig
 
 Array = Any
 
-# Motor steps in one turn of the wheel: 20 per turn of the motor, with a 50:1 gear. Source: the
-# e-puck guide; both versions have the same number.
+# Motor steps in one turn of the wheel: the motor makes 20 steps per turn, and the gear is 50:1.
+# Source: the e-puck guide; both versions have the same number.
 STEPS_PER_TURN = 1000
 _STEPS_PER_RADIAN = STEPS_PER_TURN / (2.0 * math.pi)
 # Timer ticks per second. The time between two steps is a whole number of ticks. e-puck 1: ticks of
@@ -105,7 +105,7 @@ def deliver(
 def _stall(
     held: Array, realism: RealismConfig, seed: Array, clock: Array, control_step: float, xp: Any
 ) -> Array:
-    """Starts stalls; returns the stalled control steps left, including this one, [..., R]."""
+    """Starts stalls; returns the number [..., R] of stalled steps left, including this one."""
     robots = held.shape[-1:]
     begins = noise.uniform(seed, clock, Stream.STALL, robots, xp) < realism.stall
     # Convert to control steps first, so that a fixed length rounds the same in NumPy and JAX.
@@ -145,9 +145,10 @@ def quantise(speed: Array, version: Literal["epuck1", "epuck2"], xp: Any) -> Arr
     """Rounds wheel speeds to those that the firmware's timer can make.
 
     A command is truncated to a whole number of steps per second, so below one step per second
-    nothing moves. The time between steps is truncated to a whole number of ticks, which makes the
-    wheel faster. Up to 1000 steps per second, the error is less than 10 % on version 1 and 2 % on
-    version 2. Sources: `e_motors.c` of e-puck-library, `motors.c` of e-puck2_main-processor.
+    nothing moves. The time between two motor steps is truncated to a whole number of ticks, which
+    makes the wheel faster. Up to 1000 steps per second, the error is less than 10 % on version 1
+    and 2 % on version 2. Sources: `e_motors.c` of e-puck-library, `motors.c` of
+    e-puck2_main-processor.
 
     Args:
       speed: [...] rad/s.

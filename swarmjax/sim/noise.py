@@ -95,7 +95,7 @@ def uniform(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: 
     Returns:
       [..., *shape] float32 in [0, 1).
     """
-    # 24 bits are the most that a float32 below 1 can hold without rounding two values together.
+    # With more than 24 bits, rounding to a float32 below 1 would make some values equal.
     whole = bits(seed, clock, stream, shape, xp) >> 8
     return whole.astype(xp.float32) * np.float32(2.0**-24)
 
@@ -104,8 +104,8 @@ def normal(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: A
     """Draws standard normal numbers, from two uniform numbers for each pair.
 
     Box and Muller, "A Note on the Generation of Random Normal Deviates", Annals of Mathematical
-    Statistics 29 (1958), pages 610-611, equation 1. The smallest uniform number bounds the result
-    by `MOST`.
+    Statistics 29 (1958), pages 610-611, equation 1. The logarithm's argument is at least 2**-24, so
+    no result exceeds `MOST` in magnitude.
 
     Args:
       seed: [...] uint32.

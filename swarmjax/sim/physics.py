@@ -2,8 +2,8 @@
 
 The state of an arena is `PhysicsState`: positions, velocities and the solver's warm start. This
 state is the same for every engine, and a step reads nothing else. Within a rollout, the engine's
-complete data is carried instead, since rebuilding it at every control step costs a quarter of the
-speed.
+complete data is carried instead. Rebuilding the data at every control step would cost a quarter of
+the speed.
 """
 
 import functools
@@ -32,7 +32,7 @@ Fields = dict[str, Array]
 
 
 class PhysicsState(NamedTuple):
-    """Physical state of an arena, or of many with a leading axis.
+    """Physical state of an arena, or of many arenas with a leading axis.
 
     Attributes:
       qpos: [Q] joint positions of each robot in turn, in its body's layout.
@@ -74,7 +74,7 @@ def build_kernels(physics: Physics, states: PhysicsState) -> None:
 
     Args:
       physics: the compiled physics, with an engine that `builds_kernels`.
-      states: [A] arenas; as many as the program will step, since contact memory depends on their
+      states: [A] as many arenas as the program will step, since contact memory depends on their
         number.
     """
 
@@ -85,7 +85,7 @@ def build_kernels(physics: Physics, states: PhysicsState) -> None:
 
 
 def rest(physics: Physics, pose: Array) -> PhysicsState:
-    """Returns the state of robots at rest at poses [R, 3], x (m), y (m), yaw (rad)."""
+    """Returns the state of robots at rest at poses [R, 3]: x (m), y (m), yaw (rad)."""
     still = jnp.zeros(physics.host.nv)
     return PhysicsState(physics.body.qpos(pose, jnp), still, still)
 
@@ -158,7 +158,7 @@ def _drive(physics: Physics, data: Data, ctrl: Array, chassis: Chassis) -> Data:
       chassis: chassis of the robots.
 
     Returns:
-      The arena, with what acts on its joints during the next physics step.
+      The arena, with the controls or forces of the next physics step.
     """
     servos, timestep = physics.body.servos, physics.host.opt.timestep
     if servos is None:
@@ -171,7 +171,7 @@ def _fixtures(physics: Physics, side: Array, obstacle: Array) -> tuple[Fields, F
     """Places obstacles and walls of an arena where the implementation reads them.
 
     `jax` computes the poses of all geoms from the model. `warp` does not compute the poses of geoms
-    of the world, so these poses are set in the data; `warp` overwrites the poses of all other
+    of the world, so these poses are set in the data. `warp` overwrites the poses of all other
     geoms. An engine that is not MJX takes side and obstacles directly.
 
     Args:
@@ -202,8 +202,8 @@ def _fixtures(physics: Physics, side: Array, obstacle: Array) -> tuple[Fields, F
 def _with_rows(array: Array, rows: Any, first: int) -> Array:
     """Replaces the rows from `first` on.
 
-    It uses `where`, because `.at` becomes a scatter under `vmap`. A concatenation becomes one
-    branch per part, and a GPU takes all of the branches.
+    The function uses `where`, because `.at` would become a scatter under `vmap`. A concatenation
+    would become one branch per part, and a GPU takes all branches.
     """
     count, end = len(array), first + len(rows)
     row = np.arange(count).reshape(-1, *[1] * (array.ndim - 1))
@@ -227,7 +227,7 @@ def _change(physics: Physics, fields: Fields, chassis: Chassis) -> Model:
     """Sets the parts of the model that differ between arenas: `fields` and the chassis."""
     model, rows_of = physics.engine.model, physics.ids.robots
     changes = physics.body.changes(chassis, rows_of, physics.robot, physics.host)
-    if not physics.engine.is_mjx:  # such a model lacks fields that its engine does not read
+    if not physics.engine.is_mjx:  # such a model may lack fields
         changes = {
             name: changes[name] for name in changes if getattr(model, name, None) is not None
         }

@@ -1,9 +1,9 @@
-"""The planar body: three degrees of freedom, and a servo in place of wheels on a floor.
+"""The planar body: three degrees of freedom, and servos instead of wheels on a floor.
 
-The planar body trains five times faster than the wheeled body. Its forces are limited to what
-wheels can pass to the floor, but the servo is deadbeat over 32 ms and seldom reaches that limit.
-The servo reaches its speed in one step, while wheels get two thirds of the way. When blocked, it
-pushes with m v / dt = 0.6 N, while wheels push with 1.0 N. A blocked planar robot also turns
+The planar body trains five times faster than the wheeled body. Servo forces are limited to what
+wheels can pass to the floor. But a servo is deadbeat over 32 ms, and seldom reaches that limit. A
+servo reaches its speed in one step, while wheels get two thirds of the way. A blocked servo pushes
+with m v / dt = 0.6 N, while blocked wheels push with 1.0 N. A blocked planar robot also turns
 freely, while two slipping wheels hardly turn. Policies that push objects therefore perform worse on
 the wheeled body (docs/robot.md).
 """
@@ -72,10 +72,10 @@ def _add_servos(spec: mujoco.MjSpec, names: list[str], robot: RobotConfig, times
 def _servos(robot: RobotConfig, timestep: float) -> _Numbers:
     """Returns the servos of a nominal robot.
 
-    The gains are deadbeat, mass / timestep, multiplied by the share of a change that a first-order
-    lag makes in one step. The velocity then equals that of the lag at every step, for any step
-    length. The force limits are those that wheels can pass to the floor (Coulomb): mu m g along
-    either axis, and a torque of mu m g times half the track.
+    A deadbeat gain, mass / timestep, is multiplied by the share of a change that a first-order lag
+    makes in one step. At every step, the velocity then equals that of the lag, for any step length.
+    The force limits are those that wheels can pass to the floor (Coulomb): mu m g along either
+    axis, and a torque of mu m g times half the track.
     """
     grip = robot.friction * robot.mass * epuck.GRAVITY
     share = servo_share(robot.motor_lag, timestep)
@@ -99,7 +99,7 @@ def _ratios(chassis: Chassis, robot: RobotConfig, xp: Any) -> _Numbers:
 
 
 def _ratio(drawn: Array | None, nominal: float) -> Array:
-    """Returns ratios [R, 1] of drawn values [R] to the nominal one; [1, 1] if none are drawn."""
+    """Returns ratios [R, 1] of drawn values [R] to the nominal value; [1, 1] if none are drawn."""
     return np.ones((1, 1)) if drawn is None else drawn[:, None] / nominal
 
 
@@ -190,8 +190,8 @@ def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjM
 
 PLANAR = Body(
     gravity=False,
-    # With this cone, a hull's push and its friction are two numbers, and contacts are as soft as
-    # without friction. Planar friction has only two cone edges, so it is exactly Coulomb's
+    # With this cone, a hull's push and its friction are two separate forces, and contacts are as
+    # soft as without friction. Planar friction has only two cone edges, so it is exactly Coulomb's
     # (docs/design-notes.md).
     cone=mujoco.mjtCone.mjCONE_ELLIPTIC,
     add=_add,

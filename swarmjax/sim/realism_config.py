@@ -35,8 +35,9 @@ COUNTED = (
 class RealismConfig(Section):
     """Settings of the sensor models, and of differences between robots and between steps.
 
-    A range is (low, high) of a uniform distribution; null switches off that factor alone.
-    configs/realism/real.yaml holds the numbers of a real robot, with their sources.
+    A range is (low, high) of a uniform distribution. A factor that is null is off; this does not
+    affect the others. configs/realism/real.yaml holds the numbers of a real robot, with their
+    sources.
     """
 
     name: Literal["ideal", "webots", "real"] = field(

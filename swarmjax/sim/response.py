@@ -4,10 +4,10 @@ A ray is the horizontal distance from the sensor's origin to the nearest object,
 ray rises by `epuck.SENSOR_TILT`, so it is longer by 1 / cos(tilt) against an upright face.
 
 `webots` is the lookup table of Webots' E-puck. The table maps (length of the ray) / reflectance to
-counts, with multiplicative noise; free space reads 67.19. `real` is a curve fitted to each sensor
-of a measured robot. The curve gives reflectance * A / (gap + d)^2 counts above free space, with
-additive noise. Readings in free space are set to zero, as by the firmware. The code runs on NumPy
-or JAX.
+counts, with multiplicative noise. In free space, it reads 67.19 counts. `real` is a curve fitted to
+each sensor of a measured robot. The curve gives reflectance * A / (gap + d)^2 counts above free
+space, with additive noise. Readings in free space are set to zero, as by the firmware. The code
+runs on NumPy or JAX.
 """
 
 import math
@@ -23,7 +23,7 @@ Response = Literal["webots", "real"]
 
 _RISE = math.cos(epuck.SENSOR_TILT)
 _LENGTH, _COUNTS, _SHARE = zip(*epuck.INFRARED_TABLE, strict=True)
-# m; nothing is seen beyond this distance, so rays end there. Webots' table ends at this length, for
+# m; nothing is seen beyond this length, so rays end there. Webots' table ends at this length, for
 # objects of reflectance 1 at most. The measured curve would still read 13 to 22 counts there. The
 # longest range in any e-puck simulator is 0.10 to 0.12 m (ARGoS, Enki).
 REACH = {"webots": _LENGTH[-1] * _RISE, "real": 0.10}
@@ -43,7 +43,7 @@ TO_HULL = _distance_to_hull()
 
 
 class Wear(NamedTuple):
-    """Differences of each sensor from a nominal one, [..., R, K] each; None for no difference.
+    """How each sensor differs from a nominal one, in arrays [..., R, K]; None for no difference.
 
     Attributes:
       noise: factor on the model's own noise; None for no noise at all.

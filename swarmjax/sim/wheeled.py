@@ -3,14 +3,14 @@
 The motors are steppers behind a 50:1 gear. A command sets the speed of a wheel, and no load changes
 it until steps are lost. (Webots gives its motors 10 N m, which has the same effect.) Here the motor
 is a velocity servo on a large reflected inertia, deadbeat in one physics step. The floor passes a
-torque of mu m g r / 2 = 0.016 N m to each wheel. Over 16 ms it changes the wheel's speed by 0.2 %
-of its limit, and the next step undoes the change. A motor with only the wheel's inertia (1e-6 kg
-m^2) does not work: with a stable gain it lags by several milliseconds, and the lag depends on the
-time step.
+torque of mu m g r / 2 = 0.016 N m to each wheel. Over 16 ms, this torque changes the wheel's speed
+by 0.2 % of the speed limit, and the next step undoes the change. A motor with only the wheel's
+inertia (1e-6 kg m^2) does not work. With a stable gain, it would lag by several milliseconds, and
+the lag would depend on the time step.
 
-The grip of wheels on the floor is a contact. Within one physics step it removes half the
-penetration and, as far as friction allows, all slip. MuJoCo's default contact takes 10 to 30 ms for
-this, depending on the time step, and the wheel creeps meanwhile.
+The grip of wheels on the floor is a contact. Within one physics step, this contact removes half the
+penetration. It also removes all slip, as far as friction allows. MuJoCo's default contact takes 10
+to 30 ms for this, depending on the time step, and the wheel creeps meanwhile.
 """
 
 from typing import Any
@@ -29,11 +29,12 @@ FLOOR = "floor"
 ROTOR_INERTIA = 0.02  # kg m^2, reflected through the gear; chosen as explained above
 SKID_RADIUS = 0.005  # m; half the height of the box under the Webots e-puck
 _QPOS = 9  # x, y, z, quaternion (w, x, y, z), left wheel, right wheel
-REST_DEPTH = 1e-5  # m; depth of the wheels in the floor at rest; at 16 ms it is 9e-6
+REST_DEPTH = 1e-5  # m; depth of the wheels in the floor at rest; 9e-6 with steps of 16 ms
 _PENETRATION = 0.5  # share of the penetration that one physics step removes
-_IMPEDANCE = 0.999  # impedance of the grip: a thousandth of gravity's acceleration remains
-# m; y of a wheel's frame. The tyre is 5 mm wide, so its geom lies off this frame. MuJoCo would
-# treat a geom compiled at the origin of its body's frame as fixed there, whatever `geom_pos` is.
+_IMPEDANCE = 0.999  # impedance of the grip; the grip cancels all but a thousandth of gravity
+# m; y of a wheel's frame. The tyre is 5 mm wide, so its geom lies off this frame. If a geom is
+# compiled at the origin of its body's frame, MuJoCo treats it as fixed there, whatever `geom_pos`
+# is.
 _INNER_EDGE = epuck.AXLE_Y - 0.0025
 _SIDES = np.array([1.0, -1.0], np.float32)  # left, right
 
@@ -50,7 +51,8 @@ def _add(spec: mujoco.MjSpec, name: str, robot: RobotConfig, timestep: float) ->
     for label, x in (("front", epuck.SKID_X), ("back", -epuck.SKID_X)):
         place = [x, 0.0, SKID_RADIUS + epuck.SKID_CLEARANCE]
         skid = add_geom(body, f"{name}_{label}", sphere, [SKID_RADIUS, 0, 0], place, FLOOR_GROUP)
-        # condim 1: skids carry weight but do not brake, like the intended smooth box of Webots.
+        # With condim 1, skids carry weight but do not brake, as is intended for the smooth box of
+        # Webots.
         spec.add_pair(geomname1=FLOOR, geomname2=skid, condim=1, **_grip(timestep))
     return add_hull(body, name, robot.hull_radius)
 
@@ -147,7 +149,7 @@ def encoders(qpos: Array, xp: Any) -> Array:
 
 
 def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjModel) -> Changes:
-    """Returns the changes; wheels of another size move their axle, so that the skids stay clear."""
+    """Returns the changes. Wheels of another size move their axle, so that the skids stay clear."""
     changes: Changes = {}
     if chassis.mass is not None:
         changes |= scale_mass(chassis.mass / robot.mass, rows, model)
@@ -177,8 +179,8 @@ def _frictions(chassis: Chassis, rows: Rows) -> tuple[Any, Array]:
 
 WHEELED = Body(
     gravity=True,
-    # MuJoCo's default, with which the grip of the wheels was measured. A model has only one cone,
-    # and MJX supports no elliptic cone together with skids of condim 1.
+    # This is MuJoCo's default cone. The grip of the wheels was measured with it. A model has only
+    # one cone, and MJX supports no elliptic cone together with skids of condim 1.
     cone=mujoco.mjtCone.mjCONE_PYRAMIDAL,
     add=_add,
     qpos=_qpos,

@@ -1,11 +1,13 @@
 """The two arrival rules of `task.arrival`: when a robot has arrived, and whether it may drive.
 
 - `latch`: a robot that comes within its target has arrived and stops for good.
-- `hold`: a robot counts as arrived while it is within its target. It keeps driving and may leave.
+- `hold`: a robot counts as arrived while it is within its target, but it keeps driving and may
+  leave.
 
 Under both rules an episode is complete once all robots have arrived. Under `hold`, all robots must
-be within their targets in the same control step. Multi-agent path finding calls this "stay at
-target" (Stern et al. 2019, "Multi-Agent Pathfinding: Definitions, Variants, and Benchmarks").
+be within their targets in the same control step. Multi-agent path finding calls this condition
+"stay at target" (Stern et al. 2019, "Multi-Agent Pathfinding: Definitions, Variants, and
+Benchmarks").
 
 The functions take arrays of any array module.
 """

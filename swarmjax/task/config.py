@@ -62,7 +62,8 @@ class NeighboursConfig(Section):
         default=0, metadata=about("nearest neighbours observed; 0: no neighbour messages", 0, 32)
     )
     range: float = field(
-        # AutoMoDe's reference models use a range-and-bearing board. We assume the same range.
+        # AutoMoDe's reference models use a range-and-bearing board. We assume the range of that
+        # board.
         default=0.7,
         metadata=about("between centres, m", above=0.0, high=10.0),
     )
@@ -156,8 +157,8 @@ def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, 
     Args:
       realism: settings, already checked against their own bounds.
       robot: the robot that the settings apply to.
-      task: provides the control step.
-      steps: control steps of an episode.
+      task: provides the length of a control step.
+      steps: number of control steps in an episode.
 
     Raises:
       ConfigError: a setting is too large; the message names the full key.

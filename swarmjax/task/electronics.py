@@ -27,7 +27,7 @@ from swarmjax.task.observation import Encoding, Layout, Readings, View
 
 Array = Any
 _DEAF = NeighboursConfig()
-_SLACK = 1e-4  # share of a period; rounding must not delay a sample that is due now
+_SLACK = 1e-4  # share of a period, so that rounding does not delay a sample that is due now
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,7 @@ class Electronics:
 
     @property
     def reach(self) -> float:
-        """How far rays are cast, m."""
+        """Largest distance to which rays are cast, m."""
         curves = {self.realism.infrared, self.encoding}
         return max([self.sensor_range, *(response.REACH.get(name, 0.0) for name in curves)])
 
@@ -69,7 +69,7 @@ class Electronics:
 
 
 class Memory(NamedTuple):
-    """State that the electronics keep between control steps; None for an unused part.
+    """State that the electronics keep between control steps; an unused part is None.
 
     Attributes:
       motor: delayed commands.
@@ -227,7 +227,7 @@ def drive(
 
     Args:
       electronics: electronics of the program.
-      memory: before the control step.
+      memory: state before the control step.
       factors: factors of the episode.
       command: [..., R, 2] forward speed (m/s) and turn rate (rad/s).
       motors: the drive with the nominal values that the firmware uses.
@@ -267,7 +267,7 @@ def sense(
 
     Args:
       electronics: electronics of the program.
-      memory: before the control step.
+      memory: state before the control step.
       factors: factors of the episode.
       sight: exact sensor quantities.
       clock: [...] or [] control steps since the start, including the current one.
@@ -305,7 +305,7 @@ def _read(
 
 def _is_due(clock: Array, period: Array, control_step: float, xp: Any) -> Array:
     """Returns [..., R] whether a sample was due in the control step that has just ended."""
-    clock = xp.asarray(clock, xp.float32)  # NumPy and JAX must round alike, to sample alike
+    clock = xp.asarray(clock, xp.float32)  # so that NumPy and JAX round alike, and sample alike
     ended = clock[..., None] * control_step / period + _SLACK
     return xp.floor(ended) > xp.floor(ended - control_step / period)
 

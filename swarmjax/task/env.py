@@ -81,7 +81,7 @@ class World:
 
 @struct.dataclass
 class EnvState:
-    """State of one arena, or of many with a leading axis.
+    """State of one arena, or of many arenas with a leading axis.
 
     Attributes:
       sim: a `PhysicsState` before and after a rollout; during a rollout, the engine's own data.
@@ -94,7 +94,7 @@ class EnvState:
       arrived: [R] whether the robot has arrived; with `task.arrival=hold`, whether it is within
         its target now.
       distance: [R] distance to the target, m.
-      apart: [R, 3] time since the last contact of each kind, s.
+      apart: [R, 3] time since the last contact of each kind ended, s.
       episode: sums since the start.
       path: the shortest paths to the targets; None if the reward does not use them.
     """
@@ -150,7 +150,7 @@ def load(
 
     Args:
       stages: stages to run; the model is compiled for their largest obstacle.
-      robot: the robot; None for the default, as for the settings below.
+      robot: the robot. Here and in the settings below, None stands for the default.
       task: the task.
       realism: sensor models, and factors drawn for each episode.
       sim: physics engine, and largest numbers of robots and obstacles.
@@ -196,7 +196,7 @@ def _load_physics(
     sim: SimConfig,
     arenas: int,
 ) -> physics.Physics:
-    """Compiles the model of one arena, and loads the engine that steps it."""
+    """Compiles the model of one arena, and loads the engine that steps the arena."""
     largest = task_factors.largest(robot, realism)
     substeps, choice = physics_substeps(robot, sim.substeps), dispatch.choose(sim, largest)
     spec = model.build(largest, size, task.control_step / substeps, fixtures="world")
@@ -382,7 +382,7 @@ def _is_finite(numbers: Array, counted: Array) -> Array:
 def _move(
     world: World, state: EnvState, action: Array, active: Array
 ) -> tuple[Any, Memory, Array, Array]:
-    """Steps the physics, with the commands of active robots only.
+    """Steps the physics; only active robots obey their commands.
 
     Returns:
       Data, memory, poses, and whether the physics is sound.
@@ -396,7 +396,7 @@ def _move(
     chassis = task_electronics.chassis(found)
     data = physics.step(world.physics, state.sim, level.side, level.obstacle, wheels, chassis)
     sound = physics.is_finite(data)
-    # Keep everything below finite: a broken arena shows its last poses until it is reset.
+    # To keep everything below finite, a broken arena shows its last sound poses until it is reset.
     before, after = (physics.poses(world.physics, each) for each in (state.sim, data))
     return data, memory, jnp.where(sound, after, before), sound
 
@@ -434,7 +434,7 @@ def _speak(world: World, action: Array, active: Array) -> Array | None:
 
 
 def _hear(world: World, sight: Sight, pose: Array, level: Level, said: Array | None) -> Sight:
-    """Adds neighbours in reach at poses [R, 3], and their broadcasts [R, M]; None at the start."""
+    """Adds neighbours in reach at poses [R, 3]; broadcasts [R, M] are None at the start."""
     settings = world.electronics.neighbours
     if not settings.count:
         return sight
@@ -449,7 +449,7 @@ def _fill(
     """Adds the fields that only extension terms read, if there are such terms."""
     if not world.terms:
         return step
-    if world.action_size > sim_drive.COMMAND_SIZE:  # terms see only the motion command
+    if world.action_size > sim_drive.COMMAND_SIZE:  # reward terms receive only the motion command
         action = action[:, : sim_drive.COMMAND_SIZE]
     return step._replace(
         outside=~state.arrived,

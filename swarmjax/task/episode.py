@@ -13,8 +13,8 @@ class Episode(NamedTuple):
       contacts: [R, 3] contacts of each kind.
       sensed: [R] control steps in which a ray was shorter than the infrared range (the paper's rule
         for collisions).
-      moving: [R] control steps that began before arrival; with `task.arrival=hold`, those that
-        began outside the target.
+      moving: [R] control steps that began before arrival. With `task.arrival=hold`, these are the
+        steps that began outside the target.
     """
 
     reward: Array
@@ -28,8 +28,8 @@ class Robots(NamedTuple):
 
     Attributes:
       present: whether the robot was present; if not, ignore its other fields.
-      reached: whether it had arrived at the end.
-      reward: undiscounted sum over the episode.
+      reached: whether the robot had arrived at the end.
+      reward: undiscounted sum of rewards over the episode.
       robot_steps: control steps before arrival.
       sensed: control steps in which a ray was shorter than the infrared range.
       contacts: contacts of all kinds.
@@ -57,7 +57,7 @@ class Ended(NamedTuple):
       robot_steps: control steps before arrival, summed over robots.
       sensed: control steps in which a ray was shorter than the infrared range.
       contacts: [.., 3] contacts of each kind, summed over robots.
-      reward: undiscounted, summed over robots.
+      reward: undiscounted sum of rewards, summed over robots.
       broken: 1 where the episode ended because the physics was no longer finite.
       robots: results per robot, if `run.episodes` asks for them.
     """

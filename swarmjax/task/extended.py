@@ -1,4 +1,4 @@
-"""Runs the pieces of an extension in an arena, and checks that they fit it."""
+"""Runs the pieces of an extension in an arena, and checks that they fit the arena."""
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -112,7 +112,7 @@ def _problem(found: Level, spacing: Spacing) -> str | None:
 
 
 def redraw(piece: LevelDrawing, drawn: Level) -> Level:
-    """Draws a level of one arena by an extension, for an evaluation in NumPy.
+    """Draws a level of one arena with an extension's drawing, for an evaluation in NumPy.
 
     Args:
       piece: the level drawing.
@@ -139,7 +139,7 @@ def earn(piece: RewardTerm, steps: Mapping[str, Any]) -> np.ndarray:
 
     Args:
       piece: the term.
-      steps: the fields of `Step`, all but `sensor_range` with a leading axis N.
+      steps: the fields of `Step`; all except `sensor_range` have a leading axis N.
 
     Returns:
       [N, R], not weighted.

@@ -40,7 +40,7 @@ class Factors(NamedTuple):
       hull_friction: [...] friction between hulls and everything that they touch.
       infrared_noise: [..., R, K] factor on the noise of the response.
       infrared_gain: [..., R, K] factor on the reflected part of the response.
-      infrared_offset: [..., R, K] counts.
+      infrared_offset: [..., R, K] constant error of the reading, counts.
       infrared_yaw: [..., R, K] rad.
       infrared_position: [..., R, K, 2] m, in the robot's frame.
       infrared_period: [..., R] s between samples.
@@ -120,18 +120,21 @@ def draw(
 
     The factors are drawn per robot, per sensor or per surface, according to their cause:
 
-    - Wheel radius: wheels wear, and both tyres of a robot have nearly the same thickness. So each
-      robot draws one radius, plus a small difference between its wheels.
-    - Track: the effective one, since tyres grip somewhere across their width.
-    - Latency and sampling period: fixed for a robot, by its radio link and its firmware.
-    - Gain, offset, yaw and position: one per sensor.
-    - Reflectance: one per obstacle or robot. All walls of the arena share one.
-    - Friction: between two surfaces. All hulls, boxes and walls of an episode are alike.
+    - Wheel radius: each robot draws one radius, and a small difference between its wheels. Wheels
+      wear, but both tyres of a robot have nearly the same thickness.
+    - Track: each robot draws its effective track, since tyres grip somewhere across their width.
+    - Latency and sampling period: each robot draws its own, since radio link and firmware determine
+      them.
+    - Gain, offset, yaw and position: each sensor draws its own.
+    - Reflectance: each obstacle and each robot draws its own. All walls of the arena share one
+      reflectance.
+    - Friction: each robot draws the friction of its wheels on the floor. All hulls, boxes and walls
+      of an episode share one friction.
 
     Args:
       seed: [...] uint32, one per episode.
       realism: which factors are drawn, and their ranges; fixed for a program.
-      robot: the nominal robot; its wheel radius is used if only a mismatch is drawn.
+      robot: the nominal robot. Its wheel radius is used if only the mismatch of wheels is drawn.
       robots: largest number of robots, R.
       obstacles: largest number of obstacles, M.
       xp: `numpy` or `jax.numpy`; both draw the same.
@@ -197,7 +200,7 @@ def largest(robot: RobotConfig, realism: RealismConfig) -> RobotConfig:
       realism: which factors are drawn.
 
     Returns:
-      The robot, with wheel radius and hull friction that no draw exceeds.
+      The robot, with a wheel radius and a hull friction that no draw exceeds.
     """
     most = realism.wheel_radius[1] if realism.wheel_radius else robot.wheel_radius
     half = 0.5 * (realism.wheel_mismatch or 0.0)

@@ -24,7 +24,8 @@ FENCE_HALF_WIDTH = 0.03  # m; not scaled, since a real wall keeps its thickness
 BOX_HALF = 0.05  # m; the 0.1 m boxes of the stock e-puck world
 SPACING = 0.1  # m; between starts, and between targets: wider than a robot
 # Centres of the boxes in the example's arena, in order of use. The boxes lie between starts and
-# targets, at least 0.10 m clear of each other in arenas of 1 m and more. This project chose them.
+# targets. In arenas of 1 m and more, at least 0.10 m is free between two boxes. This project chose
+# them.
 BOXES = ((0.0, 0.02), (-0.17, -0.12), (0.17, 0.1), (0.02, -0.2))
 
 
@@ -70,7 +71,7 @@ def targets(robots: int, side: Array, xp: Any) -> Array:
 
 
 def obstacles(count: int, side: Array, fenced: Array, xp: Any) -> Array:
-    """Places the obstacles: either boxes, or `count` copies of the fence.
+    """Places the obstacles: `count` boxes, or `count` copies of the fence.
 
     Args:
       count: M.

@@ -1,9 +1,9 @@
 """Distance to the target along the shortest path around walls and boxes.
 
 A visibility graph (Lozano-Pérez & Wesley 1979, "An Algorithm for Planning Collision-Free Paths
-Among Polyhedral Obstacles") is solved once per episode for every target. The distance from a robot
-is then a minimum over the corners that it can see. For each corner, the distance to the corner and
-the distance from the corner to the target are added. Navigation rewards count progress along this
+Among Polyhedral Obstacles") is solved once per episode for every target. For each corner that a
+robot can see, the distance to the corner and the distance from there to the target are then added.
+The smallest of these sums is the robot's distance. Navigation rewards count progress along this
 path (Wijmans et al. 2020, "DD-PPO", section 4).
 
 Other robots are ignored. Obstacles are widened by a little less than a robot's radius, with square
@@ -23,15 +23,16 @@ from jax import Array
 from swarmjax.task.level import PARKING, Level
 from swarmjax.task.surroundings import into_frame
 
-# Shares of the hull's radius: obstacles are widened by the first, and corners are set off by the
-# second. Contacts are soft, so a robot pushed against a wall can come closer to it than its radius.
+# Shares of the hull's radius. Obstacles are widened by the first share, and corners are set off by
+# the second. Contacts are soft, so a robot pushed against a wall can come closer to it than its
+# radius.
 _WIDENED = 0.8
 _CORNER = 0.9
 _SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
 
 
 class Roadmap(NamedTuple):
-    """Corners where paths can turn, and the distances from there to the targets.
+    """Corners at which paths can turn, and the distances from these corners to the targets.
 
     Attributes:
       corner: [K, 2] x and y of the corners of the widened obstacles, m.
@@ -177,7 +178,10 @@ def _corners(level: Level, off: float) -> Array:
 
 
 def _frames(level: Level) -> Array:
-    """Lists obstacles [M, 6]: x, y (m), cos and sin of yaw, half edges (m); absent ones far off."""
+    """Lists obstacles [M, 6]: x, y (m), cos and sin of yaw, half edges (m).
+
+    Absent obstacles are far off.
+    """
     x, y, yaw, half_x, half_y = level.obstacle.T
     x = jnp.where(level.obstacle_present, x, PARKING)
     return jnp.stack([x, y, jnp.cos(yaw), jnp.sin(yaw), half_x, half_y], axis=-1)

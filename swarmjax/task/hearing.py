@@ -1,6 +1,6 @@
 """Range and bearing of neighbours, and the numbers that they broadcast.
 
-A robot receives a neighbour's distance and bearing and the few numbers of its packet. The model
+A robot receives a neighbour's distance, its bearing, and the few numbers of its packet. The model
 follows the e-puck's infrared board for local communication (Gutiérrez et al. 2009, "Open E-puck
 Range & Bearing miniaturized board for local communication in swarm robotics") and AutoMoDe's
 reference models. Inner walls and boxes block reception; other robots do not. The code runs on NumPy
@@ -24,7 +24,8 @@ class Heard(NamedTuple):
     """Neighbours within reach.
 
     Attributes:
-      distance: [..., R, R] distance from receiver (first axis) to sender, m; inf without reception.
+      distance: [..., R, R] distance from the receiver (first axis of the two) to the sender, m; inf
+        without reception.
       bearing: [..., R, R] bearing of the sender, from the receiver's x axis, rad.
       message: [..., R, M] numbers that each robot broadcast in the last control step, -1..1.
     """
@@ -104,7 +105,7 @@ def listen(
     clock: Array,
     xp: Any,
 ) -> Array:
-    """Lists the nearest neighbours of each robot, counting only those whose packets arrive.
+    """Lists each robot's nearest neighbours, counting only those whose packets arrive.
 
     Args:
       heard: the neighbours within reach.
@@ -115,8 +116,8 @@ def listen(
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [..., R, K W], nearest first. Each neighbour has a presence flag of 1, distance (m), cosine
-      and sine of the bearing, and message. Missing neighbours are 0.
+      [..., R, K W], nearest first. The W numbers of a neighbour are a presence flag of 1, its
+      distance (m), cosine and sine of its bearing, and its message. Missing neighbours are 0.
     """
     distance, bearing, message = heard
     robots = distance.shape[-1]

@@ -79,7 +79,7 @@ class Spacing(NamedTuple):
 
 
 class _Uniforms(NamedTuple):
-    """The uniform numbers, grouped by use: [2], [M] or [R] each; two for the seed."""
+    """The uniform numbers, grouped by use, in arrays [2], [M] or [R]; the seed takes two."""
 
     obstacle_shift: Array
     target_shift: Array
@@ -127,13 +127,13 @@ def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
 
     A random level places obstacles, then targets, then starts, without overlap. Obstacles keep
     `PASSAGE` clear between each other and to the walls. An obstacle that finds no such place is
-    left out. Where the arena has room, targets keep enough distance from each other and from
-    obstacles for a robot to pass between any two arrived robots. Every target then stays reachable,
-    whatever the order of arrival.
+    left out. Where the arena has room, targets keep their distance from each other and from
+    obstacles, so that a robot can pass between any two arrived robots. Every target then stays
+    reachable, whatever the order of arrival.
 
     Args:
-      uniforms: [uniform_count(spacing)] float32 in [0, 1). The layout's numbers may follow; if they
-        do not, they are drawn from the level's seed (see `write_out`).
+      uniforms: [uniform_count(spacing)] float32 in [0, 1). The layout's numbers may follow.
+        Otherwise, they are drawn from the level's seed (see `write_out`).
       stage: fields [].
       spacing: sizes.
       xp: `numpy` or `jax.numpy`; both draw the same level.
@@ -192,7 +192,7 @@ def _random(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
 
 
 def _seed(drawn: _Uniforms, xp: Any) -> Array:
-    """Makes 32 random bits from two uniform numbers; one float32 is sure to hold only 16."""
+    """Makes 32 random bits from two uniform numbers; each float32 provides 16 of them."""
     high, low = (drawn.seed * np.float32(2**16)).astype(xp.uint32)
     return (high << 16) | low
 
@@ -301,7 +301,7 @@ def _mapped(drawn: _Uniforms, stage: Stage, arena: MapArrays, spacing: Spacing, 
 
 
 def _of_layout(kind: Kind, uniforms: Array, seed: Array, spacing: Spacing, xp: Any) -> Array:
-    """Returns the layout's numbers: those in `uniforms`, or else those drawn from the seed."""
+    """Returns the layout's numbers: those in `uniforms`, or numbers drawn from the seed."""
     before = uniform_count(spacing)
     if uniforms.shape[0] > before:
         return uniforms[before:]
@@ -318,7 +318,7 @@ def _laid_out(
     spacing: Spacing,
     xp: Any,
 ) -> Level:
-    """Lays an arena out; robots and walls beyond the layout's own are absent."""
+    """Lays out an arena. Robots and walls that the layout does not have are absent."""
     present = xp.arange(spacing.robots) < stage.robots
     sizes = RobotSizes(spacing.hull_radius, spacing.target_radius)
     arena = drawing.draw(kind, of, uniforms, present, sizes, xp)

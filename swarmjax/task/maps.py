@@ -7,8 +7,8 @@
     ########
 
 `#` is a wall, `.` is floor. `S` and `T` mark the areas for starts and targets. Any other lower-case
-letter is the start of one robot, and its capital is that robot's target. The text shows the arena
-from above, with x to the right and y up.
+letter is the start of one robot, and the same letter as a capital is that robot's target. The text
+shows the arena from above, with x to the right and y up.
 """
 
 import math
@@ -24,9 +24,10 @@ Array = Any
 Cell = tuple[int, int]  # row and column of the text, from 0
 
 WALL, FLOOR, START, TARGET = "#.ST"
-MOST_CELLS = 48  # largest number of cells in a row, and of rows
-# Points that starts and targets may be placed on: their least distance (m), and their largest
-# number. An area with more cells than that gets one point per cell.
+MOST_CELLS = 48  # largest number of cells in a row, and largest number of rows
+# Starts and targets may be placed on a set of points. The numbers below are the least distance
+# between two points (m), and the largest number of points. An area with more cells than this number
+# gets one point per cell.
 _APART, _MOST_POINTS = 0.03, 1024
 
 

@@ -15,8 +15,8 @@ from swarmjax.task.layouts.site import NUMBERS
 from swarmjax.task.level import Spacing
 from swarmjax.task.stage_config import BUILT_IN, StageConfig
 
-# Parts of a layout's numbers that may change: the first group entirely, the second only for the
-# robots that are present.
+# Parts of a layout's numbers that may change. The numbers of the first group may all change. The
+# numbers of the second group may change only for robots that are present.
 _WHOLE, _BY_ROBOT = ("wall", "room"), ("target", "start")
 
 
@@ -83,7 +83,7 @@ def _places(stage: StageConfig, spacing: Spacing) -> np.ndarray:
     many, few = spacing.obstacles, spacing.robots
     drawn = stage.drawn_map
     boxes, settled = (stage.obstacles, 0) if drawn is None else (0, len(drawn.pair))
-    # The order of `level.sample`: three shifts, boxes and their turns, targets, starts.
+    # `level.sample` has this order: three shifts, boxes and their turns, targets, starts.
     first = np.cumsum([6, many, many, few])
     parts = ((0, boxes), (0, boxes), (settled, stage.robots), (settled, stage.robots))
     return np.concatenate([at + np.arange(*part) for at, part in zip(first, parts, strict=True)])

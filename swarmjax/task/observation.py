@@ -1,8 +1,8 @@
-"""Observations: the only place that defines which entries exist, and in which order.
+"""Observations: only this module defines which entries exist, and in which order.
 
 `INPUTS` is the table of built-in entries. `layout` describes them to other modules. Policy files,
-evaluations, exports and tests take names, units and sizes from it. To add an input, add one row to
-`INPUTS` and, if the input is a new quantity, one field to `Readings`.
+evaluations, exports and tests take names, units and sizes from `layout`. To add an input, add one
+row to `INPUTS` and, if the input is a new quantity, one field to `Readings`.
 """
 
 import math
@@ -40,7 +40,7 @@ class Readings(NamedTuple):
 
 
 class Coding(NamedTuple):
-    """Scaling of a quantity in an encoding: (quantity - offset) / scale, both in `unit`."""
+    """Scaling in an encoding, (quantity - offset) / scale; all three numbers are in `unit`."""
 
     unit: str
     offset: float = 0.0
@@ -62,8 +62,9 @@ class Input(NamedTuple):
 
 
 # The paper says ten inputs and names nine. The tenth is the bearing, as in the published example
-# that the task is based on. `webots` scales as find_and_avoid of deepworlds does (commit 60b8fc4a):
-# counts / 1023 without clipping; distance / 1.5 m; (bearing + pi) / (2 pi), so 0.5 is dead ahead.
+# that the task is based on. `webots` scales as find_and_avoid of deepworlds does (commit 60b8fc4a).
+# The scaled values are counts / 1023 without clipping, distance / 1.5 m, and (bearing + pi) / (2
+# pi), so a scaled bearing of 0.5 is dead ahead.
 INPUTS = (
     Input(
         tuple(f"infrared_{i}" for i in range(SENSORS)),
@@ -153,7 +154,7 @@ def stacked_names(names: Sequence[str], history: int) -> tuple[str, ...]:
 
 
 def stack(fresh: Array, before: Array, xp: Any) -> Array:
-    """Prepends an observation to the stack of earlier ones and drops the oldest.
+    """Adds an observation at the front of the stack of earlier ones, and drops the oldest.
 
     Args:
       fresh: [..., O] current observation.

@@ -17,8 +17,8 @@ UNITS = 4096  # per metre; (4 m * sqrt(2) * 4096)**2 = 5.4e8 < 2**30
 LATTICE = 24  # points along a side
 MARGIN = 0.02  # m; least free space around anything at the start
 TARGET_SPACING = 0.25  # m; least distance between targets where the arena has room
-_UNROLLED = 5  # number of objects placed without a loop; XLA takes a second to compile twenty
-_FORBIDDEN = -(2**30)  # at or below half of this, a hard distance is violated
+_UNROLLED = 5  # number of objects placed without a loop; XLA would take a second to compile twenty
+_FORBIDDEN = -(2**30)  # a score at or below half of this means that a hard distance is violated
 
 
 class Gap(NamedTuple):
@@ -102,7 +102,7 @@ def lattice(shift: Array, side: Array, xp: Any) -> Array:
 
 
 def score_walls(points: Array, side: Array, gap: Array, xp: Any) -> Array:
-    """Scores points by their distance to the walls, as a hard limit.
+    """Scores points by their distance to the walls, which is a hard limit.
 
     Args:
       points: [P, 2] units.
@@ -153,7 +153,7 @@ def score_open(points: Array, is_open: Array, xp: Any) -> Array:
 
 
 def score_rectangles(points: Array, rectangle: Array, there: Array, gap: int, xp: Any) -> Array:
-    """Scores points by their distances to axis-aligned rectangles, as a hard limit.
+    """Scores points by their distances to axis-aligned rectangles, which are hard limits.
 
     Args:
       points: [P, 2] units.
@@ -163,7 +163,7 @@ def score_rectangles(points: Array, rectangle: Array, there: Array, gap: int, xp
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [P] 0 where all distances are kept, very low where one is not.
+      [P] 0 where all distances are kept, very low where any distance is violated.
     """
     apart = xp.abs(points[:, None, :] - rectangle[None, :, :2]) - rectangle[None, :, 2:]
     apart = xp.maximum(apart, 0)
@@ -205,7 +205,8 @@ def _fold(step: Callable, state: Array, rows: tuple[Array, Array], xp: Any) -> t
         from jax import lax  # evaluations draw levels without JAX
 
         # The score is a constant if all points are free. Without the barrier, XLA evaluates the
-        # search at compile time, arena by arena: 105 s on two cores for 4,096 arenas of a trap.
+        # search at compile time, arena by arena. For 4,096 arenas of a trap, this took 105 s on two
+        # cores.
         state = lax.optimization_barrier(state)
         return lax.scan(step, state, rows, unroll=max(1, min(_UNROLLED, len(rows[0]))))[1]
     first, second = [], []

@@ -29,14 +29,14 @@ class Step(NamedTuple):
       arrives: [R] whether the robot arrived in this step; with `task.arrival=hold`, whether all
         robots are within their targets, which ends the episode.
       contact_begins: [R, 3] whether a contact of each kind began in this step.
-      outside: [R] whether the robot had not arrived when the step began; None if this holds for all
-        robots that get a reward, as with `task.arrival=latch`.
+      outside: [R] whether the robot had not yet arrived when the step began. None if this holds for
+        all robots that get a reward, as with `task.arrival=latch`.
       touching: [R, 3] whether the robot touches something of each kind after the step.
-      path_before: [R] distance along the shortest path to the target, m; None without a path
-        weight, and in an extension.
+      path_before: [R] distance along the shortest path to the target, m. None for a reward without
+        a path weight, and for terms of an extension.
       path: [R] the same distance after the step, m.
-      pose_before: [R, 3] x (m), y (m), yaw (rad). This field and those below are for extensions
-        only. For extensions, `outside` is set under both arrival rules.
+      pose_before: [R, 3] x (m), y (m), yaw (rad). This field and the fields below are for
+        extensions only. For extensions, `outside` is set under both arrival rules.
       pose: [R, 3] the pose after the step.
       action: [R, 2] action, clipped to -1..1; -1 and 1 are the ends of each command's range.
       present: [R] whether the robot is present, bool.
@@ -71,7 +71,7 @@ def path_progress(step: Step) -> Array:
 
 
 def proximity(step: Step) -> Array:
-    """Returns 1 if any ray is shorter than the sensor's range, at most once a step (equation 3)."""
+    """Returns 1 if one or more rays are shorter than the sensor's range (equation 3)."""
     rays = step.infrared.shape[-1]
     nearest = least((step.infrared[..., i] for i in pieces(rays, jnp)), step.sensor_range, jnp)
     return _before_arrival(step, (nearest < step.sensor_range).astype(jnp.float32))
@@ -109,7 +109,7 @@ def step_penalty(step: Step) -> Array:
 
 
 def _before_arrival(step: Step, price: Array) -> Array:
-    """Returns the price [R] for robots that had not arrived, and 0 for others."""
+    """Returns the price [R] of robots that had not arrived, and 0 for all other robots."""
     return price if step.outside is None else jnp.where(step.outside, price, 0.0)
 
 

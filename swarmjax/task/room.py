@@ -13,7 +13,7 @@ from swarmjax.task.placement import MARGIN
 from swarmjax.task.stage_config import StageConfig
 
 _TRIED = 16  # levels of a map to check
-_ROUNDING = 1.0 / 1024  # m; points are rounded to units of 1/4096 m, in each direction
+_ROUNDING = 1.0 / 1024  # m; x and y of points are rounded to units of 1/4096 m
 _BESIDE = 0.003  # m, between the hull and each side of the narrowest door
 
 

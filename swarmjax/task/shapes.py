@@ -1,4 +1,4 @@
-"""Obstacles of other shapes than the trained box, composed of boxes within the box's outer circle.
+"""Obstacles with shapes other than the trained box; they consist of boxes in its outer circle.
 
 A level keeps distances from an obstacle's outer circle, so these distances hold for any shape
 inside the circle. The shapes consist of boxes because both engines and the analytic sensors support
@@ -15,9 +15,9 @@ from swarmjax.task.level import Level
 # Shapes of a random level's obstacles in an evaluation; training uses boxes only.
 Shape = Literal["box", "bar", "cross", "ell", "pillar"]
 
-HALF_THICKNESS = 0.005  # m, for plates; our choice: a board that stands upright
+HALF_THICKNESS = 0.005  # m, for plates; we chose the thickness of a board that stands upright
 # Coordinates are rounded to binary fractions of a metre, which float32 holds exactly. A level is
-# then identical to the last bit even where sine and cosine round differently.
+# then identical to the last bit, even on machines that round sine and cosine differently.
 _GRID = 2.0**20
 
 
@@ -40,10 +40,10 @@ def _parts(shape: Shape, half: float) -> list[_Part]:
         return [bar]
     if shape == "cross":
         return [bar, bar._replace(turn=quarter)]
-    if shape == "ell":  # two sides of the square
+    if shape == "ell":  # two sides of the square form an L
         aside = half - thin
         return [_Part(0.0, -aside, 0.0, half, thin), _Part(-aside, 0.0, quarter, half, thin)]
-    if shape == "pillar":  # four boxes form a regular octagon, whose edges are their ends
+    if shape == "pillar":  # four boxes form a regular octagon; its edges are the boxes' ends
         length, width = outer * math.cos(math.pi / 8), outer * math.sin(math.pi / 8)
         return [_Part(0.0, 0.0, 0.25 * math.pi * i, length, width) for i in range(4)]
     return [_Part(0.0, 0.0, 0.0, half, half)]

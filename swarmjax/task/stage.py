@@ -1,4 +1,4 @@
-"""Stages of the curriculum as arrays; a stage changes their values, never their shapes."""
+"""Stages of the curriculum as arrays; stages differ in values, never in shapes."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -24,10 +24,10 @@ class Stage(NamedTuple):
     Attributes:
       robots: number of robots, int32.
       obstacles: number of obstacles, int32.
-      side: side of the arena, or the smallest side that it may have, m.
-      largest_side: largest side, m; if it exceeds `side`, each level draws its own.
+      side: side of the arena, or the smallest side that the arena may have, m.
+      largest_side: largest side, m; if it exceeds `side`, each level draws its own side.
       obstacle_size: edge of the boxes of a random level, m.
-      fixed: whether the level is the paper's fixed one instead of a random one, bool.
+      fixed: whether the level is the paper's fixed level instead of a random level, bool.
       fence: whether a fixed level has the fence instead of boxes, bool.
       drawing: 1 + index of the extension drawing of the stage's levels, 0 for none, int32.
       map: the maps; None if no stage has one.
@@ -96,7 +96,10 @@ def select(stages: Stage, index: Array) -> Stage:
 
 
 def largest_half(stages: Sequence[StageConfig]) -> float:
-    """Returns half the longest obstacle edge in these stages, m; the model is compiled for it."""
+    """Returns half the longest obstacle edge in these stages, m.
+
+    The model is compiled for this length.
+    """
     return max(_half(stage) for stage in stages)
 
 

@@ -1,4 +1,4 @@
-"""Settings of a stage, the arena size that a level needs, and grids of stages."""
+"""Settings of a stage, the arena size that its levels need, and grids of stages."""
 
 import functools
 import itertools
@@ -19,8 +19,8 @@ from swarmjax.task.placement import UNITS
 
 # Area that a random level needs. A start and a target each take a square of 0.15 m (two hulls of
 # 0.074 m side by side). An obstacle takes the square around its circumscribed circle, widened by a
-# passage in which one robot has 13 mm to spare on either side. Along the walls, a border of half a
-# passage stays free.
+# passage. In a passage, one robot has 13 mm to spare on either side. Along the walls, a border of
+# half a passage stays free.
 DISC = 0.15  # m, edge of the square around the disc of a start or a target
 
 
@@ -266,7 +266,7 @@ class StageConfig(Section):
 
     @property
     def laid_out(self) -> tuple[Kind, dict[str, Any]] | None:
-        """The layout and its numbers in units, as `drawing.stack` takes them, or None."""
+        """The layout and its numbers in units, as `drawing.stack` takes them; None without one."""
         if self.kind is None:
             return None
         ends = [_ends(getattr(self, key) or 0.0) for key in NUMBERS]
@@ -291,13 +291,13 @@ class StageConfig(Section):
 def smallest_side(stage: StageConfig) -> float:
     """Returns the smallest side of an arena that has room for a level of the stage.
 
-    The free square (side - 0.10)^2 must hold two squares of 0.15^2 for each robot and one of
-    (obstacle_size * sqrt(2) + 0.10)^2 for each obstacle. This leaves more than a passage on either
-    side of any single obstacle.
+    The free square (side - 0.10)^2 must hold two squares of 0.15^2 for each robot. It must also
+    hold a square of (obstacle_size * sqrt(2) + 0.10)^2 for each obstacle. This leaves more than a
+    passage on either side of any single obstacle.
 
     A random level places its obstacles one after the other. The obstacles may take at most the
     share FILLING of the free square. Discs placed this way jam at 0.547 of the area (Feder 1980),
-    which is 0.70 of a square grid of discs. The walls reduce this further.
+    which is 0.70 of a square grid of discs. Walls make them jam even earlier.
 
     Args:
       stage: the stage; its `side` is not read.
@@ -317,8 +317,8 @@ def make_room(sim: SimConfig, stages: Sequence[StageConfig]) -> SimConfig:
       stages: stages that must fit.
 
     Returns:
-      The settings with both numbers. These are at least 5 and 4, so that the stages of a curriculum
-      share a program and its checkpoints.
+      The settings with both numbers. These are at least 5 robots and 4 obstacles, so that the
+      stages of a curriculum share a program and its checkpoints.
     """
     robots = max([sim.robots, *(stage.robots for stage in stages)])
     obstacles = max([sim.obstacles, *(stage.obstacles for stage in stages)])
@@ -401,7 +401,7 @@ class GridConfig(Section):
 
 
 def _cell_name(robots: int, obstacles: int, side: float | tuple[float, float]) -> str:
-    """Names a cell of a grid by its numbers, lengths in cm, as r5-o3-s120 or r5-o3-s50-120."""
+    """Names a cell of a grid by its numbers (lengths in cm), as in r5-o3-s120 or r5-o3-s50-120."""
     ends = side if isinstance(side, tuple) else (side,)
     lengths = "-".join(f"{100 * length:.6g}".replace(".", "_") for length in ends)
     return f"r{robots}-o{obstacles}-s{lengths}"

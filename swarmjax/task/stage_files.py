@@ -18,7 +18,8 @@ def expand(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
       choice: the name of its file.
 
     Raises:
-      ConfigError: the file, its sequence or its grid is invalid, or it does not take these keys.
+      ConfigError: the file, its sequence or its grid is invalid, or the file does not take these
+        keys.
     """
     if not _is_grid(choice):
         return _listed(stage, choice)
@@ -50,7 +51,7 @@ def read_stage(choice: str) -> dict[str, Any]:
     """Reads a file of configs/stage/ that is a single stage.
 
     Raises:
-      ConfigError: there is no file of this name, or it names several stages.
+      ConfigError: there is no file of this name, or the file names several stages.
     """
     files.check_choice("stage", choice, "stage")
     if _is_sequence(choice) or _is_grid(choice):
@@ -69,7 +70,8 @@ def load_levels[C: Section](
       stage: plain data of the default stage; None for the stage of the command's file.
 
     Raises:
-      ConfigError: a word is invalid, or a suite is given together with a key that it sets itself.
+      ConfigError: a word is invalid, or a suite is given together with a key that the suite sets
+        itself.
     """
 
     def fill_in(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:
@@ -144,7 +146,7 @@ def _member(name: str) -> dict[str, Any]:
 
 
 def name_of(choice: str) -> str:
-    """Returns the name of a choice of the group `stage`; the name of a path is that of its file."""
+    """Returns the name of a choice of the group `stage`; a path has the name of its file."""
     return Path(choice).stem if files.is_path(choice) else choice
 
 

@@ -1,4 +1,4 @@
-"""Surroundings of each robot in its own frame: exact, and only for a critic in training.
+"""Exact surroundings of each robot in its own frame, only for a critic in training.
 
 The critic may see the full state, since only the actor is deployed (Pinto et al. 2017, "Asymmetric
 Actor Critic for Image-Based Robot Learning"). The nearest robots and walls are listed, nearest
@@ -81,7 +81,7 @@ def _rectangles(pose: Array, level: Level) -> Array:
     middle, viewer = jnp.stack([x, y], axis=-1), pose[:, None]
     end = jnp.stack([reach * jnp.cos(along), reach * jnp.sin(along)], axis=-1)
     one, other = (into_frame(viewer, middle + sign * end) for sign in (-1.0, 1.0))
-    is_left = one[0] * other[1] - one[1] * other[0] >= 0.0  # `other`, seen from the robot
+    is_left = one[0] * other[1] - one[1] * other[0] >= 0.0  # of `other`, seen from the robot
     right = _shown(*(jnp.where(is_left, a, b) for a, b in zip(one, other, strict=True)))
     left = _shown(*(jnp.where(is_left, b, a) for a, b in zip(one, other, strict=True)))
     nearest = _shown(*into_frame(viewer, _to_rectangle(pose, found)[0]))
@@ -102,10 +102,10 @@ def _to_rectangle(pose: Array, rectangle: Array) -> tuple[Array, Array]:
 
 
 def _nearest(distance: Array, is_there: Array, count: int) -> tuple[Array, Array]:
-    """Chooses the nearest `count` of N objects at distances [R, N], or all, nearest first.
+    """Chooses the nearest of N objects at distances [R, N]: `count` or all, nearest first.
 
     Returns:
-      [R, n] their indices, and whether they are present.
+      [R, n] indices of the chosen objects, and [R, n] whether they are present.
     """
     ranked = jnp.where(is_there, distance, jnp.inf)
     _, chosen = jax.lax.top_k(-ranked, min(count, distance.shape[1]))

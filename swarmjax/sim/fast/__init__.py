@@ -1,8 +1,8 @@
 """Faster, optional code for the same physics; only `sim/dispatch.py` calls it.
 
-`discs.py` steps planar robots; `planar_jax.py` or `planar_warp.py` solves their contacts. With
-friction, `rubbing_jax.py` or `rubbing_warp.py` does. For wheeled robots, `warp_step.py` makes
-MJX-Warp use the solver of `wheeled_warp.py` (with `wheeled_problem.py` and `wheeled_pairs.py`).
-`paths_warp.py` finds shortest paths. `unroll.py` splits short axes for XLA. Tests compare each
-physics step with MuJoCo C.
+`discs.py` steps planar robots. Their contacts are solved by `planar_jax.py` or `planar_warp.py`,
+and contacts with friction by `rubbing_jax.py` or `rubbing_warp.py`. For wheeled robots,
+`warp_step.py` makes MJX-Warp use the solver of `wheeled_warp.py` (with `wheeled_problem.py` and
+`wheeled_pairs.py`). `paths_warp.py` finds shortest paths. `unroll.py` splits short axes for XLA.
+Tests compare each physics step with MuJoCo C.
 """

@@ -2,9 +2,9 @@
 
 A hull is a sphere between upright faces, so in the plane it is a disc. Its contacts (condim 1) push
 through its centre, so they move it along x and y and never turn it. MJX's own step builds every
-contact in space, and factorises one matrix for all robots at every iteration of Newton's method.
-These two take nine tenths of its time. The contact forces are the solution of MuJoCo's convex
-problem in its dual form (MuJoCo's documentation, Computation, "Dual problem"),
+contact in space. At every iteration of Newton's method, it factorises one matrix for all robots.
+Together, these two tasks take nine tenths of the step's time. The contact forces are the solution
+of MuJoCo's convex problem in its dual form (MuJoCo's documentation, Computation, "Dual problem"),
 
     minimise over f >= 0:  1/2 f' (J M^-1 J' + R) f + f' (J a0 - aref).
 
@@ -33,10 +33,11 @@ from swarmjax.sim import model as sim_model
 from swarmjax.sim.engine import Engine
 from swarmjax.sim.geometry import CONTACT_HEIGHT
 
-# Sweeps stop when no force changes by more than this share of the largest; float32 rounds at 1e-7.
+# Sweeps stop when no force changes by more than this share of the largest force. float32 rounds at
+# 1e-7.
 TOLERANCE = 1e-6
-# m; distance of a hull's centre to the nearer of a box's top and bottom. MuJoCo pushes a centre
-# that lies deeper within the box than this up or down, where no joint moves.
+# m; distance of a hull's centre to the nearer of a box's top and bottom. If a centre lies deeper
+# within the box than this, MuJoCo pushes it up or down, where no joint moves.
 DEEPEST = min(CONTACT_HEIGHT, 2.0 * sim_model.HALF_HEIGHT - CONTACT_HEIGHT)
 
 
@@ -103,7 +104,7 @@ class Data:
 
 
 class Rubbing(NamedTuple):
-    """Additional quantities for friction, of an arena, or of many with a leading axis.
+    """Additional quantities for friction in an arena, or in many arenas with a leading axis.
 
     Attributes:
       agility: [R] 1 / moment of inertia, 1 / (kg m^2).
@@ -115,7 +116,7 @@ class Rubbing(NamedTuple):
 
 
 class DiscRobots(NamedTuple):
-    """The robots of an arena, or of many with a leading axis.
+    """The robots of an arena, or of many arenas with a leading axis.
 
     Attributes:
       place: [R, 3] x (m), y (m), yaw (rad).
@@ -194,7 +195,7 @@ def load_engine(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve:
       The engine.
     """
     discs = load(model, ids, radius, solve)
-    # Speeds of the whole environment, not of the physics alone.
+    # The label gives speeds of the whole environment, not of the physics alone.
     label = (
         "discs, swarmjax's own planar step of the MJX model (2.4 times as fast as "
         "sim.solver=mjx on two cores, 3.9 times on an H200)"
@@ -205,9 +206,9 @@ def load_engine(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve:
 def _rounds(robots: int) -> np.ndarray:
     """Builds a tournament: the robot that each robot meets in each round, [N, R].
 
-    With an odd number N of robots, two robots meet in the round that equals their sum modulo N (the
-    circle method). The robot left over meets none and gets its own index. With an even number, it
-    meets the last robot instead.
+    With an odd number N of robots, robots i and j meet in round (i + j) modulo N (the circle
+    method). The robot left over in a round meets none and gets its own index. With an even number
+    of robots, the robot left over meets the last robot instead.
     """
     rounds = robots - 1 + robots % 2
     player = np.arange(rounds)
@@ -258,8 +259,8 @@ def _robots(discs: Discs, model: Model, data: Data) -> DiscRobots:
 def spring(discs: Discs) -> tuple[float, float]:
     """Returns stiffness and damping, which are the same for all contacts.
 
-    MuJoCo's documentation, Modeling, "Solver parameters": k and b from `solref`, whose time
-    constant is at least two physics steps (`refsafe`).
+    They are k and b in MuJoCo's documentation (Modeling, "Solver parameters"), computed from
+    `solref`. The time constant in `solref` is at least two physics steps (`refsafe`).
 
     Args:
       discs: constants.

@@ -3,8 +3,8 @@
 For each pair of corners, a thread checks whether they see each other. For each robot, a thread
 settles the corners outwards from the robot's target (Dijkstra 1959, "A Note on Two Problems in
 Connexion with Graphs"). Another thread per robot finds the first corner of the robot's path. This
-thread checks obstacles only for corners that could shorten the path. XLA would take minutes to
-compile this for a GPU.
+thread checks obstacles only for corners that could shorten the path. For a GPU, XLA would take
+minutes to compile the JAX code.
 """
 
 from functools import partial
@@ -31,8 +31,8 @@ def find_legs(corner: Array, side: Array, frame: Array, widened: float) -> Array
       widened: width added around obstacles, m.
 
     Returns:
-      [K, K] m; inf if an obstacle is in between, or a corner lies in an obstacle or outside the
-      arena. A corner is 0 m from itself, unless it lies outside.
+      [K, K] m; inf if an obstacle is in between, or if a corner lies in an obstacle or outside the
+      arena. The distance from a corner to itself is 0 m, unless the corner lies outside.
     """
     many = of_arenas(partial(_find_legs, widened))
     return many(corner[None], jnp.asarray(side)[None], frame[None])[0]
@@ -101,7 +101,7 @@ def _settle(widened: float, target: Array, side: Array, *given: Array) -> Array:
     corner, frame, legs = given
     size = (arenas, robots, corner.shape[1])
     call = wp.jax_kernel(_settle_corners, num_outputs=2)
-    del side  # an argument only because `of_arenas` takes the number of arenas from it
+    del side  # unused; `of_arenas` takes the number of arenas from its shape
     shapes = {"state": size, "to_go": size}
     found = call(
         target, corner, frame, legs, widened, launch_dims=(arenas, robots), output_dims=shapes

@@ -1,7 +1,7 @@
 """Contacts of planar robots in JAX: all robots of an arena at once, sweep by sweep.
 
 `discs` describes the problem and the order of a sweep. Each fixture is one row for all robots. Each
-round of the tournament is also one row; in a round, each robot meets one other robot.
+round of the tournament, in which each robot meets one other robot, is also one row.
 """
 
 import operator
@@ -36,8 +36,8 @@ class Contact(NamedTuple):
     """A gap, and the contact's parameters if it is closed.
 
     Attributes:
-      gap: gap between the two.
-      give: softness R, the acceleration by which a unit of force misses the demand, 1 / kg.
+      gap: gap between the robot and the object.
+      give: softness R: a unit of force misses the demand by this acceleration, 1 / kg.
       demand: aref, requested acceleration along the gap, m/s^2.
       stiffness: J M^-1 J' + R, effect of a unit of force, 1 / kg.
     """
@@ -49,7 +49,7 @@ class Contact(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Velocities or accelerations along x and y, of robots or of one relative to another."""
+    """Velocities or accelerations along x and y, of robots or of robots relative to others."""
 
     x: Array
     y: Array
@@ -91,7 +91,7 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
 
 
 def contacts(discs: Discs, robots: DiscRobots, fixture: Array) -> Contact:
-    """Returns all contacts [K, R] of robots: with each fixture [F, 5], then of each round."""
+    """Returns all contacts [K, R] of robots: with the fixtures [F, 5], then with opponents."""
     x, y, other = robots.place[:, 0], robots.place[:, 1], discs.opponent
     to_fixture = _from_box(x, y, turned(fixture[:, None], jnp), discs.radius)
     meets = other - np.arange(len(x))
@@ -140,8 +140,9 @@ def _sweep(
 def _from_box(x: Array, y: Array, box: Box, radius: float) -> DiscGap:
     """Returns the gap between boxes and robots at x and y, m.
 
-    The gap is measured from the box's nearest point. If the centre is within the box, it is
-    measured from the nearest face instead, unless that is the top or the bottom.
+    The gap is measured from the box's point nearest to the hull's centre. A centre within the box
+    has no such point, so its gap is measured from the nearest face, unless that face is the top or
+    the bottom.
     """
     x, y = to_box_frame(x - box.x, y - box.y, box)
     over_x, over_y = jnp.abs(x) - box.half_x, jnp.abs(y) - box.half_y
@@ -149,7 +150,7 @@ def _from_box(x: Array, y: Array, box: Box, radius: float) -> DiscGap:
     along_x = jnp.where(within, jnp.where(over_x > over_y, 1.0, 0.0), jnp.maximum(over_x, 0.0))
     along_y = jnp.where(within, jnp.where(over_x > over_y, 0.0, 1.0), jnp.maximum(over_y, 0.0))
     length = jnp.sqrt(along_x * along_x + along_y * along_y)
-    # A centre midway between two faces is pushed out of the face at the negative end.
+    # A centre midway between two faces is pushed out through the face at the negative end.
     along_x = jnp.where(x > 0.0, along_x, -along_x) / length
     along_y = jnp.where(y > 0.0, along_y, -along_y) / length
     depth = -jnp.maximum(over_x, over_y)
@@ -161,8 +162,8 @@ def _from_box(x: Array, y: Array, box: Box, radius: float) -> DiscGap:
 def _from_disc(x: Array, y: Array, ahead: Array, radius: float) -> DiscGap:
     """Returns the gap between robots and others; x and y (m) lead from the others to the robots.
 
-    Two hulls at the same place push each other along x, as in MuJoCo. In each pair, one robot has
-    `ahead` 1 and the other -1; the one with 1 is pushed towards the negative end.
+    Two hulls at the same place push each other along x, as in MuJoCo. In each pair, `ahead` is 1
+    for one robot and -1 for the other. The robot with 1 is pushed towards negative x.
     """
     apart = jnp.sqrt(x * x + y * y)
     along_x = jnp.where(apart > 0.0, x / apart, -ahead)

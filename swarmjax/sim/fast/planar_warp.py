@@ -1,8 +1,8 @@
 """Contacts of planar robots in Warp: one kernel, with one thread per arena.
 
-`discs` describes the problem. A thread finds the contacts of its arena, stores them, and sweeps
-through them until no force changes. In a kernel that XLA unrolls over all possible contacts,
-most of a sweep would go to contacts that do not exist.
+`discs` describes the problem. A thread finds and stores the contacts of its arena, and sweeps
+through them until no force changes. In a kernel that XLA unrolls over all possible contacts, most
+of a sweep would go to contacts that do not exist.
 
 JAX calls the kernel through `warp.jax_kernel`, so XLA can include it in a CUDA graph.
 """
@@ -60,7 +60,7 @@ def of_arenas(solve: Any) -> Any:
 
         whole = jax.tree.map(widen, given, tuple(batched))
         shape = whole[1].shape  # shape of the sides: [size, arenas]
-        arenas = shape[0] * shape[1]  # reshape cannot infer it if there are no obstacles
+        arenas = shape[0] * shape[1]  # `reshape` cannot infer this number if there are no obstacles
         found = many(*jax.tree.map(lambda x: x.reshape(arenas, *x.shape[2:]), whole))
         return found.reshape(*shape, *found.shape[1:]), True
 
@@ -94,7 +94,7 @@ class WarpArena:
       row: [K, A] numbers of each contact: x and y of the unit vector along which it pushes, aref,
         and J M^-1 J' + R.
       soft: [K, A] R, and the force, N.
-      between: [K, A] the robot pushed along the vector, and the one pushed back; -1 for none.
+      between: [K, A] the robot pushed along the vector, and the robot pushed back; -1 for none.
       found: [A, R] acceleration of x, y and yaw.
       index: [A] index of the thread.
     """
@@ -229,8 +229,9 @@ def _touch_robots(arena: WarpArena, count: int, i: int) -> int:
 def from_box(place: wp.vec3, box: WarpBox, radius: float) -> wp.vec3:
     """Returns x and y of the unit vector from a box to a robot, and the gap between them, m.
 
-    The gap is measured from the box's nearest point. If the centre is within the box, it is
-    measured from the nearest face, unless that is the top or the bottom (`discs.DEEPEST`).
+    The gap is measured from the box's point nearest to the hull's centre. A centre within the box
+    has no such point, so its gap is measured from the nearest face, unless that face is the top or
+    the bottom (`discs.DEEPEST`).
     """
     away_x, away_y = place[0] - box.x, place[1] - box.y
     x = box.cos * away_x + box.sin * away_y
@@ -243,7 +244,7 @@ def from_box(place: wp.vec3, box: WarpBox, radius: float) -> wp.vec3:
         along = wp.where(over_x > over_y, wp.vec2(1.0, 0.0), wp.vec2(0.0, 1.0))
         distance = wp.where(depth > _DEEPEST, radius, -depth)
     along = wp.normalize(along)
-    # A centre midway between two faces is pushed out of the face at the negative end.
+    # A centre midway between two faces is pushed out through the face at the negative end.
     along_x = wp.where(x > 0.0, along[0], -along[0])
     along_y = wp.where(y > 0.0, along[1], -along[1])
     world_x = box.cos * along_x - box.sin * along_y
@@ -256,7 +257,7 @@ def from_disc(x: float, y: float, radius: float) -> wp.vec3:
     """Returns the unit vector from the second robot to the first, and their gap, m.
 
     x and y (m) lead from the second robot to the first. Two hulls at the same place push each other
-    along x, as in MuJoCo; the first is pushed towards the negative end.
+    along x, as in MuJoCo. The first is pushed towards negative x.
     """
     apart = wp.length(wp.vec2(x, y))
     along = wp.vec2(-1.0, 0.0)

@@ -2,8 +2,8 @@
 
 A contact has two forces within the cone |rub| <= friction * push: a push along the normal and a rub
 along the face. This is MuJoCo's elliptic cone of condim 3. The third force is vertical, where no
-joint moves, and stays 0. The push acts through the centre, the rub with an arm. Push and rub move
-the robot in different ways, so for one contact the problem
+joint moves, and stays 0. The push acts through the robot's centre, and the rub acts with a lever
+arm. Push and rub move the robot in different ways, so for one contact the problem
 
     minimise over the cone:  1/2 f' (J M^-1 J' + R) f + f' (J a0 - aref)
 
@@ -11,11 +11,11 @@ is two separate parabolas. The least point of their sum in the cone has a closed
 Projected Gauss-Seidel then goes through contacts instead of forces. A step sets one contact to its
 best forces while the other forces stay the same.
 
-Wedged robots pass a force back and forth, a little less of it in each sweep. An arena may take up
-to 200 sweeps, and all arenas of a call wait for it. So between sweeps, forces leap to where the
-last three sweeps are heading (`_leap`). This is Anderson acceleration (D. G. Anderson, Iterative
-Procedures for Nonlinear Integral Equations, J. ACM 12, 1965) with a memory of two sweeps.
-docs/performance.md compares it with alternatives.
+Wedged robots pass a force back and forth, and the force shrinks only a little in each sweep. An
+arena may take up to 200 sweeps, and all arenas of a call wait for the slowest arena. So between
+sweeps, forces leap to where the last three sweeps are heading (`_leap`). This is Anderson
+acceleration (D. G. Anderson, Iterative Procedures for Nonlinear Integral Equations, J. ACM 12,
+1965) with a memory of two sweeps. docs/performance.md compares this method with alternatives.
 """
 
 import functools
@@ -32,12 +32,12 @@ from swarmjax.sim.fast.discs import TOLERANCE, DiscRobots, Discs, Rubbing, sprin
 from swarmjax.sim.fast.planar_jax import Contact, DiscGap
 
 KEPT = 3  # sweeps that a leap uses; a fourth saves 3 % in s6 (docs/performance.md)
-# Relative increase of a sum of squares. Without it, rounding may leave 0. It is ten times float32's
-# rounding.
+# Relative increase of a sum of squares. The increase is ten times float32's rounding. Without the
+# increase, rounding may turn the sum into 0.
 ROUNDING = 1e-6
-# Relative error of an acceleration after two roundings in float32. Without this limit, 3 of 20,000
-# random crowds never came to rest. These crowds had hulls that were grazed at speed. All arenas
-# wait for such a crowd.
+# Relative error of an acceleration after two roundings in float32. Smaller changes of an
+# acceleration are ignored. Otherwise, 3 of 20,000 random crowds never came to rest. In these
+# crowds, hulls were grazed at speed. All arenas wait for such a crowd.
 FLOOR = 2.4e-7
 
 
@@ -89,7 +89,7 @@ class Search(NamedTuple):
       force: forces to continue from.
       motion: accelerations under these forces.
       last: result of the last sweep.
-      before: result of the sweep before it.
+      before: result of the sweep before the last.
       moves: [] whether the last sweep changed a force.
     """
 
@@ -102,7 +102,7 @@ class Search(NamedTuple):
 
 
 class PlaneMotion(NamedTuple):
-    """Velocities or accelerations of robots, or those relative to others (`turn` is then a sum)."""
+    """Velocities or accelerations, of robots or of pairs of robots (`turn` is then a sum)."""
 
     x: Array
     y: Array
@@ -125,7 +125,7 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
 
 
 def solve(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> tuple[Array, Array]:
-    """Does the same as `push_apart`, and also returns how many sweeps it took.
+    """Does the same as `push_apart`, and also returns the number of sweeps.
 
     Args:
       discs: constants.
@@ -156,14 +156,14 @@ def solve(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> tup
 
 
 def _least_change(touch: Touch, motion: PlaneMotion) -> Array:
-    """Returns the force, N, that rounding of accelerations can cause; ignore smaller changes."""
+    """Returns the force, N, that rounding can cause; smaller changes are to be ignored."""
     size = jnp.abs(motion.x) + jnp.abs(motion.y) + touch.rub.arm * jnp.abs(motion.turn)
     closed = touch.push.gap.distance < 0.0
     return FLOOR * jnp.max(jnp.where(closed, size / touch.push.stiffness, 0.0))
 
 
 def _go_on(discs: Discs, touch: Touch, robots: DiscRobots, least: Array, now: Search) -> Search:
-    """Sweeps once, and leaps if allowed."""
+    """Makes one sweep, and then a leap if that is allowed."""
     force, motion = _sweep(discs, touch, robots, now.motion, now.force)
     swept = Swept(force, _minus(force, now.force))
     largest = jnp.max(jnp.stack([jnp.abs(each) for each in swept.change]))
@@ -255,7 +255,7 @@ def _against(discs: Discs, motion: PlaneMotion, contacts: int) -> PlaneMotion:
 
 
 def _slide(gap: DiscGap, arm: Array, motion: PlaneMotion) -> Array:
-    """Returns J a along the face: how fast the robot's rim slides on the object it touches."""
+    """Returns J a along the face: how fast the robot's rim slides on the touched object."""
     return gap.x * motion.y - gap.y * motion.x - arm * motion.turn
 
 
@@ -337,9 +337,9 @@ def project(force: Force, push: Array, rub: Array, friction: Array) -> Force:
       friction: [] 0 or above.
 
     Returns:
-      The forces themselves, if they lie in the cone. Otherwise the nearest point of the cone's edge
-      on the same side, or the cone's tip. On the edge, this is where the parabola along (1,
-      friction) is least.
+      The forces themselves, if they lie in the cone; otherwise the nearest point of the cone's edge
+      on the same side, or the cone's tip. The nearest point of an edge is the least point of the
+      parabola along (1, friction).
     """
     size = jnp.abs(force.rub)
     edge = push * force.push + friction * rub * size

@@ -77,7 +77,7 @@ class WarpRubbingArena:
         (m), R.
       asked: [K, A] aref of push and rub, and J M^-1 J' + R of both.
       force: [K, A] push and rub, N.
-      between: [K, A] the robot pushed along the vector, and the one pushed back; -1 for none.
+      between: [K, A] the robot pushed along the vector, and the robot pushed back; -1 for none.
       past: [KEPT, K, A] push and rub after a sweep, and their changes in that sweep, N; sweep i is
         in row i modulo KEPT.
       found: [A, R] acceleration of x, y and yaw.
@@ -249,7 +249,7 @@ def _both(arena: WarpRubbingArena, of_robots: wp.array2d[float], between: wp.vec
 def _slide(
     arena: WarpRubbingArena, motion: wp.array2d[wp.vec3], row: wp.vec4, between: wp.vec2i
 ) -> wp.vec2:
-    """Returns J a: how fast the two sides of a contact move apart, and along each other."""
+    """Returns J a: how fast the two sides of a contact move apart, and how fast they slide."""
     apart = _apart(arena, motion, between)
     along = row[0] * apart[1] - row[1] * apart[0] - row[2] * apart[2]
     return wp.vec2(row[0] * apart[0] + row[1] * apart[1], along)
@@ -314,7 +314,7 @@ def _solve_contacts(arena: WarpRubbingArena, count: int, sweeps: int) -> None:
 
 @wp.func
 def _least_change(arena: WarpRubbingArena, count: int) -> float:
-    """Returns the force, N, that rounding can cause (`rubbing_jax`); ignore smaller changes."""
+    """Returns the force, N, that rounding can cause, as in `rubbing_jax`."""
     largest = wp.float32(0.0)
     for k in range(count):
         apart = _apart(arena, arena.free, arena.between[k, arena.index])

@@ -1,4 +1,4 @@
-"""Replaces the physics step of MJX-Warp with one made for a body. Needs Warp.
+"""Replaces the physics step of MJX-Warp with a step made for one kind of body. Needs Warp.
 
 MJX calls Warp's `step` by name, and this module replaces that function. The model's `opt.solver`
 selects the step. All other values of `opt.solver` select MJX-Warp's own step.
@@ -35,7 +35,7 @@ def load_engine(model: mujoco.MjModel, robots: int, arenas: int) -> Engine:
     plain = engine.load_mjx(model, robots, "warp", arenas)
     install()
     chosen = plain.model.tree_replace({"opt.solver": wheeled_warp.NUMBER})
-    # Speed of the whole environment, not of the physics alone.
+    # The label gives the speed of the whole environment, not of the physics alone.
     label = "MJX with swarmjax's contact solver (3.2 times as fast as sim.solver=mjx on an H200)"
     return replace(plain, label=label, model=chosen)
 

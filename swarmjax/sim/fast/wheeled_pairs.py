@@ -1,4 +1,4 @@
-"""Contacts between wheeled robots: Newton's method for robots that touch each other, jointly.
+"""Contacts between wheeled robots: a joint solution for robots that touch each other.
 
 `wheeled_warp` describes the problem, and first solves it for single robots.
 """
@@ -153,7 +153,7 @@ def _side(problem: Problem, arena: int, row: int, side: int) -> wp.vec3i:
 
 @wp.func
 def _overlap(problem: Problem, together: Together, arena: int, i: int, j: int, sides: int) -> float:
-    """Returns the effect of pair j along pair i, in the robot that `sides` picks in each."""
+    """Returns the effect of pair j along pair i, in the robot that `sides` picks in each pair."""
     row = together.pair[arena, i]
     mine = _side(problem, arena, row, sides % 2)
     theirs = _side(problem, arena, together.pair[arena, j], sides // 2)
@@ -164,7 +164,7 @@ def _overlap(problem: Problem, together: Together, arena: int, i: int, j: int, s
 
 @wp.func
 def _take(problem: Problem, together: Together, arena: int, robots: int) -> bool:
-    """Takes the step; returns whether another is needed."""
+    """Takes the step; returns whether another step is needed."""
     switches = wp.bool(False)
     for k in range(together.count[arena]):
         row = together.row[arena, k]
@@ -190,7 +190,7 @@ def _take(problem: Problem, together: Together, arena: int, robots: int) -> bool
 
 @wp.func
 def _slopes(problem: Problem, together: Together, arena: int, robot: int) -> bool:
-    """Computes J times the step for a robot's own rows; returns whether any of them switches."""
+    """Computes J times the step for a robot's own rows; returns whether any row switches."""
     switches = wp.bool(False)
     step = of_robot(together.step, arena, robot)
     for k in range(problem.own[arena, robot]):

@@ -9,9 +9,9 @@ from typing import Any
 import warp as wp
 
 JOINTS = wp.constant(8)  # joints of a robot: six of a free body, and two wheels
-FREE = wp.constant(6)  # the joints of the free body among these
+FREE = wp.constant(6)  # joints of the free body alone
 _INERTIA = wp.constant(35)  # entries of a robot's M, without the zero between both wheels
-SHARED = wp.constant(-2)  # in place of a wheel, in a row between two robots
+SHARED = wp.constant(-2)  # stands in place of a wheel, in a row between two robots
 # Entries of `Problem.scaled` that follow a row's entries.
 AREF = wp.constant(8)
 GAP = wp.constant(9)
@@ -27,8 +27,8 @@ _SHORT = wp.constant(1e-2)
 _ROUNDING = wp.constant(1e-5)
 # Number of contacts between robots that become separate terms. Further contacts are added to the
 # robots' blocks, and the method then takes more and shorter steps. Five robots have ten pairs;
-# larger swarms use Newton's method (`dispatch.MOST_WHEELED`). The number equals JOINTS, so one size
-# of matrix serves both.
+# larger swarms use MJX's own Newton method (`dispatch.MOST_WHEELED`). The number of contacts equals
+# JOINTS, so one size of matrix serves for both.
 PAIRS = wp.constant(8)
 
 
@@ -60,7 +60,7 @@ class Problem:
       second: [A, N] the `side` of the other robot.
       own: [A, R] number of rows of a robot.
       row: [A, R, K] indices of these rows, and where the robot's entries are in them.
-      touches: [A, R] whether any row also involves another robot.
+      touches: [A, R] whether any of the robot's rows also involves another robot.
       scaled: [K, 11, A R] numbers of each row, multiplied by the root of D: the robot's entries and
         aref, and during `_relax` also J a - aref and J times the step. Values that threads read at
         the same time are adjacent.
@@ -161,7 +161,7 @@ def make_room(m: Any, d: Any, robots: int) -> Any:
 
 @wp.func
 def does_switch(gap: float, slope: float) -> bool:
-    """Returns whether a row is active before a whole step and not after it, or vice versa.
+    """Returns whether a row is active only before a whole step, or only after it.
 
     If no row switches, the cost is quadratic along the step, and the whole step is best.
     """
@@ -220,9 +220,9 @@ def entries_of(problem: Problem, arena: int, side: wp.vec3i) -> Vector:
     Args:
       problem: the problem.
       arena: index of the arena.
-      side: three numbers. The first is the robot or the row and is not read here. The second is the
-        place of the body's six entries, which are stored from the last joint to the first. The
-        third is the wheel whose entry precedes those six.
+      side: three numbers. The first is the index of the robot or of the row, and is not read here.
+        The second is the place of the body's six entries, which are stored from the last joint to
+        the first. The third is the wheel with an entry before those six entries.
     """
     found = Vector()
     for i in range(6):

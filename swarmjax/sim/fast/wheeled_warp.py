@@ -7,9 +7,10 @@ problem"), with rows for pyramidal friction cones and for contacts that only pus
 
 For robots that touch only the floor, walls and obstacles, the rows of M and J involve one robot
 each. The problem then splits into one problem with 8 unknowns per robot. MJX-Warp's Newton method
-instead takes all robots of an arena together, and factorises a matrix of 8 R rows per iteration.
+instead solves for all robots of an arena together, and factorises a matrix of 8 R rows per
+iteration.
 
-Here only robots that touch each other are taken together. Their Hessian is one 8 x 8 block per
+Here, only robots that touch each other are solved together. Their Hessian is one 8 x 8 block per
 robot, plus a rank-one term per contact between two robots. The Woodbury identity moves these terms
 out of the inverse (Golub and Van Loan 2013, "Matrix Computations", 2.1.4).
 """
@@ -49,7 +50,7 @@ from swarmjax.sim.fast.wheeled_problem import (
 
 NUMBER = -1  # value of `opt.solver` for this solver; MuJoCo does not use it
 _ITERATIONS = 20  # limit of Newton's method; touching robots usually need six, at most 18 so far
-_BLOCK = 64  # threads per block; their work is long and uneven, so small blocks wait less
+_BLOCK = 64  # threads per block; a thread's work is long and uneven, so small blocks wait less
 
 
 def step(m: Any, d: Any) -> None:
@@ -96,7 +97,10 @@ def _begin(
 
 @wp.kernel(enable_backward=False)
 def _share_out(problem: Problem, together: Together) -> None:
-    """Lists the rows of a robot. The first robot also lists its arena if any robots touch."""
+    """Lists the rows of a robot.
+
+    The thread of the first robot also lists the arena if any robots touch each other.
+    """
     arena, robot = wp.tid()
     own = wp.int32(0)
     touches, crowded = wp.bool(False), wp.bool(False)
@@ -144,7 +148,7 @@ def _sides(problem: Problem, arena: int, row: int) -> tuple[wp.vec3i, wp.vec3i]:
 
 @wp.func
 def _scale(problem: Problem, arena: int, robot: int, k: int) -> None:
-    """Copies a robot's row to adjacent memory of neighbouring threads, for simultaneous reads."""
+    """Copies a robot's row so that neighbouring threads read from adjacent memory."""
     side = problem.row[arena, robot, k]
     root = wp.sqrt(problem.D[arena, side[0]])
     entries = root * entries_of(problem, arena, side)

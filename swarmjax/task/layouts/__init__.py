@@ -1,6 +1,6 @@
-"""Layouts of arenas with walls; each file draws one as a pure function.
+"""Layouts of arenas with walls; each file draws one layout as a pure function.
 
-`LAYOUTS` lists them by the names that stages use for `level`. `site.py` holds the parts that
+`LAYOUTS` lists the layouts by the names that stages use for `level`. `site.py` holds the parts that
 layouts share. `drawing.py` turns a layout into a level. Lengths are whole units of 1/4096 m, so
 NumPy and JAX draw the same bits. The package may import `placement.py` and `sim.noise`.
 """

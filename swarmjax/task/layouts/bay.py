@@ -61,7 +61,7 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
 
 
 def _walls(site: Site, bay: Array, middle: Array, recess: Array, xp: Any) -> Array:
-    """Returns the walls [4, 4] (units): the right one, then the left ones around the bay."""
+    """Returns the walls [4, 4] (units): the right wall, then the left walls around the bay."""
     half_x, thin, aside = site.half[0], THICKNESS // 2, site.numbers.gap // 2
     along = site.numbers.length // 2
     left = between(-half_x, bay - along)
@@ -80,7 +80,8 @@ def _walls(site: Site, bay: Array, middle: Array, recess: Array, xp: Any) -> Arr
 
 
 def _least(demand: Demand) -> tuple[float, float]:
-    # The bay lies within the middle quarter on either side, and the robots start beyond it.
+    # The bay's centre lies in the middle quarter of the corridor. On either side, the robots start
+    # beyond the bay.
     side = 4 / 3 * (demand.numbers["length"][1] + 2 * (2 * _ENDS + _AHEAD) + 0.12)
     return min(side, 1.2), demand.numbers["width"][1] + 2 * THICKNESS / 4096
 

@@ -8,11 +8,11 @@ import numpy as np
 from swarmjax.task.layouts.site import ArenaLayout, Demand, Drawn, Site, pick
 
 Array = Any
-_TURN = 5040  # directions around the circle; divisible by 2 to 10, 12, 14, 15, 16, 18 and 20 robots
+_TURN = 5040  # directions around the circle; divisible by 2 to 10, by 12, 14, 15, 16, 18 and 20
 _ONE = 2**14  # scale of the sine table; times a radius of 2 m (2**13 units), it fits an int32
 _ANGLE = np.arange(_TURN) * (2.0 * math.pi / _TURN)
 _TABLE = np.round(_ONE * np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=-1)).astype(np.int32)
-_WALL = 0.07  # m, from the circle to the walls: a hull of 0.045 m and some spare space
+_WALL = 0.07  # m, from the circle to the walls: a hull's radius of 0.045 m and some spare space
 
 
 def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:

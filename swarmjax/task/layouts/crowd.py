@@ -1,7 +1,7 @@
 """A crowd without obstacles: robots start anywhere outside the arrival zones.
 
 Targets keep the distance `apart` while there is room. A target that finds no such place takes the
-point farthest from the earlier targets, so all of them are placed.
+point farthest from the earlier targets, so all targets are placed.
 """
 
 import math
@@ -13,7 +13,7 @@ from swarmjax.task.layouts.site import MARGIN_UNITS, ArenaLayout, Demand, Drawn,
 from swarmjax.task.placement import Gap, place, score_things
 
 Array = Any
-_LATTICE = 40  # points along a side: 3 cm apart in an arena of 1.2 m
+_LATTICE = 40  # points along a side; they are 3 cm apart in an arena of 1.2 m
 _FILLING = 0.5  # largest share of the area for discs as wide as `apart`; random discs jam at 0.547
 
 

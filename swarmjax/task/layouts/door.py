@@ -22,7 +22,7 @@ from swarmjax.task.placement import place, score_things
 
 Array = Any
 _ASIDE = 0.1  # largest offset of the wall from the middle, as a share of half the arena
-_JAMB = 0.10  # m, of wall on either side of the door
+_JAMB = 0.10  # m, least length of wall on either side of the door
 
 
 def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
@@ -82,7 +82,7 @@ def _hall(site: Site, where: Array, side: int, shifts: Array, xp: Any) -> tuple[
 def _least(demand: Demand) -> tuple[float, float]:
     gap, apart = demand.numbers["gap"][1], demand.numbers["apart"][1]
     breadth = gap + 2 * _JAMB
-    # A square of 0.15 m for each start and each target, and free space near the door.
+    # This area has a square of 0.15 m for each start and each target, and free space near the door.
     area = demand.robots * 2 * 0.15**2 + 3.2 * apart**2
     return max(2 * (apart + 0.15), area / max(demand.breadth, breadth)) / (1 - _ASIDE), breadth
 

@@ -1,4 +1,4 @@
-"""Draws levels of layouts: draws numbers, lays the arena out, turns it and converts to metres."""
+"""Draws levels of layouts: draws numbers, lays out an arena, turns it, converts it to metres."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -70,7 +70,7 @@ class Kind(NamedTuple):
     Attributes:
       name: name in `LAYOUTS`.
       cells: number of cells along a side of a maze; 0 for other layouts.
-      narrow: whether there are bars, so that an arena may be narrower than it is long.
+      narrow: whether an arena may be narrower than it is long, with bars of wall beside it.
     """
 
     name: str
@@ -111,7 +111,7 @@ def uniform_count(kind: Kind, robots: int) -> int:
 
 
 def before_own(robots: int) -> int:
-    """Returns how many uniform numbers precede the layout's: lengths, the turn and headings."""
+    """Returns how many uniform numbers precede the layout's own: lengths, the turn and headings."""
     return LENGTHS + 1 + robots
 
 
@@ -122,7 +122,7 @@ def draw(
 
     Args:
       kind: the compiled part.
-      of: the layout's numbers in one stage, with fields [...].
+      of: numbers of the layout in one stage, in fields [...].
       uniforms: [uniform_count(kind, R)] float32 in [0, 1), or more; the only source of randomness.
       present: [R] whether the robot is present.
       sizes: sizes of robots and targets.

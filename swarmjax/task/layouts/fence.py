@@ -22,7 +22,7 @@ from swarmjax.task.placement import score_rectangles
 
 Array = Any
 _ASIDE = 0.1  # largest offset of the fence from the middle, as a share of half the arena
-_LEAST_WAY = 0.10  # m, around the end: a hull of 0.045 m and half a centimetre on either side
+_LEAST_WAY = 0.10  # m, around the end: a hull (radius 0.045 m), half a centimetre on either side
 
 
 def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
@@ -34,8 +34,8 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      The layout, with starts on one side and targets on the other. None of them lies in the way
-      around the end.
+      The layout, with starts on one side and targets on the other. No start or target lies in the
+      way around the end.
     """
     count = site.present.shape[0]
     place, shifts, targets, starts = split(uniforms, [1, 4, count, count])
@@ -51,7 +51,8 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     behind = points((far, low), (half_x - site.clear, high), shifts[2:], xp)
     way_y, way_half = between(-half_y, end)
     way = rows(((where, way_y, thin, way_half),), xp)
-    # Leaves room for a robot that parks on this side of its target, and for another that passes.
+    # This leaves room for a robot that parks on this side of its target, and for a robot that
+    # passes.
     free = score_rectangles(behind, way, np.ones(1, bool), site.reach + 3 * site.hull, xp)
     target = place_targets(site, behind, free, targets, site.present, xp)
     start = place_starts(site, before, target, starts, site.present, xp)
@@ -60,7 +61,7 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
 
 
 def _least(demand: Demand) -> tuple[float, float]:
-    # Room for a row of starts on one side, a row of targets on the other, and the fence.
+    # This is room for a row of starts on one side, a row of targets on the other, and the fence.
     side = 2 * 0.15 * (1 + demand.robots // 5) / (1 - _ASIDE) + THICKNESS / 4096
     return side, demand.numbers["length"][1] + _LEAST_WAY
 

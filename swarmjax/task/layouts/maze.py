@@ -19,7 +19,7 @@ from swarmjax.task.layouts.site import (
 )
 
 Array = Any
-_PASSAGE = 0.20  # m, least free width: a robot can pass another that parks in the middle
+_PASSAGE = 0.20  # m, least free width: one robot can pass another that parks in the middle
 
 
 def edges(cells: int) -> np.ndarray:
@@ -55,13 +55,14 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     edge = 2 * site.half[0] // cells
     corner = -site.half[0]
     chosen = xp.argsort(rooms, stable=True)[: 2 * count].astype(xp.int32)
-    if cells * cells < 2 * count:  # the program has more robots than the maze has room for
+    if cells * cells < 2 * count:  # a program may have more robots than fit into a maze
         lacking = xp.zeros(2 * count - cells * cells, xp.int32)
         chosen = xp.concatenate([chosen, lacking])
     centre = xp.stack([chosen % cells, chosen // cells], axis=-1) * edge + corner + edge // 2
     most = xp.maximum(edge // 2 - THICKNESS // 2 - site.clear, 0)
     place = centre + pick(aside.reshape(2 * count, 2), -most, most, xp)
-    # Interleaved, so that a robot's cells do not depend on the number of robots compiled in.
+    # Starts and targets alternate, so that a robot's cells do not depend on the compiled number of
+    # robots.
     return Drawn(_walls(pairs, cells, edge, corner, xp), ~open_, place[0::2], place[1::2])
 
 
@@ -83,7 +84,7 @@ def _tree(pairs: np.ndarray, order: Array, xp: Any) -> Array:
 def _braid(pairs: np.ndarray, open_: Array, order: Array, cells: int, xp: Any) -> Array:
     """Opens one more edge [E] of each cell that has only one open edge.
 
-    It prefers an edge that leads to another such cell, so that most walls remain.
+    An edge that leads to another such cell is preferred, so that most walls remain.
     """
     touches = np.arange(cells * cells)[:, None, None] == pairs  # [C, E, 2]
     for cell in range(cells * cells):

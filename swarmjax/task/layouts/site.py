@@ -1,4 +1,4 @@
-"""Shared parts of layouts: the arena that they are drawn in, walls, and areas for robots."""
+"""Shared parts of layouts: arenas, walls, and areas for robots."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +15,7 @@ LATTICE = 24  # points along each edge of an area
 
 
 class Numbers(NamedTuple):
-    """Lengths of a layout, [] int32 units each; a layout reads only some of them.
+    """Lengths of a layout, each [] int32 in units; a layout reads only some of them.
 
     Attributes:
       gap: free width of a door or a corridor.
@@ -97,12 +97,12 @@ class ArenaLayout(NamedTuple):
 
     Attributes:
       draw: draws the layout from uniform numbers [K] in [0, 1), a site and the array module.
-      parts: takes a number of robots and cells, and returns the parts of the layout's uniform
-        numbers in order: what a part places, and its length. A mutation may change single numbers
-        of `wall`, `room`, `target` and `start`. The other parts are `area` (shift of a lattice's
-        points) and `aside` (offset from the middle of a way).
-      walls: returns the largest number of walls for a number of cells (of a maze).
-      reads: the `NUMBERS` of a stage that the layout uses.
+      parts: takes a number of robots and cells, and returns in order the parts of the layout's
+        uniform numbers. For each part, it returns what the part places, and its length. A mutation
+        may change single numbers of `wall`, `room`, `target` and `start`. The other parts are
+        `area` (shift of a lattice's points) and `aside` (offset from the middle of a way).
+      walls: takes a number of cells (of a maze), and returns the largest number of walls.
+      reads: those `NUMBERS` of a stage that the layout uses.
       least: returns the smallest side and breadth with room for a demand, m.
       most_robots: largest number of robots, however large the arena.
       square: whether the arena must be square.
@@ -186,7 +186,7 @@ def place_starts(
 
 
 def beyond(passage: int) -> Gap:
-    """Returns a distance that is kept even where there is little room."""
+    """Returns a least distance that is also kept where there is little room."""
     return Gap(passage, passage)
 
 

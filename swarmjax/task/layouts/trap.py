@@ -20,8 +20,8 @@ from swarmjax.task.layouts.site import (
 )
 
 Array = Any
-_ROOM = 0.20  # m, before the mouth and behind the trap: one start or target, with some choice
-_WAY = 0.14  # m, beside the trap: a hull of 0.045 m with 2 cm on either side, and 1 cm more
+_ROOM = 0.20  # m, before the mouth and behind the trap: one start or target, and spare space
+_WAY = 0.14  # m, beside the trap: a hull (radius 0.045 m), 2 cm on either side, and 1 cm more
 
 
 def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
