@@ -3,9 +3,10 @@
 `python -m benchmarks.adapters_speed [who=bare,gymnasium,...] [stage=s1] [arenas=256] [steps=200]`
 prints a JSON line for each adapter. It times five calls of `steps` control steps each, after one
 warm-up call, with all robots driving straight ahead. `compile_s` is the first call minus the median
-of the others. `pettingzoo` steps one arena, from the host. `jaxmarl` and `playground` map one arena
-over `arenas`. Adapters on the device take all steps with `scan`; all others take them one by one on
-the host. An adapter whose library is missing is left out, and the reason is printed.
+of the others. `pettingzoo` steps one arena, from the host. `jaxmarl` and `playground` map the step
+of one arena over `arenas` arenas. Adapters that run on the device take all steps in one `scan`. The
+others take one step after the other on the host. An adapter whose library is missing is left out,
+and the reason is printed.
 """
 
 import statistics
@@ -134,7 +135,7 @@ def brax(given: AdapterSpeedConfig) -> Call:
 
 
 def playground(given: AdapterSpeedConfig) -> Call:
-    """Steps one arena, mapped over `arenas`, without Playground's wrappers."""
+    """Maps the step of one arena over `arenas` arenas, without Playground's wrappers."""
     adapter = peers.find("swarmjax.adapters.playground", "the extra playground")
     env = adapter.SwarmMjxEnv(swarmjax.make_env(given.stage, arenas=1))
     keys = jax.random.split(jax.random.PRNGKey(0), given.arenas)

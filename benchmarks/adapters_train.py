@@ -4,8 +4,8 @@
 trains `s1` with the PPO of Brax, of Stable-Baselines3 or of examples/torch_ppo.py until 0.9 of the
 targets are reached, and prints a JSON line. The seconds in this line are training time without
 compiling. Brax's evaluator judges the policy's mean action on one episode of each robot. For the
-other two libraries the share is that of the last 200 robots of training, while the policy explores.
-The command needs the extra with the library's name.
+other two libraries the share is measured over the last 200 robots of training, while the policy
+still explores. The command needs the extra with the library's name.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ class AdapterTrainConfig(Section):
 
 
 class _Reached(Exception):  # noqa: N818  # not an error: training is over
-    """The share of targets was reached."""
+    """Raised when the share of targets is reached."""
 
 
 def train_brax(given: AdapterTrainConfig) -> tuple[float, int, float]:
@@ -83,7 +83,7 @@ def train_brax(given: AdapterTrainConfig) -> tuple[float, int, float]:
             seed=given.seed,
         )
     share, steps, _ = curve[-1]
-    # The first calls compile, so they are counted with the median time of the others.
+    # The first calls also compile, so each of them is counted with the median time of the others.
     calls = np.diff([seconds for *_, seconds in curve])
     calls[:2] = np.median(calls[2:]) if len(calls) > 2 else calls.min()
     return share, steps, float(calls.sum())
@@ -98,7 +98,7 @@ def train_sb3(given: AdapterTrainConfig) -> tuple[float, int, float]:
     env.reset()
     env.step(np.zeros((env.num_envs, 2), np.float32))
     recent: list[bool] = []
-    peers.find("torch", "the extra sb3").set_num_threads(1)  # more threads are slower, beside JAX's
+    peers.find("torch", "the extra sb3").set_num_threads(1)  # more are slower next to JAX's
 
     def look(values: dict[str, Any], _: Any) -> bool:
         ended = [info for info in values["infos"] if info]

@@ -1,8 +1,8 @@
 """How long does a sum over devices take?
 
 `python -m benchmarks.all_reduce devices=N [sizes=1,1024,16384,1048576]` sums float32 arrays over
-the first N devices. One program runs many sums in sequence. It prints a JSON line for each size:
-microseconds per sum, the median of `REPEATS` calls.
+the first N devices. One program runs many sums in sequence. For each size a JSON line is printed
+with the microseconds per sum, as the median of `REPEATS` calls.
 """
 
 import json
@@ -43,7 +43,7 @@ def seconds(devices: int, size: int) -> float:
 
     Args:
       devices: number of devices.
-      size: numbers in the array.
+      size: how many numbers the array has.
 
     Returns:
       Seconds per sum.

@@ -43,14 +43,14 @@ POLICIES = {
     "still": ((-1.0, 0.0), (0.0, 0.0), (0.0, 0.0)),
 }
 NAMES = (*POLICIES, "bug2", *planners.SETTINGS)
-BATCH = 32  # arenas at once per process; with 40 robots on 4 x 4 m their paths fill 0.2 GB
+BATCH = 32  # arenas that a process runs at once; with 40 robots on 4 x 4 m their paths fill 0.2 GB
 _FIXED = (
     "policy",
     "compare",
     "engine",
     "action",
     "out",
-)  # keys of `evaluate` without meaning here
+)  # keys of `evaluate` that mean nothing here
 
 
 @dataclass(frozen=True, kw_only=True)

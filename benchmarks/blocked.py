@@ -1,12 +1,12 @@
 """How far does a robot turn while a wall blocks it and its wheels slip?
 
 `python -m benchmarks.blocked` presses one robot against a wall for `SECONDS` at constant wheel
-speeds, and prints a JSON line for each start and body: how far it turned and slid.
+speeds, and prints a JSON line for each start and body, with how far the robot turned and slid.
 
-It runs MuJoCo C with both bodies, and a reference integrated by hand: a rigid disc on two wheels
-with Coulomb friction, against a frictionless wall. In the reference both wheels push forward with
-all their grip at any speed, so no grip is left to turn the robot. A body that turns freely while
-blocked is therefore wrong.
+It runs both bodies in MuJoCo C, and also integrates a reference by hand. The reference is a rigid
+disc on two wheels with Coulomb friction, against a frictionless wall. In the reference both wheels
+push forward with all their grip at any speed, so no grip is left to turn the robot. A body that
+turns freely while blocked is therefore wrong.
 """
 
 import json
@@ -31,7 +31,7 @@ STARTS = (
     (6.28, 3.0, 0.2),
     (6.28, 0.7, 0.0),
 )
-# Bodies and physics steps (s), as used in training and by the judge, and finer steps.
+# Bodies with their physics steps (s): those of training and of the judge, and finer ones.
 TIMESTEPS: tuple[tuple[Literal["planar", "wheeled"], float], ...] = (
     ("planar", 0.032),
     ("wheeled", 0.016),
@@ -39,13 +39,13 @@ TIMESTEPS: tuple[tuple[Literal["planar", "wheeled"], float], ...] = (
     ("wheeled", 0.002),
     ("wheeled", 0.0005),
 )
-_STEP = 2e-5  # s; step of the reference; 1e-5 changes its angles by less than 0.01 rad
+_STEP = 2e-5  # s; step of the reference; a step of 1e-5 changes the angles by less than 0.01 rad
 _SHARP = 1e-3  # m/s; for slower slip the reference's friction is proportional to the slip
 _WALL = 4e3, 64.0  # N/m, N s/m: the wall yields by 0.4 mm under the robot's push
 
 
 class _Rigid(NamedTuple):
-    """A planar disc: x, y (m), yaw (rad), their rates, traction [2, 2] of the wheels (N)."""
+    """A planar disc: x, y (m) and yaw (rad), their rates, and the wheels' traction [2, 2] (N)."""
 
     pose: np.ndarray
     rate: np.ndarray

@@ -1,9 +1,9 @@
 """Implements Bug2 (Lumelsky & Stepanov 1987) from a robot's ten observations and its commands.
 
 "Path-planning strategies for a point mobile automaton moving amidst unknown obstacles of arbitrary
-shape", Algorithmica 2, section 4: drive along the line from the start to the target. At an obstacle
-follow its outline on one side. When the robot meets the line closer to the target than where it
-left the line, it continues along the line.
+shape", Algorithmica 2, section 4. A robot drives along the line from the start to the target. At an
+obstacle it follows the outline on one side. When the robot meets the line closer to the target than
+where it left the line, it continues along the line.
 
 A point automaton knows its position. Here a robot integrates its own commands to a heading. The
 heading, distance and bearing of the target give its position.
@@ -22,8 +22,8 @@ The paper's obstacles stand still, but robots are obstacles that move. Three rul
 3. If a robot makes no progress for `STUCK` seconds, in front of another robot or between two, it
    does the same as after a full round. This ends most deadlocks, but not all.
 
-A contact turns a robot without its commands showing it. Its line is then off by this angle until a
-new line starts.
+A contact turns a robot, but the robot's commands do not show this. The line is then off by the
+angle of this turn until a new line starts.
 """
 
 import math
@@ -39,14 +39,14 @@ from swarmjax.sim import drive as sim_drive
 from swarmjax.sim.drive import Drive
 from swarmjax.task import observation
 
-# Columns of an observation with the wall on the left, and on the right. First come the rays on that
-# side: near the nose, diagonal, beside, behind. Then come the first three on the other side.
+# Columns of an observation with the wall on the left, and on the right. First come the rays on the
+# wall's side: near the nose, diagonal, beside, behind. Then come the first three on the other side.
 _LEFT, _RIGHT = (7, 6, 5, 4, 0, 1, 2), (0, 1, 2, 3, 7, 6, 5)
 _TARGET = tuple(observation.NAMES.index(name) for name in ("target_distance", "target_bearing"))
 
 
 class Senses(NamedTuple):
-    """A robot's observation, [...] each, with ray lengths in m.
+    """A robot's observation; each part is [...], and ray lengths are in m.
 
     Attributes:
       nose, diagonal, beside, behind: rays on the side of the wall, from front to back.
@@ -67,7 +67,7 @@ class Senses(NamedTuple):
 
 
 class BugMemory(NamedTuple):
-    """A robot's memory, [...] each.
+    """A robot's memory; each part is [...] if no other shape is given.
 
     Attributes:
       heading: angle from the direction of the line, rad.
@@ -78,7 +78,8 @@ class BugMemory(NamedTuple):
       gap: distance to the outline beside the robot one control step ago, m.
       lost: distance driven since the outline was last sensed, m.
       way: distance driven since the robot left the line, m.
-      mark: [..., 3] a pose on the outline (m, m, rad) that shows when the robot has gone round it.
+      mark: [..., 3] a pose on the outline (m, m, rad) that shows when the robot has gone round the
+        outline.
       marked: value of `way` at the mark.
       anchor: [..., 2] position near which the robot has recently been, m.
       waited: how long the robot has been near the anchor, s.
@@ -116,13 +117,13 @@ class BugBody(NamedTuple):
     control_step: float
 
 
-# Lengths in m. They were chosen on benchmarks/maps, fence2, and levels of s6 and crowd_dense with
-# seed 7.
+# Lengths in m. These values were chosen on benchmarks/maps, fence2, and levels of s6 and
+# crowd_dense with seed 7.
 GAP = 0.012  # between hull and outline
 AHEAD = 0.025  # a shorter ray near the nose blocks the way; a wall is then 0.017 m before the hull
 ASIDE = 0.0167  # the hull would hit the end of this diagonal ray: 0.025 + 0.717 * 0.0167 = 0.037
-NEARER = 0.03  # the robot returns to the line if this much closer to the target than when it left
-ROUND = 0.03  # back at the mark: within this distance and within a right angle of its heading
+NEARER = 0.03  # a robot this much closer to the target than when it left the line returns to it
+ROUND = 0.03  # how near the mark counts as back; the heading may differ by a right angle
 LOST = 0.33  # a full circle of the arc that seeks the outline: 2 pi (0.037 + 0.012) = 0.31
 STILL, STUCK = 0.02, 3.0  # m, s: no progress
 SPEED, CORNER_SPEED = 0.11, 0.08  # m/s, along an outline and round its corners
@@ -261,7 +262,7 @@ def _follow(memory: BugMemory, senses: Senses, gap: np.ndarray, body: BugBody) -
     other = senses.other_beside - (senses.beside - gap)
     wanted = np.minimum(GAP, 0.5 * (gap + other))
     turn = BY_ANGLE * _angle(memory, senses, gap, body) + BY_GAP * (gap - wanted)
-    # With the diagonal ray alone: compares its length with that along a wall at the desired gap.
+    # With the diagonal ray alone, its length is compared with that along a wall at the desired gap.
     _, y, yaw = epuck.SENSOR_POSES[6]
     expected = (body.hull_radius + GAP - y) / math.sin(yaw)
     turn = np.where(senses.beside < near, turn, BY_GAP * (senses.diagonal - expected))

@@ -3,9 +3,9 @@
 `python -m benchmarks.checkpoint_price [every=S] [seconds=S] [key=value ...]` compiles the program
 of a config once. It then trains alternately with a checkpoint every `every` seconds, and without.
 All other keys are keys of `swarmjax.train`. It prints a JSON line with the arena control steps per
-second of both, and the share of the speed that checkpoints take: the median over `PAIRS` pairs with
-a 95 % interval by order statistics. `price_at_60_s` is the same share, converted to one checkpoint
-a minute; each checkpoint costs the same time.
+second of both, and with the share of the speed that checkpoints take. All are medians over `PAIRS`
+pairs, and the share has a 95 % interval by order statistics. `price_at_60_s` is the same share,
+converted to one checkpoint a minute, since each checkpoint costs the same time.
 """
 
 import json

@@ -1,15 +1,15 @@
 """How many seconds after the command does a swarm reach its targets, and how good is it then?
 
 `python -m benchmarks.command_to_success seed=0,1,2 [stop_at=0.95] [key=value ...]` takes the keys
-of `swarmjax.train` and runs that command once per seed, in its own process, with the caches that
-exist. The run is asked to stop as soon as its last stage has a measured success of `stop_at` of the
-targets, over a whole cohort of training episodes. The saved policy is then judged in MuJoCo C on
-the wheeled body.
+of `swarmjax.train` and runs `swarmjax.train` once per seed, each time in its own process and with
+the caches that exist. The run is asked to stop as soon as robots on its last stage reach at least
+`stop_at` of the targets over a whole cohort of training episodes. The saved policy is then judged
+in MuJoCo C on the wheeled body.
 
-It prints a JSON line for each seed: the seconds from the command, including compilation, until 0.90
-and 0.95 were measured and until the policy was saved, and the judged share of targets.
-`benchmarks.time_to_success` measures the same for a finished run, without the time before its first
-update.
+It prints a JSON line for each seed. The line has the judged share of targets, and the seconds from
+the command until 0.90 and 0.95 were measured and until the policy was saved. These seconds include
+compilation. `benchmarks.time_to_success` measures the same for a finished run, without the time
+before its first update.
 """
 
 import sys

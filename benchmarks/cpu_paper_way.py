@@ -133,7 +133,7 @@ def cycle(arena: MujocoArena, robots: Sequence[Robot], steps: int, epochs: int) 
       arena: one arena.
       robots: the arena's robots; an arrived robot waits and stores nothing.
       steps: number of control steps.
-      epochs: steps of each optimiser.
+      epochs: how many steps each optimiser takes.
     """
     seen, drives = arena.reset(), list(robots)
     for _ in range(steps):

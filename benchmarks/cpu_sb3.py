@@ -2,7 +2,7 @@
 
 `python -m benchmarks.cpu_sb3 [arenas=16] [workers=2] [seconds=30] [key=value ...]` takes the keys
 of `swarmjax.evaluate` and needs `torch-peers.txt`. Every robot is one environment of
-Stable-Baselines3, all robots share its policy, and `workers` processes simulate the arenas.
+Stable-Baselines3. All robots share one policy, and `workers` processes simulate the arenas.
 Networks, batch per robot, epochs, minibatches, discount and clip are those of `algo=ppo`.
 Observations are not normalised. Stable-Baselines3 has no mask, so an arrived robot waits in the
 batch with reward 0 until its arena is over. Iterations of rollout and update are timed until
@@ -52,7 +52,8 @@ def serve(pipe: Connection, judged: EvaluateConfig, numbers: Sequence[int]) -> N
 
     Args:
       pipe: receives actions [A R, 2]; the first message has no action. It sends observation
-        [A R, O], reward, done, truncated [A R] and, where done, the observation before the reset.
+        [A R, O], reward, done, truncated [A R] and, for robots that are done, the observation
+        before the reset.
       judged: settings of the arenas.
       numbers: [A] numbers of the arenas.
     """
@@ -105,7 +106,7 @@ class Workers:
             pipe.send(part)
 
     def receive(self) -> list[np.ndarray]:
-        """Receives the results of `_step` for all robots, except which robots wait."""
+        """Receives the results of `_step` for all robots, without the list of waiting robots."""
         found = [pipe.recv() for pipe in self._pipes]
         return [np.concatenate([each[i] for each in found]) for i in range(5)]
 

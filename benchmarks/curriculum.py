@@ -1,14 +1,16 @@
-"""Where does a curriculum help? Compares its modes with training on the goal alone at equal steps.
+"""Where does a curriculum help?
+
+Each mode of the curriculum is compared with training on the goal alone, at equal steps.
 
 `python -m benchmarks.curriculum goal=s6 arms=final,sequential,mixed,adaptive [key=value ...]` takes
 the keys of `curriculum_arms.StudyConfig` and of `swarmjax.train`, except `stage`, `algo.policy` and
 `curriculum.mode`, which the arms set. `seeds` is 10 by default.
 
-Each arm trains all its seeds in one program. It stops at points that are evenly spaced over the
-logarithm of the arena steps, and judges the policies of every seed on the device. All arms are
-judged on the same levels of three stages: the goal, the 1.5 m arena that no arm trains on (with 5
-robots compiled in), and the first stage of the goal's curriculum, even for an arm that has not
-trained on it. It prints a JSON line for each arm and policy as soon as it is done.
+Each arm trains all its seeds in one program. Training stops at points that are evenly spaced over
+the logarithm of the arena steps, and the policies of every seed are judged on the device. All arms
+are judged on the same levels of three stages: the goal, the 1.5 m arena (with 5 robots compiled
+in), and the first stage of the goal's curriculum. No arm trains on the 1.5 m arena, and some arms
+do not train on the first stage. As soon as an arm is done with a policy, a JSON line is printed.
 `benchmarks.curriculum_table` makes tables and plots from the lines.
 
 The baseline `final` trains on the goal alone. To compare options of one mode, run one arm at a time
@@ -56,7 +58,7 @@ def load_judge(study: StudyConfig, trained: TrainConfig, judged: dict[str, Stage
       judged: the stages, by role.
 
     Returns:
-      A function that takes learners [N, L] and returns, by role, each of the `Outcomes` as its mean
+      A function that takes learners [N, L]. For each role it returns the `Outcomes`, each as a mean
       [N] over the levels.
     """
     stages, arenas = tuple(judged.values()), len(judged) * study.levels
@@ -90,11 +92,11 @@ class Curves:
 
     Attributes:
       judged: [N, P] results by role and measure.
-      transitions: [N, P] robot steps that each seed has trained on by then.
+      transitions: [N, P] robot steps that each seed has trained on up to the point.
       stage: [N, P] index of the newest stage.
       mix: [P, S] share of the arenas on each stage, over all seeds.
       broken_arenas: training episodes that ended because the physics broke, over all seeds.
-      train_s: [P] seconds of training by then, without compiling and judging.
+      train_s: [P] seconds of training up to the point, without compiling and judging.
       judge_s: seconds of judging.
       compile_s: seconds of compiling the training.
       judge_compile_s: seconds of a first judging, including its compilation.
@@ -167,7 +169,7 @@ def _timed[T](call: Callable[[], T]) -> tuple[float, T]:
 def _train(
     program: Program, call: Callable[..., Any], state: TrainState, n: int
 ) -> tuple[TrainState, dict[str, Any]]:
-    """Trains all seeds for n updates, in calls of at most the program's report interval."""
+    """Trains all seeds for n updates, in calls no longer than the program's report interval."""
     transitions, broken, metrics, last = 0, 0, {}, 0
     for done in range(0, n, program.rows):
         last = min(program.rows, n - done)

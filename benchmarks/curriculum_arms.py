@@ -101,7 +101,7 @@ def load_arm(study: StudyConfig, arm: str, policy: str, words: Sequence[str]) ->
 
 
 def points(study: StudyConfig, trained: TrainConfig) -> np.ndarray:
-    """Computes the updates [P] after which arms are judged, evenly spaced in the logarithm.
+    """Computes the updates [P] after which arms are judged, evenly spaced in their logarithm.
 
     Args:
       study: the study.

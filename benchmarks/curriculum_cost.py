@@ -2,9 +2,10 @@
 
 `python -m benchmarks.curriculum_cost [key=value ...]` takes the keys of `swarmjax.train` and trains
 pairs of programs alternately: one stage alone, and a curriculum of `COPIES` copies of that stage in
-each mode. Both simulate the same mix and differ only in the curriculum's engine. It prints a JSON
-line for each mode: the median ratio of its speed to that of the single stage, and the 95 % interval
-of this median by order statistics, which assumes no distribution.
+each mode. Both simulate the same mix and differ only in the curriculum's engine. For each mode a
+JSON line is printed. The line has the median ratio of the mode's speed to the speed of the single
+stage, and the 95 % interval of this median. The interval is by order statistics, which assumes no
+distribution.
 """
 
 import json

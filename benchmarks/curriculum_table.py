@@ -58,7 +58,7 @@ class Key(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """The results of each seed of an arm, [N] each.
+    """The results of an arm; each has one value per seed, [N].
 
     Attributes:
       goal: final share on the goal.
@@ -289,7 +289,7 @@ def _are_curves(steps: Any, curves: Any) -> bool:
         if {at.dtype.kind, values.dtype.kind} <= {"i", "f"} and values.ndim == 2:
             area_under(at, values)
             return bool(at[0] > 0)
-    except ValueError:  # from ragged lists, or from the statistics
+    except ValueError:  # raised for ragged lists, or by the statistics
         return False
     return False
 

@@ -34,7 +34,7 @@ EXPECTED_MAX = {1: 0.0, 2: 0.564, 8: 1.424, 64: 2.34, 512: 3.05}
 # program has.
 REDUCES = 13
 _HOST = 8  # devices per host
-_HOP_US = 15.0  # added to a sum by each doubling of hosts; assumed, not measured
+_HOP_US = 15.0  # each doubling of hosts adds this to a sum; assumed, not measured
 _ROLLOUT = 32  # control steps per update, the default
 _MESSAGE = 65_536  # bytes: networks of 40 kB, rounded up to a size that was timed
 

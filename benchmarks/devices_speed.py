@@ -3,9 +3,9 @@
 `python -m benchmarks.devices_speed devices=N [scaling=weak|strong] [key=value ...]` takes the keys
 of `swarmjax.train` and trains alternately on one device and on N. `scaling=weak` gives each device
 `arenas` arenas. `scaling=strong` spreads `arenas` over all devices. It prints a JSON line with the
-arena steps per second of both, their ratio, and `efficiency`, the ratio divided by N. Each number
-is the median over `PAIRS` pairs with a 95 % interval by order statistics. Compile time is listed
-separately.
+arena steps per second of both, and with their ratio. The line's `efficiency` is this ratio divided
+by N. Each number is the median over `PAIRS` pairs with a 95 % interval by order statistics. Compile
+time is listed separately.
 
 With `run.coordinator`, `run.processes` and `run.process`, start the command once for each process.
 The first process then trains alternately on its own device and on all devices, and prints the line.

@@ -1,9 +1,9 @@
 """Do the training engine and the judge agree on a policy, level by level?
 
 `python -m benchmarks.engines policy=FILE [evaluate keys]` runs both on the same levels and prints a
-JSON line for each cell: the targets reached in each engine with their intervals, the number of
-levels with equal results, and the largest differences. Only the engine differs, not the policy, the
-levels or the length of a physics step.
+JSON line for each cell. The line has the targets reached in each engine with their intervals, the
+number of levels with equal results, and the largest differences. Only the engine differs, not the
+policy, the levels or the length of a physics step.
 """
 
 import json

@@ -1,9 +1,9 @@
 """Campaign of `benchmarks.faults` against the disk, the directory and the clock of a run.
 
-The first `SIZES` trials give a run a disk that is too small, with sizes up to one that just holds
-the run. The other trials alternate between four faults: a disk that becomes read-only, a directory
-that is removed, two processes on one directory, and a clock that is set back. Afterwards the run is
-started once more without a fault, and must end like an undisturbed run.
+In the first `SIZES` trials a run gets a small disk; the sizes go up to one that just holds the run.
+The other trials alternate between four faults: a disk that becomes read-only, a directory that is
+removed, two processes on one directory, and a clock that is set back. Afterwards the run is started
+once more without a fault, and must end like an undisturbed run.
 
 Disks are mounted in their own namespace (`unshare`, util-linux). The clock is set by `libfaketime`.
 If either is missing, the outcome of the trial is `not tried`.
@@ -35,7 +35,7 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
     """Disturbs a run, then lets it end.
 
     Args:
-      seed: Seed of the trial; its number chooses the fault.
+      seed: Seed of the trial; the seed's last six digits choose the fault.
       folder: Empty folder of the trial.
 
     Returns:

@@ -43,7 +43,7 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
     """Kills one of two processes; then lets the run end, on one device or on two.
 
     Args:
-      seed: seed for the moment, for the process that is killed and for how the run is resumed.
+      seed: chooses the moment, the process that is killed, and how the run is resumed.
       folder: an empty folder.
 
     Returns:
@@ -87,7 +87,7 @@ class Lost(NamedTuple):
 
     @property
     def is_sound(self) -> bool:
-        """Whether it ended in time, without a traceback, with the exit code for a restart."""
+        """Whether it ended in time, without a traceback, and with the exit code for a restart."""
         soon, short = self.seconds < MOST_SECONDS, "Traceback" not in self.said
         return self.code == REQUEUE and soon and short and self.updates > 0
 

@@ -264,7 +264,7 @@ def _command_line(name: str, draw: random.Random) -> list[str]:
 
 
 class _Hang(BaseException):
-    """A refusal takes too long."""
+    """Raised when a refusal takes too long."""
 
 
 @contextlib.contextmanager
@@ -342,7 +342,7 @@ def _spent() -> float:
 
 
 def _kept_in(word: str) -> str:
-    """Keeps a word from writing outside the folder, and removes characters no process can get."""
+    """Keeps a word from writing outside the folder; removes characters that no process can get."""
     key, equals, value = word.partition("=")
     if value.strip("'\"").startswith(("/", "..")):
         value = "elsewhere"

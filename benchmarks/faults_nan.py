@@ -2,8 +2,8 @@
 
 A trial trains a small run, puts NaN or an infinity somewhere before a random update, and continues
 training. There are three outcomes. `went on`: training continued. `goes back`: no more steps were
-taken, so the run returns to its checkpoint. `WRONG`: a non-finite number was learned, or an arena
-changed that was not touched.
+taken, so the run returns to its checkpoint. `WRONG`: a non-finite number was learned, or an
+untouched arena changed.
 """
 
 import functools

@@ -1,8 +1,8 @@
 """Damages policy files and lets both readers read them: what does each accept, and at what cost?
 
-NumPy also reads each accepted file, and a separate function computes the file's digest. If this is
-not the digest in the file, the outcome is WRONG. Memory is the peak that Python and NumPy allocate
-while a reader works.
+NumPy also reads each accepted file, and a separate function computes the file's digest. If this
+digest differs from the one in the file, the outcome is WRONG. Memory is the peak that Python and
+NumPy allocate while a reader works.
 """
 
 import hashlib
@@ -213,7 +213,7 @@ def _foreign_digest(content: bytes, draw: random.Random) -> bytes:
 
 
 def _other_array(content: bytes, draw: random.Random) -> bytes:
-    """Replaces an array with another one, with a correct digest."""
+    """Replaces an array with another one, and corrects the digest."""
     arrays = _arrays(content)
     name = draw.choice(sorted(arrays.keys() - {"digest", "meta"}))
     array = arrays[name]

@@ -1,13 +1,14 @@
 """How realistic is the simulated robot? Compares it with numbers of the real or Webots robot.
 
 `python -m benchmarks.fidelity [out=FILE] [docs=DIR]` measures both bodies in MuJoCo's C engine and
-prints one table. `out` writes JSON lines: a head with versions and commit, then one for each row.
-`docs` writes the table into DIR/robot.md, between its two markers, and plots into DIR/figures.
+prints one table. `out` writes JSON lines: first a line with versions and commit, then a line for
+each row. `docs` writes the table into DIR/robot.md, between its two markers, and plots into
+DIR/figures.
 
 Our numbers are read from the compiled model or from the robot's motion. The reference numbers are
-written here a second time with their source, since a number that both sides took from the same line
-would prove nothing. Where a source differs from Webots' own numbers, the error shows the spread
-between sources.
+written here a second time, each with its source. If both sides took a number from the same line,
+the comparison would prove nothing. Where a source differs from Webots' own numbers, the error shows
+the spread between sources.
 """
 
 import itertools

@@ -48,7 +48,7 @@ def centre(bench: Rig) -> np.ndarray:
 
 
 def cast(bench: Rig, origin: ArrayLike, direction: ArrayLike) -> float:
-    """Casts a ray and returns its length, m; it may hit the robot itself; -1 if it hits nothing."""
+    """Casts a ray, which may hit the robot itself; returns its length, m; -1 if nothing is hit."""
     start, toward = np.array(origin, float), np.array(direction, float)
     met = np.zeros(1, np.int32)
     return mujoco.mj_ray(bench.model, rig.place(bench), start, toward, rig.SEEN, True, -1, met)

@@ -43,8 +43,9 @@ SPIN_UP = 3.14 * 1.0564e-4 / (0.16 * 9.81 * 0.026)  # s; time to a turn rate: w 
 FINE = 0.0005  # s; a physics step that resolves a start of 8 to 21 ms
 REVOLUTIONS = 10
 TRACKS = 0.052, 0.057  # m
-# Command (m/s, rad/s), and the motion that it results in with wheels of 0.02 m, 0.052 m apart, and
-# a limit of 6.28 rad/s: left = (v - 0.026 w) / 0.02 and right = (v + 0.026 w) / 0.02, each clipped.
+# Command (m/s, rad/s), and the resulting motion with wheels of 0.02 m that are 0.052 m apart and
+# have a limit of 6.28 rad/s. Here left = (v - 0.026 w) / 0.02 and right = (v + 0.026 w) / 0.02, and
+# both are clipped.
 COMMANDS = (
     ((0.0, 3.14), (0.0, 3.14)),
     ((0.0625, 3.14), (0.05323, 2.78346)),

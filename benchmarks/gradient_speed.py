@@ -2,9 +2,9 @@
 
 `python -m benchmarks.gradient_speed [batch=N,N] [tile=N,N] [programs=N,N] [warps=N,N] [key=value
 ...]` also takes the keys of `swarmjax.train`, of which only `algo.*` have an effect. For each batch
-it compiles autodiff and every launch of the kernels, times them alternately, and prints a JSON line
-for each: seconds per gradient, and the difference from autodiff's gradient at the same and at full
-precision.
+it compiles autodiff and every launch of the kernels, and times them alternately. For each of them
+it prints a JSON line with the seconds per gradient and the difference from autodiff's gradient at
+the same and at full precision.
 
 The time of a kernel gradient includes converting the networks to vectors and back, which learners
 do only once per update. With `algo.memory=gru` the samples are sequences as long as a rollout. With

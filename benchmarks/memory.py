@@ -1,9 +1,9 @@
 """How many bytes does an arena take on the GPU, and where?
 
 `python -m benchmarks.memory arenas=65536 [key=value ...]` takes the keys of `swarmjax.train`,
-trains for two updates and prints a JSON line with four numbers: the bytes in XLA's analysis of the
-compiled program, the peak of XLA's allocator, the peak of Warp's own allocator, which XLA does not
-see, and the drop in the GPU's free memory.
+trains for two updates and prints a JSON line with four numbers. They are the bytes in XLA's
+analysis of the compiled program, the peak of XLA's allocator, the peak of Warp's own allocator, and
+the drop in the GPU's free memory. XLA does not see what Warp allocates.
 
 A peak covers a whole process, so measure one size per process. Set
 XLA_PYTHON_CLIENT_PREALLOCATE=false; otherwise the last number is the memory that XLA preallocates.

@@ -33,7 +33,7 @@ class Arm:
         self.transitions = 0
 
     def time(self, updates: int) -> float:
-        """Trains for some updates and returns the seconds that took."""
+        """Trains for some updates and returns the seconds that this took."""
         began = time.perf_counter()
         self._state, metrics = self._train(self._state, np.int32(updates))
         jax.block_until_ready(metrics)
@@ -79,11 +79,12 @@ def in_turn[T](one: Callable[[], T], other: Callable[[], T], pairs: int) -> list
 
 
 def median(values: Sequence[float]) -> tuple[float, float, float]:
-    """Returns the median and an interval that contains the true median with at least 95 %.
+    """Returns the median and an interval with at least 95 % probability for the true median.
 
-    For any distribution, the number of n independent values below the true median is distributed
-    like the number of heads in n coin tosses. The interval runs from the k-th smallest to the k-th
-    largest value, with the largest k that leaves at most 2.5 % on each side.
+    Of n independent values, the number that lie below the true median is distributed like the
+    number of heads in n coin tosses. This holds for any distribution of the values. The interval
+    runs from the k-th smallest to the k-th largest value, with the largest k that leaves at most
+    2.5 % on each side.
 
     Args:
       values: at least 6 values.

@@ -1,9 +1,9 @@
 """How fast does BenchMARL train with IPPO on VMAS's navigation, in PyTorch?
 
 `python -m benchmarks.peer_benchmarl [arenas=4096] [device=cuda] ...` needs `torch-peers.txt` and
-prints a JSON line for each number of arenas: seconds of whole iterations (collecting and learning,
-without logging or evaluation), except the first two. The task, networks, rollout, epochs and
-minibatches have our settings. All other settings are BenchMARL's own.
+prints a JSON line for each number of arenas. The line has the seconds of all iterations except the
+first two. An iteration is collecting and learning, without logging or evaluation. The task,
+networks, rollout, epochs and minibatches have our settings. All other settings are BenchMARL's own.
 """
 
 import contextlib

@@ -1,8 +1,8 @@
 """How fast is CAMAR with differential drives, the most similar continuous path finder in JAX?
 
 `python -m benchmarks.peer_camar [arenas=4096,65536] ...` needs the extra `camar` and prints a JSON
-line for each number of arenas. It times calls of `steps` control steps with random actions, each
-call one compiled scan. Resets are CAMAR's own optimistic ones: each step draws one fresh map per
+line for each number of arenas. Each timed call is one compiled scan of `steps` control steps with
+random actions. Resets are CAMAR's own optimistic ones: each step draws one fresh map per
 `reset_ratio` arenas, and the arenas that end in this step share these maps.
 """
 

@@ -6,9 +6,9 @@ prints a JSON line for each number of arenas.
 JaxMARL's scripts are not in its package and have no configuration for JaxNav. This file is a
 rewrite of `baselines/IPPO/ippo_ff_mabrax.py` (commit c793d09): networks with two layers of 64, one
 policy for all robots, a clipped value loss, advantages normalised in each minibatch, and samples
-shuffled individually. Learning rate, costs and clip are from its configuration. Rollout, epochs and
-minibatches are ours, so batches have the same size. Episodes start from a pool of states, the best
-case of `benchmarks.peer_jaxnav`.
+shuffled individually. Learning rate, costs and clip are from the configuration of that file.
+Rollout, epochs and minibatches are ours, so batches have the same size. Episodes start from a pool
+of states, the best case of `benchmarks.peer_jaxnav`.
 """
 
 import sys

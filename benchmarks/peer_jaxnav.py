@@ -4,7 +4,7 @@
 prints a JSON line for each number of arenas and each way to step. `pool` uses `step_env` with a
 pool of `pool` states that were drawn beforehand (JaxNav's best case). `default` uses JaxNav's own
 `step`. This function draws a whole map for every arena and step, and discards nearly all of these
-maps. It times calls of `steps` control steps with random actions, each call one compiled scan.
+maps. Each timed call is one compiled scan of `steps` control steps with random actions.
 """
 
 import sys

@@ -22,7 +22,7 @@ TORCH = "benchmarks/torch-peers.txt"
 
 
 class MissingPeerError(Exception):
-    """A peer is not installed or cannot be imported, explained in one sentence."""
+    """Raised when a peer is not installed or cannot be imported; the reason is one sentence."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,7 @@ def find(module: str, source: str) -> Any:
 
     Args:
       module: name of the module.
-      source: where it comes from, an extra of pyproject.toml or a requirements file.
+      source: extra of pyproject.toml, or requirements file, that the peer comes from.
 
     Returns:
       The module.

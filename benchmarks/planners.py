@@ -50,7 +50,7 @@ class Scene(NamedTuple):
     Attributes:
       plan: the paths to the targets.
       behavior: [R] planners of the package.
-      segment: [4, M] line segments of the package, the outlines.
+      segment: [4, M] the outlines, as line segments of the package.
       centre: [M, 2] centres of the obstacles, m; the walls come last.
       radius: [M] radii of circles around the obstacles, m.
     """

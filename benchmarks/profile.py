@@ -2,8 +2,8 @@
 
 `python -m benchmarks.profile [top=40] [key=value ...]` takes the keys of `swarmjax.train`. It
 traces one call each of physics alone, of the environment including physics, and of training
-including both. For each call it prints a JSON line for each of the `top` kernels: microseconds per
-control step of all arenas, and the share of all kernels' time. On a GPU these are the kernels of
+including both. For each of the `top` kernels of a call it prints a JSON line, with the microseconds
+per control step of all arenas and the share of all kernels' time. On a GPU these are the kernels of
 its streams. On a CPU they are XLA's operations, summed over all threads. `busy` is the time of all
 kernels divided by the time of the call. It is above 1 if several threads or streams ran at once.
 """

@@ -94,8 +94,8 @@ def near(rows: Sequence[str]) -> tuple[list[Place], np.ndarray]:
       rows: rows of a layout.
 
     Returns:
-      The N free places, row by row, and [N, 5] numbers of the same place and of its neighbours
-      below, above, right and left, with -1 for a missing neighbour.
+      The N free places, row by row. Also [N, 5]: each place's own number and the numbers of its
+      neighbours below, above, right and left, with -1 for a missing neighbour.
     """
     place = [(r, c) for r, row in enumerate(rows) for c, x in enumerate(row) if x != maps.WALL]
     number = {each: i for i, each in enumerate(place)}

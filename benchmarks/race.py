@@ -22,8 +22,9 @@ that it learns from.
 `settings=playground` gives Brax the settings of MuJoCo Playground for its walking robots
 (`PLAYGROUND`) instead of ours. The networks stay the same.
 
-Seconds are training time alone. Brax compiles within its first two calls. These are counted with
-the median time of the others, and the rest of their time is the compile time. Judging is not timed.
+Seconds are training time alone. Brax compiles within its first two calls. Each of these two calls
+counts as the median time of the other calls, and the rest of its time as compile time. Judging is
+not timed.
 """
 
 import math

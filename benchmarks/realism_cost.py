@@ -2,9 +2,10 @@
 
 `python -m benchmarks.realism_cost [arms=real,webots,...] [key=value ...]` takes the keys of
 `swarmjax.train` and compares each program with the ideal one. It calls both alternately, `PAIRS`
-times, after a warm-up pair. It prints a JSON line for each factor: the median ratio of its time to
-the ideal one's, with an interval that assumes no distribution. With 10 pairs the interval runs from
-the second smallest to the second largest ratio and contains the true median with 97.9 %.
+times, after a warm-up pair. For each factor it prints a JSON line with the median ratio of the
+program's time to the ideal program's time, and with an interval that assumes no distribution. With
+10 pairs the interval runs from the second smallest to the second largest ratio and contains the
+true median with a probability of 97.9 %.
 """
 
 import dataclasses
@@ -48,7 +49,7 @@ def compare(ideal: Arm, arm: Arm, updates: int) -> dict[str, Any]:
     """Times two arms alternately.
 
     Returns:
-      The median ratio of the arm's seconds to the ideal one's, its interval, and both medians.
+      The median ratio of the arm's seconds to the ideal arm's, its interval, and both medians.
     """
     pairs = time_in_turn(ideal, arm, updates, PAIRS)
     ratio, low, high = median([mine / theirs for theirs, mine in pairs])

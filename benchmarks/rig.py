@@ -1,6 +1,6 @@
 """A test rig for one robot: alone in a square arena of MuJoCo's C engine, with given wheel speeds.
 
-It measures numbers of the robot. Its model is the one that training and the judge share. No code
+It measures numbers of the robot. The rig uses the model that training and the judge share. No code
 here uses the numbers that are expected.
 """
 
@@ -20,7 +20,7 @@ CONTROL_STEP = 0.032  # s; Webots basicTimeStep
 # Physics steps per control step, as in swarmjax.evaluate.
 SUBSTEPS = {"planar": 1, "wheeled": 4}
 SIDE = 2.0  # m; side of the arena, so large that walls are far unless a test needs them
-# What rays can hit; they ignore contact spheres, wheels, skids and the floor.
+# What rays can hit; rays ignore contact spheres, wheels, skids and the floor.
 SEEN = np.array([group not in (HULL_GROUP, FLOOR_GROUP) for group in range(6)], np.uint8)
 
 

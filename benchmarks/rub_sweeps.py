@@ -7,9 +7,9 @@ solves the contacts of each state with every design: with `built`, which is
 `sim/fast/rubbing_jax.py`, and with the `DESIGNS` in NumPy. All designs use float32 and get the same
 contacts.
 
-It prints a JSON line for each stage and design: the sweeps, and the error of the accelerations
-relative to `CONVERGED` plain sweeps in float64. A warp of a GPU needs as many sweeps as the slowest
-of its 32 arenas.
+For each stage and design it prints a JSON line with the sweeps, and with the error of the
+accelerations relative to `CONVERGED` plain sweeps in float64. A warp of a GPU needs as many sweeps
+as the slowest of its 32 arenas.
 """
 
 import json
@@ -36,7 +36,7 @@ from swarmjax.sim.fast.discs import TOLERANCE, DiscRobots, Discs
 STAGES = "s6", "fence", "world_fence", "world_door", "crowd", "world_crowd"
 DEFAULTS = ("robot.hull_friction=1", "arenas=512")
 STEPS, EVERY = 480, 24  # control steps per arena, and between two kept states
-CONVERGED, EXACT = 2000, 1e-13  # most float64 sweeps, and the change of forces that ends them
+CONVERGED, EXACT = 2000, 1e-13  # limit of float64 sweeps, and the change of forces that ends them
 NOISE = 0.5  # standard deviation of the actions of robots that head for their targets
 WARP = 32  # threads of a GPU that wait for each other
 
@@ -108,7 +108,7 @@ class Design(NamedTuple):
     """How to sweep, and what to do between sweeps.
 
     Attributes:
-      over: relaxation: how far a force moves, as a share of the distance to its best value.
+      over: how far a force moves (relaxation), as a share of the distance to its best value.
       since: number of sweeps before relaxation or acceleration starts.
       turns: whether every second sweep goes from the last contact to the first.
       momentum: whether forces have Nesterov's momentum, which is reset when it leads uphill.

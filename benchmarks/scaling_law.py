@@ -8,8 +8,9 @@
   point with less than one update is skipped, and its line says so.
 - `judge` tries the policies on wheels in MuJoCo C, with drawn and with mean actions. It uses the
   suite `scaling`: the cells of `headline`, and `crowd_dense`, on which no policy was trained.
-- `table` prints a JSON line for each point, cell and kind of action, with the changes, level by
-  level, from the next smaller number of arenas and of transitions.
+- `table` prints a JSON line for each point, cell and kind of action. The line has the changes from
+  the next smaller number of arenas and from the next smaller number of transitions, taken level by
+  level.
 
 All three continue from the contents of `DIR`. They may be stopped, and judging may run on another
 machine.

@@ -2,8 +2,8 @@
 
 `python -m benchmarks.seeds_speed [key=value ...]` takes the keys of `swarmjax.train` (`seeds` is 10
 by default; `arenas` is the number per seed) and trains all seeds and one seed alternately. It
-prints a JSON line with the transitions per second of both, and their ratio: the median over `PAIRS`
-pairs with a 95 % interval by order statistics.
+prints a JSON line with the transitions per second of both, and with their ratio. All are medians
+over `PAIRS` pairs, and the ratio has a 95 % interval by order statistics.
 """
 
 import json

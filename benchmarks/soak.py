@@ -2,10 +2,10 @@
 
 `python -m benchmarks.soak dir=DIR minutes=60 [key=value ...]` trains in `DIR`/run for this time and
 then asks the run to stop. It appends a sample every ten seconds to `DIR`/samples.jsonl. All other
-keys are keys of `swarmjax.train`. If the same command is given again, it resumes the run, and this
-part of the run is called another leg. `python -m benchmarks.soak dir=DIR do=table` prints a JSON
-line with the median of each leg and quantity, and its slope in percent of the median per hour, by
-Theil and Sen with a 95 % interval.
+keys are keys of `swarmjax.train`. The same command given again resumes the run. What the run does
+after one command is called a leg. `python -m benchmarks.soak dir=DIR do=table` prints a JSON line
+with the median and the slope of each quantity of each leg. The slope is in percent of the median
+per hour, by Theil and Sen, with a 95 % interval.
 
 Speed is given per second, and per second of processor time, which other processes on the machine
 affect less.
@@ -32,7 +32,7 @@ from swarmjax.exit_codes import REQUEUE
 from swarmjax.run import directory
 
 EVERY_S = 10.0  # between two samples
-WARM_UP = 0.1  # this share of a leg is left out: caches fill, and the policy learns to move
+WARM_UP = 0.1  # first share of a leg, left out since caches fill and the policy learns to move
 SAMPLES = "samples.jsonl"
 _TAIL = 65_536  # bytes at the end of the metrics, which contain the last line
 _LEVELS = ("memory_mb", "device_memory_mb", "descriptors", "threads")

@@ -32,7 +32,7 @@ class StartConfig(Section):
 
 
 def caches(folder: Path) -> dict[str, str]:
-    """Returns environment variables that put all caches, also of small programs, into a folder."""
+    """Returns environment variables that put all caches into a folder, even of small programs."""
     return {
         "JAX_COMPILATION_CACHE_DIR": str(folder / "xla"),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",

@@ -6,11 +6,11 @@ prints a JSON line for physics alone, for the environment including physics, and
 including both. Each number is the median of `timing.REPEATS` timed calls after a warm-up call.
 Compile time is listed separately.
 
-All robots of the last stage take random actions (physics and environment) or actions of the policy
-in training. Before the timing of environment and physics, the environment steps for a whole
-episode, with clocks spread over the step limit. Arenas then have all ages, and some reset in every
-timed call; `episodes_ended` counts these in the last call. Speeds are totals over all `seeds`. If a
-device runs out of memory, the line says so as `failed`.
+In physics and environment all robots of the last stage take random actions. In training they take
+the policy's actions. Before the timing of environment and physics, the environment steps for a
+whole episode, with clocks spread over the step limit. Arenas then have all ages, and some reset in
+every timed call; `episodes_ended` counts these in the last call. Speeds are totals over all
+`seeds`. If a device runs out of memory, the line says so as `failed`.
 """
 
 import json
@@ -142,7 +142,7 @@ def environment(
         keys = jax.random.split(key, program.config.algo.rollout_length)
         return jax.lax.scan(partial(body, starts=starts), arenas, keys)
 
-    began = replace(arenas, sim=unpack(arenas.sim), recall=None)  # random robots need no memory
+    began = replace(arenas, sim=unpack(arenas.sim), recall=None)  # random actions need no memory
     keys = jax.random.split(key, _rollouts(program.config))
     ended, sums = jax.lax.scan(rolled, began, keys)
     packed = jax.vmap(physics.pack)(ended.sim)
@@ -191,7 +191,7 @@ def about(settings: TrainConfig, impl: str | None = None) -> dict[str, Any]:
 
     Args:
       settings: settings of training.
-      impl: implementation that was used; None: the function finds out, which may need the GPU.
+      impl: implementation that was used; with None the function finds out, which may need the GPU.
 
     Returns:
       Entries with the names in docs/interface.md.
@@ -257,7 +257,7 @@ def time_environment(prepared: Prepared, arenas: rollout.Arena) -> dict[str, Any
 
 
 def time_training(prepared: Prepared, arena_steps_per_s: float) -> dict[str, Any]:
-    """Times training, in calls with a length based on the environment's speed.
+    """Times training, in calls whose length is based on the environment's speed.
 
     Args:
       prepared: the compiled size.

@@ -60,7 +60,7 @@ def _robots(name: str, *words: str) -> SuiteEntry:
 
 
 def _memory(name: str, *words: str) -> SuiteEntry:
-    """Makes an entry for memory at two sizes, in a process each, since a peak covers a process."""
+    """Makes an entry for memory at two sizes, one process each, since a peak covers a process."""
     return SuiteEntry(
         name=name,
         module="memory",

@@ -1,8 +1,8 @@
 """How many seconds of training does a swarm need to reach its targets, and how fast was training?
 
 `python -m benchmarks.time_to_success RUN [SHARE]` reads a run directory of `swarmjax.train` and
-prints a JSON line for each seed. It gives the seconds, without compilation, until the last stage
-first had a measured success of at least SHARE (0.9) of the targets, over a whole cohort of training
+prints a JSON line for each seed. It gives the seconds, without compilation, until robots on the
+last stage first reached at least SHARE (0.9) of the targets over a whole cohort of training
 episodes. Seconds are measured only at the end of each call (`run.chunk`), so they are rounded up to
 the end of a call. The seeds of a run share these times, and the speeds are totals over all seeds.
 """

@@ -13,7 +13,7 @@ REPEATS = 5
 
 
 class TimedProgram(NamedTuple):
-    """A compiled `(state, argument) -> (state, rest)` that donates the state.
+    """A compiled program `(state, argument) -> (state, rest)` that donates the state.
 
     Attributes:
       call: the program.

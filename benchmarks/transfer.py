@@ -5,10 +5,11 @@ of `swarmjax.evaluate` except `policy` and `suite`. Each `label:` has the files 
 seeds, joined by `+`. Every policy is judged in MuJoCo C on the same levels in each world of
 `WORLDS`.
 
-It prints a JSON line for each label and world: means with 95 % intervals, and paired differences to
-the label's first world (`_change`) and to the same body's ideal world (`_realism_change`).
-Intervals are from a bootstrap that draws whole levels, the same for all seeds, so they hold for
-these policies on other levels. `targets_reached_by_seed` shows how much seeds differ.
+For each label and world it prints a JSON line with means and their 95 % intervals, and with paired
+differences to the label's first world (`_change`) and to the same body's ideal world
+(`_realism_change`). Intervals are from a bootstrap that draws whole levels, the same for all seeds.
+They therefore hold for these policies on other levels. `targets_reached_by_seed` shows how much
+seeds differ.
 """
 
 import json

@@ -3,8 +3,9 @@
 `python -m benchmarks.trees_speed [before=FOLDER] [than=key=value] [stage=NAME] [key=value ...]`
 takes the keys of `swarmjax.train`, for both sides. `before` is a checkout of another commit, this
 one by default. `than` is a setting only for this tree's side. Each side is a separate process, and
-the two run alternately: one call each, `PAIRS` times, after a warm-up pair. It prints a JSON line:
-the median ratio of this tree's speed to the other's, with an interval that assumes no distribution.
+the two run alternately: one call each, `PAIRS` times, after a warm-up pair. It prints a JSON line
+with the median ratio of this tree's speed to the other's, and with an interval that assumes no
+distribution.
 """
 
 import json
@@ -66,7 +67,7 @@ class Side:
         self.compile_s = self._read()
 
     def time(self, updates: int) -> float:
-        """Trains for some updates and returns the seconds that took."""
+        """Trains for some updates and returns the seconds that this took."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{updates}\n")
         self._process.stdin.flush()

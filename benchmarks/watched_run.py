@@ -70,7 +70,7 @@ class Watched:
         self._finish()
 
     def stop(self) -> None:
-        """Asks the run to save and stop, only once, since a second signal would kill it.
+        """Asks the run to save and stop, but only once, since a second signal would kill it.
 
         `rows` continues until the run has stopped.
         """

@@ -13,7 +13,7 @@ import numpy as np
 
 from swarmjax.config import ConfigError
 
-CELL = 0.01  # m; a 0.09 m passage on s6 leaves a centre 0.016 m, which 0.02 m cells could miss
+CELL = 0.01  # m; in a 0.09 m passage on s6 a centre has 0.016 m, which 0.02 m cells could miss
 COARSE_CELL, LARGE = 0.02, 2.0  # m; COARSE_CELL is for arenas with a side above LARGE
 MARGIN, DEARER = 0.015, 3.0  # steps within MARGIN (m) of the hull's limit cost DEARER times as much
 REACH = 24  # maximum distance of a way-point, in cells along the path
@@ -118,7 +118,7 @@ def _cell_of(place: np.ndarray, cell: float, count: int) -> np.ndarray:
 
 
 def way_points(plan: Plan, place: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Finds each robot's way-point: the furthest point of its path with a free straight line to it.
+    """Finds each robot's way-point: the furthest point of its path in a free straight line.
 
     Args:
       plan: plan of the arena.

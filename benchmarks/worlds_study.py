@@ -164,7 +164,7 @@ def load_judge(study: Study, trained: TrainConfig) -> Judge:
       trained: The config of the arm.
 
     Returns:
-      A function that takes learners [N, L] and returns, by family, each of the `Outcomes` as its
+      A function that takes learners [N, L]. For each family it returns the `Outcomes`, each as a
       mean [N] over the levels.
     """
     stages = tuple(_hardest(stage) for stage in trained.stage)

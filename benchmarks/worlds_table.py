@@ -1,16 +1,16 @@
 """Makes tables from the lines that `benchmarks.worlds_study` has printed.
 
-`python -m benchmarks.worlds_table FILE...` prints two Markdown tables. The first has an arm in each
-row, with interquartile means over seeds and families and 95 % intervals of a stratified bootstrap
-(swarmjax.evaluate.statistics):
+`python -m benchmarks.worlds_table FILE...` prints two Markdown tables. The first table has an arm
+in each row, with interquartile means over seeds and families and 95 % intervals of a stratified
+bootstrap (swarmjax.evaluate.statistics):
 
 - `all arrive`: share of levels in which all robots arrive, at the end of training.
 - `to 0.9`: arena steps until a seed's mean over the families first reaches 0.9.
-- `worst 5 %`: mean of the worst twentieth of all results, one for each seed and family.
+- `worst 5 %`: mean of the worst twentieth of all results; each seed has one result for each family.
 - `contacts`: contacts per robot.
 - `P(better)`: probability that a seed does better on a family than a seed of `random`.
 
-The second has a family in each row, with the mean over seeds of `all arrive` for every arm.
+The second table has a family in each row, and for every arm the mean of `all arrive` over seeds.
 """
 
 import json

@@ -1,13 +1,14 @@
 """E-puck swarms in MuJoCo MJX: thousands of arenas, a curriculum and PPO in one compiled program.
 
-From Python: `make_env`, `train_policy`, `evaluate_policy` and `load_policy`; what they refuse
-raises `SwarmjaxError`. Importing this package imports neither JAX nor NumPy.
+Python code calls `make_env`, `train_policy`, `evaluate_policy` and `load_policy`. They raise
+`SwarmjaxError` for what they refuse. Importing this package imports neither JAX nor NumPy.
 
-Axes, used in every docstring: `T` time, `A` arenas, `R` robots (max), `K` = 8 infrared sensors,
+Every docstring uses these axes: `T` time, `A` arenas, `R` robots (max), `K` = 8 infrared sensors,
 `O` observation, `U` = 2 command, `M` obstacles (max), `S` stages, `L` learners (1 when the policy
-is shared, R when every robot has its own). SI units; angles in radians, counter-clockwise, x
-forward. A step is always qualified: a physics step, a control step (one per arena), a robot step
-(a control step of one robot), a transition (a robot step that was trained on).
+is shared, R when every robot has its own). Units are SI. Angles are in radians and
+counter-clockwise, and x points forward. A step is always qualified: a physics step, a control step
+(one per arena), a robot step (a control step of one robot), a transition (a robot step that was
+trained on).
 """
 
 from typing import TYPE_CHECKING, Any
@@ -35,7 +36,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Imports what is asked for, and not before."""
+    """Imports a name when it is first asked for."""
     if name not in __all__:
         raise AttributeError(f"module 'swarmjax' has no attribute {name!r}")
     from swarmjax import api

@@ -30,7 +30,7 @@ class PolicyError(ValueError):
 
 
 class Policy(NamedTuple):
-    """A trained policy. L is 1 if all robots share it; otherwise robot i is learner i."""
+    """A trained policy. L is 1 if all robots share one learner; otherwise robot i is learner i."""
 
     layers: list[tuple[np.ndarray, np.ndarray]]  # kernel [L, in, out] and bias [L, out]
     log_std: np.ndarray  # [L, U], logarithm of the deviation of the action
@@ -101,7 +101,7 @@ def load(path: str | Path | IO[bytes]) -> Policy:
         rest += [meta["policy"] == "shared", meta["observation"]["encoding"]]
         rest += [*meta["action"]["high"][:2], meta, found]
         return Policy(*[layers, *rest], memory=memory, hearing=hearing)
-    except Exception as error:  # zipfile, NumPy and json raise many kinds for a damaged file
+    except Exception as error:  # zipfile, NumPy and json raise many errors for a damaged file
         reason = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
         raise PolicyError(f"{path} cannot be read as a policy: {reason[:200]}.") from None
 
@@ -160,7 +160,8 @@ def act(policy: Policy, observation: np.ndarray, normal: Any = 0.0) -> np.ndarra
     """Draws the action of each robot; without `normal` it is the most likely one.
 
     Args:
-      policy: Has no memory or history, and one learner for all robots or at least R learners.
+      policy: Has no memory and no history. It has one learner for all robots, or at least R
+        learners.
       observation: [..., R, O] as `meta["observation"]` says: (quantity - offset) / scale.
       normal: [..., R, U] standard normal, drawn afresh at each control step.
 
@@ -175,7 +176,7 @@ def act(policy: Policy, observation: np.ndarray, normal: Any = 0.0) -> np.ndarra
 def begin(policy: Policy, shape: tuple[int, ...]) -> np.ndarray | None:
     """Returns the memory of robots whose episode begins; None if there is none.
 
-    It is [*shape, H] or, with a history, the earlier observations, [*shape, (k - 1) O].
+    The memory is [*shape, H]. With a history it is the earlier observations, [*shape, (k - 1) O].
     """
     return np.zeros((*shape, policy.carried), "f4") if policy.carried else None
 
@@ -239,7 +240,7 @@ def _hear(parts: list[np.ndarray], policy: Policy, x: np.ndarray) -> np.ndarray:
 
 
 def _remember(parts: list[np.ndarray], memory: np.ndarray, features: np.ndarray) -> np.ndarray:
-    """Applies a gated recurrent unit (GRU), whose reset gate follows the product, to the memory."""
+    """Updates the memory with a gated recurrent unit (GRU) whose reset gate follows the product."""
     seen, recalled = (
         np.vecmat(features, parts[0]) + parts[1],
         np.vecmat(memory, parts[2]) + parts[3],

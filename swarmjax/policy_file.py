@@ -1,8 +1,8 @@
 """Reads and writes policy files (docs/policy-format.md), and checks every field. No JAX.
 
-`policy.load` trusts NumPy's reading of a file; `read` trusts nothing. It matches each member's
-header against the one form that NumPy writes, instead of evaluating it, and compares sizes before
-it allocates anything.
+`policy.load` trusts NumPy's reading of a file; `read` trusts nothing. It does not evaluate a
+member's header, but matches it against the one form that NumPy writes. It compares sizes before it
+allocates anything.
 """
 
 import io
@@ -60,7 +60,7 @@ _HEADER = re.compile(
     rb"'shape': \((N,|N(?:, N){1,7}|)\), \} *\n".replace(b"N", rb"(?:0|[1-9]\d{0,8})")
 )
 _MOST_LOG_STD = 20.0  # 5e8 times the range of commands; exp(89) overflows float32
-_MOST_HEADER = 10_000  # bytes, with all that precedes the header; NumPy reads no longer ones
+_MOST_HEADER = 10_000  # bytes, with all that precedes the header; NumPy reads no longer headers
 _NAME = re.compile(r"[a-zA-Z][\w.-]{0,63}", re.ASCII)
 _UNIT = re.compile(r"(?!.*(?:\*/|/\*))[a-zA-Z0-9/^*. -]{1,16}")  # cannot open or close a comment
 _META = {  # keys of `meta`, with their JSON types

@@ -35,8 +35,8 @@ def versions() -> dict[str, str]:
 def commit() -> str | None:
     """Returns the commit of the source tree, with `-dirty` if files have changed; None without git.
 
-    The environment variable `SWARMJAX_COMMIT` takes precedence. Use it for copies of the tree
-    without their own Git history, or inside another repository.
+    The environment variable `SWARMJAX_COMMIT` takes precedence. Set it for a copy of the tree that
+    has no Git history of its own or lies in another repository.
     """
     given = os.environ.get("SWARMJAX_COMMIT")
     if given:

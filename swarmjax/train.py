@@ -2,7 +2,7 @@
 
 Without arguments it trains the default curriculum. `--help` shows examples. JAX takes seconds to
 load, so it is imported only after the settings have passed their checks. Signals are handled even
-before that.
+before the settings are checked.
 """
 
 import sys

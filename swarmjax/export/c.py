@@ -310,7 +310,7 @@ def _calls(sizes: Sequence[int], recalled: int) -> Iterable[str]:
 
 
 def _cases(trained: Policy) -> dict[str, str]:
-    """Makes the self-test's cases, half of them beyond the clip, and the results of NumPy."""
+    """Makes the self-test's cases, half of them beyond the clip, and NumPy's results for them."""
     draw = np.random.default_rng(0)
     mean, std = (part[:, : _seen(trained)] for part in (trained.mean, trained.std))
     shape = (CASES, *mean.shape)

@@ -16,7 +16,7 @@ from swarmjax.atomic_file import replacing
 from swarmjax.config import ConfigError, reading
 
 MANIFEST = "export.json"
-BUILT = ("__pycache__", "build")  # created when an export is used, and replaceable
+BUILT = ("__pycache__", "build")  # made by using an export; may be replaced
 
 
 def write_file(path: Path, content: bytes) -> None:

@@ -27,7 +27,7 @@ def render(
     Args:
       trained: the policy.
       content: content of the policy file.
-      answers: whose sensors to read: those of simulated or of real e-pucks.
+      answers: whether to read the sensors of simulated or of real e-pucks.
       name: name of the controller and of its folder; Webots needs them to be equal.
 
     Returns:
@@ -47,13 +47,13 @@ def sensors(answers: Literal["webots", "real"]) -> dict[str, Any]:
     """Describes how to convert the counts of infrared sensors to distances.
 
     Args:
-      answers: whose sensors they are: those of simulated or of real e-pucks.
+      answers: whether they are the sensors of simulated or of real e-pucks.
 
     Returns:
       `answers`, and the points of Webots' table as `distance` (m) and `counts`, to be
-      interpolated linearly. For real sensors also `fit`: a count n above free space, at most
-      `span` [K], means a distance of sqrt(`strength` / n) - `depth` + `to_hull` [K] m, clipped to
-      the range from 0 to `reach`.
+      interpolated linearly. For real sensors also `fit`: a count that is n above free space, with n
+      at most `span` [K], means a distance of sqrt(`strength` / n) - `depth` + `to_hull` [K] m,
+      clipped to the range from 0 to `reach`.
     """
     counts = np.array([row[1] for row in epuck.INFRARED_TABLE])
     found: dict[str, Any] = {

@@ -1,8 +1,8 @@
 """Drives a Webots e-puck to its target with a trained policy. Needs only NumPy.
 
 In every control step it reads infrared, GPS and compass, and sets the speeds of the wheels. It
-needs `policy.npz` and `sensors.json`, which gives the meaning of the sensors' counts, in the same
-folder.
+needs `policy.npz` and `sensors.json` in the same folder. The second file gives the meaning of the
+sensors' counts.
 
 The target is `target=x,y` (m) in the robot's controllerArgs, or in its customData, where it may
 change. A policy that is not shared also needs `robot=i`, the robot's number from 0. controllerArgs

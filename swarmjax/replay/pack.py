@@ -1,7 +1,8 @@
 """Packs recordings into few bytes: integer quanta, differences in time, deflated.
 
-The packed data are one zlib stream with three parts: the length of the header (4 bytes,
-little-endian), the header (JSON), and the series of all runs that the header lists, in that order.
+The packed data are one zlib stream with three parts. First comes the length of the header (4 bytes,
+little-endian), then the header (JSON), and last the series of all runs, in the order in which the
+header lists them.
 
 A series is a table of integers with one row per frame. Each number is stored as the difference to
 the number above it; the first row is stored as it is. Signed differences are folded: 0, -1, 1, -2,
@@ -112,7 +113,7 @@ def dark(reach: float) -> int:
       reach: Length of such a ray, m.
 
     Returns:
-      A number larger than that of any shorter ray.
+      The number, which is larger than that of any shorter ray.
     """
     return int(np.ceil(reach / RAY))
 

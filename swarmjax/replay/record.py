@@ -113,7 +113,7 @@ class Steps(NamedTuple):
       arrives: [..., R] whether the robot arrived in this step; with `hold`, whether all did.
       contact_begins: [..., R, 3] whether a contact of each kind began in this step.
       touching: [..., R, 3] whether the robot touches something of each kind after the step.
-      outside: [..., R] whether the robot had not arrived when the step began; None: no robot had
+      outside: [..., R] whether the robot had yet to arrive when the step began; None: no robot had
         arrived.
     """
 
@@ -189,7 +189,7 @@ def record(
     arenas = engine_c.start(judge, levels)
     mount = electronics.mount(arenas.factors)
     frames = [_look(judge, arenas, np.zeros_like(arenas.pose[..., :2]))]
-    over = np.zeros(len(levels), bool)  # with `hold` robots may leave again; an episode stays over
+    over = np.zeros(len(levels), bool)  # with `hold` robots may leave, but an episode stays over
     driver = engine_c.by_policy(judge)
     memory = driver.init(arenas)
     while len(frames) <= judge.config.step_limit and not over.all():

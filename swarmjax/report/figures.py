@@ -269,7 +269,7 @@ def _at(updates: int, points: int) -> np.ndarray:
 
 
 def _stretched(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Averages values [N or S, T] over stretches of updates; gives the steps where each ends, too.
+    """Averages values [N or S, T] over stretches of updates; also gives the step where each ends.
 
     Missing values are skipped. A stretch without any value is nan.
     """

@@ -60,7 +60,7 @@ class ValueKind(NamedTuple):
 
 
 def _is_number(value: Any, types: type | UnionType, largest: float) -> bool:
-    """Tests whether a value is a number no larger than `largest`; booleans and nan are not."""
+    """Tests whether a value is a number no larger than `largest`; booleans and nan do not count."""
     return isinstance(value, types) and not isinstance(value, bool) and abs(value) <= largest
 
 

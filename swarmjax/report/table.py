@@ -266,7 +266,7 @@ def plain(lines: Sequence[TableLine]) -> list[dict[str, Any]]:
 
 
 def _place(runs: Sequence[Path]) -> str:
-    """Names a run, or the common folder of several runs and their number."""
+    """Names a run; for several runs, their common folder and how many they are."""
     if len(runs) == 1:
         return str(runs[0])
     return f"{len(runs)} in {os.path.commonpath(runs)}"

@@ -200,7 +200,7 @@ def steady(stage: str | None, axis: Axis) -> list[tuple[str, str, Values]]:
 
     Args:
       stage: uses only the episodes of this stage; None for all.
-      axis: counts in this unit.
+      axis: unit in which places are counted.
 
     Returns:
       For each reading: the goal, what is counted, and a function that finds an arm's places by

@@ -59,7 +59,8 @@ def earlier(ours: np.ndarray, theirs: np.ndarray) -> tuple[bool | None, str]:
     """Tests whether the first arm reaches a goal earlier, where inf means never.
 
     It takes the probability that a seed of the first arm is earlier than a seed of the second. The
-    claim holds if the interval of this probability lies above 0.5, and is contradicted below 0.5.
+    claim holds if the interval of this probability lies above 0.5. It is contradicted if the
+    interval lies below 0.5.
     """
     chance = statistics.probability_of_improvement(theirs[:, None], ours[:, None])
     both = " against ".join(PLACE.value(float(iqm(each))) for each in (ours, theirs))

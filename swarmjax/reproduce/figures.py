@@ -23,7 +23,7 @@ from swarmjax.reproduce.measures import AXES, WINDOW, Axis, Measure
 from swarmjax.reproduce.raster import raster
 from swarmjax.reproduce.rows import EXPANDED, LAST, MODERN, PAIR, TUNED, Reproduction
 
-SHADES = 128  # colours in a file, which has a quarter of the size; each is off by at most 23 of 255
+SHADES = 128  # colours in a file, a quarter of the size; each colour is off by at most 23 of 255
 _POINTS, _RESAMPLES = 100, 1000  # for the interval along a curve
 COLOURS = {
     "curriculum": "#0072b2",

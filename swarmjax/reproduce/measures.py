@@ -94,8 +94,8 @@ def steady(success: np.ndarray, window: int = WINDOW, share: float = STEADY) -> 
     window has less than `KEPT`.
 
     Later windows need not have `share`, because such a rule would measure the length of the run. A
-    policy that succeeds in nine of ten episodes has fewer than 16 successes in one window of 23, so
-    some window near the end of any run would fail.
+    policy that succeeds in nine of ten episodes has fewer than 16 successes in one of 23 windows,
+    so some window near the end of any run would fail.
 
     Args:
       success: [E] whether an episode succeeded.
@@ -129,7 +129,7 @@ def steady_at(
       data: the reproduction's data.
       arm: a finished arm.
       success: takes [E] successes from a log.
-      axis: counts in this unit from the beginning of the run.
+      axis: unit in which places are counted from the beginning of the run.
       stage: uses only the episodes of this stage; None for all.
 
     Returns:
@@ -165,15 +165,14 @@ def judged(data: Reproduction, arm: str, *, key: str, stage: str) -> np.ndarray:
 
 
 def crowding(data: Reproduction, arm: str, *, stage: str) -> np.ndarray:
-    """Counts how many more steps the last robot to arrive sensed something than the first one.
+    """Counts in how many more steps the last robot to arrive sensed something than the first one.
 
     The first robot finds no other robot at the targets. The last one finds all that arrived before.
 
     Args:
       data: the reproduction's data.
       arm: a finished arm.
-      stage: the stage. Episodes with two or more arrivals are used, among its last `WINDOW`
-        episodes.
+      stage: the stage. Of the last `WINDOW` episodes, those with two or more arrivals are used.
 
     Returns:
       [N] robot steps per pair, mean by seed; nan for a seed without such an episode.
@@ -200,7 +199,7 @@ def reward_reached(
       data: the reproduction's data.
       arm: one of the rivals.
       of: takes the reward [E] from a log.
-      axis: counts in this unit from the beginning of the run.
+      axis: unit in which places are counted from the beginning of the run.
       rivals: finished arms; the best mean is searched over all their seeds.
       stage: uses only the episodes of this stage.
 

@@ -174,7 +174,7 @@ def _places(data: Reproduction) -> list[tuple[str, str, str, np.ndarray]]:
 
 
 def _summary(places: np.ndarray) -> tuple[str, str, str]:
-    """Writes median and IQM of places, and how many seeds have one; inf means none."""
+    """Writes median and IQM of places, and how many seeds have a place; inf means none."""
     there = np.isfinite(places)
     return (
         PLACE.value(float(np.median(places))),
@@ -187,7 +187,7 @@ def _summary(places: np.ndarray) -> tuple[str, str, str]:
 def _compared(data: Reproduction) -> list[tuple[str, ...]]:
     """Makes the table of how much earlier success becomes steady with the curriculum.
 
-    It gives the difference of paired seeds, and the probability for unpaired ones.
+    The table gives the difference of paired seeds, and the probability for unpaired ones.
     """
     rows = []
     for goal, counted, values in _CASES:

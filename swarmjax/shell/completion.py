@@ -1,7 +1,8 @@
 """Writes completion scripts for bash, zsh and fish: commands, their keys, and values of keys.
 
-A script holds all of this in a table, so that completing a word does not start Python. It must be
-written again after the keys change. A line of the table has a command, a key and its values:
+A script holds all of this in a table, so that completing a word does not start Python. The script
+must be written again after the keys change. A line of the table has a command, a key and its
+values:
 
     train stage s1 s2 @file
     train run.dry true false
@@ -28,7 +29,7 @@ def script(shell: str) -> str:
       shell: one of `SHELLS`.
 
     Returns:
-      Its text, with a newline at the end.
+      The script's text, with a newline at the end.
 
     Raises:
       ConfigError: if it is another shell.
@@ -65,7 +66,7 @@ def choices(hint: object) -> list[str]:
       hint: its type.
 
     Returns:
-      Its values, with `@file` if the key takes text. A key that takes only numbers has none.
+      Its values, with `@file` if the key takes text. A key that takes only numbers has no values.
     """
     found: list[str] = []
     for option in section.options(hint):

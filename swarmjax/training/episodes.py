@@ -60,7 +60,7 @@ def pack(ended: Ended, size: int) -> EpisodeLog:
     """Drops the places where no episode ended.
 
     Args:
-      ended: [T, A], with `robots`.
+      ended: [T, A] counts of ended episodes, with `robots`.
       size: E.
 
     Returns:
@@ -102,8 +102,8 @@ def rows(
       control_steps: arena control steps of one update and seed, over all arenas.
 
     Returns:
-      The rows, by update, then seed, then in the order of their ends; and the number of lost
-      episodes.
+      The rows, sorted by update, then by seed, then by when the episode ended. Also the number of
+      lost episodes.
     """
     found, lost = [], 0
     for i, update in enumerate(updates.tolist()):

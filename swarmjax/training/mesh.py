@@ -185,7 +185,7 @@ def bytes_each(config: ProgramConfig, state: TrainState) -> int:
 
 
 def stepped_together(program: Program, state: TrainState) -> Any:
-    """Takes the arenas of one device that the program steps together out of a state.
+    """Takes out of a state the arenas that the program steps together on one device.
 
     Args:
       program: the compiled program.

@@ -160,7 +160,7 @@ def _nothing(slot: Array) -> Gained:
 
 
 def _mutate(practice: Practice, source: LevelSource, picks: Array) -> LevelSource:
-    """Moves something in some of the replayed levels [N]; picks are [N, 3]."""
+    """Mutates some of the replayed levels [N]; picks are [N, 3]."""
     buffer, options = practice.buffer, practice.options
     if options.movable is None:
         return source
@@ -217,12 +217,12 @@ def gain(before: Gained, batch: Batch, over: Array) -> tuple[Array, Gained]:
 
     Args:
       before: [A] sums of the episodes under way.
-      batch: [L] batches of A groups of T N samples.
+      batch: [L] batches, each of A groups with T N samples.
       over: [T, A] whether the episode ended with the step.
 
     Returns:
-      [T, A] positive value loss of the episode up to the step, the mean of max(advantage, 0) over
-      its transitions; and [A] the sums of the episodes under way afterwards.
+      [T, A] positive value loss of the episode up to the step: the mean of max(advantage, 0) over
+      its transitions. Also [A], the sums of the episodes that are then under way.
     """
     steps = over.shape[0]
 

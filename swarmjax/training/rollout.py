@@ -63,11 +63,11 @@ class Trajectory(NamedTuple):
       value: of the observation.
       next_value: value of the observation after the step, before any reset.
       reward: of the step.
-      terminated: the robot arrived in this step; with `task.arrival=hold`, all robots were on their
-        targets at once.
-      truncated: the time ran out for the robot.
+      terminated: whether the robot arrived in this step; with `task.arrival=hold`, whether all
+        robots were on their targets at once.
+      truncated: whether the time ran out for the robot.
       valid: whether to learn from the transition.
-      over: the episode ended with the step; None without a memory.
+      over: whether the episode ended with the step; None without a memory.
       state: [.., P], what the critic sees in addition to the observation; None if nothing.
     """
 
@@ -223,7 +223,7 @@ def batch(
       memory: [A, R, H] memory of the arenas before the rollout; None without a memory.
 
     Returns:
-      [L] batches of A groups of T * N samples.
+      [L] batches, each of A groups with T * N samples.
     """
     advantages, returns = {"gae": _bootstrapped, "monte_carlo": _monte_carlo}[config.advantage](
         trajectory, config, shards
@@ -464,13 +464,13 @@ def _ended(arenas: Arena, came: env.TimeStep, *, by_robot: bool) -> Ended:
 
 
 def _to_counts(ended: Ended) -> _Counts:
-    """Lays the counts [A, ...] of a step side by side [A, K]: one array to write instead of 11."""
+    """Lays the counts [A, ...] of a step side by side [A, K], to write one array instead of 11."""
     columns = [getattr(ended, name).reshape(len(ended.reward), -1) for name in _COUNTS]
     return jnp.concatenate(columns, axis=1), ended.reward, ended.robots
 
 
 def _to_ended(counts: Array, reward: Array, robots: Robots | None) -> Ended:
-    """Undoes `_to_counts`, [T, A, ...]."""
+    """Undoes `_to_counts` for all steps of a rollout, [T, A, ...]."""
     found, first = {}, 0
     for name, width in _COUNTS.items():
         found[name] = counts[..., first] if width == 1 else counts[..., first : first + width]

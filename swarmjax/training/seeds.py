@@ -81,8 +81,8 @@ def each(config: ProgramConfig, function: Callable[[Any], Any], lanes: Any) -> A
 
     Side by side (`vmap`), the matrix products are batched. This rounds differently from a run of
     one seed, but in the same way for every seed. One seed alone is not batched. One after the other
-    (`map`), a seed gives the same bits for any number of seeds. With `cores`, groups of seeds run
-    side by side, one group a call. With `devices`, the seeds of each device run side by side.
+    (`map`), a seed gives the same bits for any number of seeds. With `cores`, a call has one group
+    of seeds, which run side by side. With `devices`, the seeds of each device run side by side.
 
     Args:
       config: settings of the run.
@@ -121,7 +121,7 @@ def size(tree: Any) -> int:
 
 
 def stepped_together(program: Program, state: TrainState) -> PhysicsState:
-    """Takes the arenas that the program steps together out of a state, all on one axis.
+    """Takes out of a state the arenas that the program steps together, all on one axis.
 
     Args:
       program: the compiled program.
