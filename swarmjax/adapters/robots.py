@@ -17,8 +17,8 @@ class RobotStep(NamedTuple):
     """The outcome of a control step, robot by robot.
 
     Attributes:
-      observation: [N, O] the observation to act on. Where `over` is True, it belongs to the next
-        episode.
+      observation: [N, O] the observation to act on. Where `over` is True, this observation belongs
+        to the next episode.
       last: [N, O] the observation after the step, before any reset.
       reward: [N] the reward; 0 for robots that had already arrived.
       terminated: [N] whether the robot arrived in this step.

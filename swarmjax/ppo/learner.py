@@ -59,14 +59,14 @@ class Batch:
       action: [G, N, U], as drawn.
       log_prob: [G, N], as `act` returned it.
       advantage: [G, N]. With `config.normalize_advantages`, the update normalises the advantages
-        over the valid samples, unless they are from Monte-Carlo returns, which are normalised
-        already.
+        over the valid samples, unless the advantages come from Monte-Carlo returns, which are
+        normalised already.
       return_: [G, N], target of the critic.
       valid: [G, N], bool or 0/1.
       memory: [G, S, H], memory of the S robots of a group before the rollout; None without
         memory. The N samples of a group are then ordered by step, [T S].
       begins: [G, N], whether an episode begins with the step; None without memory.
-      state: [G, N, P], of order 1, what the critic sees in addition; None if nothing.
+      state: [G, N, P], numbers of order 1 that the critic sees in addition; None if there are none.
     """
 
     observation: jax.Array
@@ -231,7 +231,7 @@ def recall_values(
       config: The config that made the learner.
       observation: [..., O], raw.
       memory: [..., H], memory of the critic before; None without memory.
-      state: [..., P], of order 1, what the critic sees in addition; None if nothing.
+      state: [..., P], numbers of order 1 that the critic sees in addition; None if there are none.
 
     Returns:
       The expected discounted return, [...], and the memory after.

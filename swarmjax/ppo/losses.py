@@ -27,7 +27,7 @@ class Minibatch:
       memory: [B', H], memory before the first step of B' sequences; None without memory. Samples
         are then ordered by step, [T B'].
       begins: [B], whether an episode begins with the step; None without memory.
-      state: [B, P], of order 1, what the critic sees in addition; None if nothing.
+      state: [B, P], numbers of order 1 that the critic sees in addition; None if there are none.
     """
 
     observation: jax.Array

@@ -320,7 +320,7 @@ def critic_input(observation: jax.Array, state: jax.Array | None) -> jax.Array:
 
     Args:
       observation: [B, O], normalised.
-      state: [B, P], what the critic sees in addition; None if nothing.
+      state: [B, P], numbers that the critic sees in addition; None if there are none.
 
     Returns:
       [B, O + P], for `recall_value`.
@@ -372,7 +372,7 @@ def entropy(std: jax.Array) -> jax.Array:
 
 
 def _check_input(network: Params, observation: jax.Array, config: AlgoConfig) -> None:
-    """Checks that an observation has the size of the hidden layers; other networks check theirs."""
+    """Checks an observation's size for the hidden layers; other networks check it themselves."""
     first = network.get("torso", {}).get("hidden_0", {})
     if "kernel" in first:
         size = first["kernel"].shape[-2]

@@ -21,8 +21,9 @@ class Normalizer:
     """Mean and variance of the observations seen so far.
 
     Attributes:
-      count: [], float32, number of observations. It rounds beyond 2**24. This is harmless: the
-        count only weighs a batch against the past, and a relative error of 2**-24 is negligible.
+      count: [], float32, number of observations. Beyond 2**24 it is rounded. This is harmless,
+        because the count only weighs a batch against the past, and a relative error of 2**-24 is
+        negligible.
       mean: [O].
       variance: [O], of the population; 1 before the first observation.
     """

@@ -17,7 +17,8 @@ from typing import Any, Protocol, runtime_checkable
 from swarmjax.run.directory import Row
 
 MOST_PENDING = 100  # how many calls of the program a logger may lag behind
-# Seconds that a run waits for a logger that lags further behind, and for each at the run's end.
+# Seconds that a run waits for a logger that lags further behind. At its end, the run waits as long
+# for each logger.
 PATIENCE_S = 60.0
 
 

@@ -126,8 +126,8 @@ def fill(
     Args:
       settings: the run's config, with any number of arenas.
       measure: returns the memory that training with a config needs, bytes.
-      available: memory of the accelerator, bytes. The share `run.memory_share` of it is filled.
-        None on a CPU, or if the memory is unknown; at most ON_CPU arenas are chosen then.
+      available: memory of the accelerator, bytes. The share `run.memory_share` of this memory is
+        filled. None on a CPU, or if the memory is unknown; at most ON_CPU arenas are chosen then.
 
     Returns:
       The config with that number, and a sentence that gives the reason.

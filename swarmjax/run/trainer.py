@@ -79,8 +79,8 @@ class Tally:
       earlier_s: seconds of training before this process began.
       seconds: seconds of training in this process, without compilation.
       decisions: promotions and demotions.
-      barren: how many of the newest updates in a row taught nothing, by seed. Such an update
-        skipped every gradient step, or every arena broke at every step.
+      barren: how many of the newest updates in a row taught nothing, by seed. In such an update
+        every gradient step was skipped, or every arena broke at every step.
     """
 
     update: int
@@ -311,8 +311,8 @@ def _pace(tally: Tally) -> float:
 def score(settings: TrainConfig, tally: Tally) -> float | None:
     """Rates what a run has learned, so that its best checkpoint can be kept.
 
-    A seed scores the index of its furthest measured stage, from 0, plus the share of targets
-    reached there.
+    A seed's score is the index of its furthest measured stage, counted from 0, plus the share of
+    targets reached there.
 
     Returns:
       The mean score over the seeds; None until every seed has been measured.

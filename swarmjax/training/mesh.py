@@ -185,7 +185,7 @@ def bytes_each(config: ProgramConfig, state: TrainState) -> int:
 
 
 def stepped_together(program: Program, state: TrainState) -> Any:
-    """Takes the arenas of one device that the program steps together out of a state.
+    """Takes out of a state those arenas of one device that the program steps together.
 
     Args:
       program: the compiled program.

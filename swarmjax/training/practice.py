@@ -176,7 +176,7 @@ def _mutate(practice: Practice, source: LevelSource, picks: Array) -> LevelSourc
 
 
 def is_fresh(source: LevelSource) -> Array:
-    """Tells which episodes count for their stage: only those on levels drawn for them."""
+    """Tells which episodes count for their stage: only those on newly drawn levels."""
     return source.slot == FRESH
 
 

@@ -20,8 +20,8 @@ def carry_over(
     If each robot has a learner and the swarm grows beyond its largest size so far,
     `newcomers=copy` lets the new robots copy the others' learners in turn: parameters, optimiser
     and normaliser. Otherwise they begin untrained. Then the optimiser, the normaliser and the
-    exploration of all learners are reset or kept, as `config.curriculum` says. Keeping them has no
-    cost.
+    exploration of all learners are reset or kept, as `config.curriculum` says. Keeping these three
+    has no cost.
 
     Args:
       learners: [L].

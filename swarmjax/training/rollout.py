@@ -54,7 +54,7 @@ class Arena(EnvState):
 
 
 class Trajectory(NamedTuple):
-    """The learners' observations and actions and their results, [T, L, A, N, ...].
+    """The learners' observations, their actions and the results, [T, L, A, N, ...].
 
     Attributes:
       observation: [.., O], raw.
@@ -68,7 +68,7 @@ class Trajectory(NamedTuple):
       truncated: the time ran out for the robot.
       valid: whether to learn from the transition.
       over: the episode ended with the step; None without a memory.
-      state: [.., P], what the critic sees in addition to the observation; None if nothing.
+      state: [.., P], numbers that the critic sees beside the observation; None if there are none.
     """
 
     observation: Array
@@ -125,9 +125,9 @@ def draw_starts(
 ) -> Arena:
     """Draws new levels for episodes that wait until their arena is free.
 
-    They are drawn before a rollout, `config.waiting` for each arena, and not at every step. An
-    arena that runs out of them repeats the last level. The repeats train, but count for no cohort:
-    otherwise short episodes would count more often than long ones.
+    They are drawn before a rollout and not at every step, `config.waiting` levels for each arena.
+    An arena that runs out of them repeats the last level. The repeats train, but count for no
+    cohort: otherwise short episodes would count more often than long ones.
 
     Args:
       world: the compiled environment.
@@ -268,7 +268,7 @@ def _bootstrapped(trajectory: Trajectory, config: AlgoConfig, _: Shards) -> tupl
 
 
 def _monte_carlo(trajectory: Trajectory, config: AlgoConfig, shards: Shards) -> tuple[Array, Array]:
-    """Returns the normalised Monte-Carlo returns less the values, and the returns themselves."""
+    """Returns the normalised Monte-Carlo returns minus the values, and the returns themselves."""
     boundary = trajectory.terminated | trajectory.truncated
     if config.time_out == "leak":
         boundary = boundary & ~_timed_out(trajectory)
@@ -289,7 +289,7 @@ class _Judged(NamedTuple):
     Attributes:
       value: value of the observation.
       memory: [.., H] memory of the critic afterwards; None without a memory.
-      state: [.., P], what the critic sees in addition to the observation; None if nothing.
+      state: [.., P], numbers that the critic sees beside the observation; None if there are none.
     """
 
     value: Array

@@ -121,7 +121,7 @@ def size(tree: Any) -> int:
 
 
 def stepped_together(program: Program, state: TrainState) -> PhysicsState:
-    """Takes the arenas that the program steps together out of a state, all on one axis.
+    """Takes out of a state the arenas that the program steps together, all on one axis.
 
     Args:
       program: the compiled program.

@@ -1,7 +1,7 @@
 """A kernel that takes samples forward through a network and a loss, and back, on the chip.
 
 XLA writes the activations of every layer to memory and reads them again. Here a program of the grid
-keeps the activations of a tile of samples on the chip, and writes only its sums, at its end.
+keeps the activations of a tile of samples on the chip. It writes only its sums, once it ends.
 Programs share nothing, so the same samples give the same bits. A network is one vector, and so is
 its gradient: the optimiser then handles one array instead of a dozen.
 
@@ -25,7 +25,7 @@ LEAST_WIDTH = 16
 MOST_WIDTH = 128
 # Bytes of the chip's memory that a program may use. Compute capability 8 and later gives at least
 # 99 KiB (CUDA C++ Programming Guide, "Technical Specifications per Compute Capability"). `fits`
-# counts for the matrix products of capability 9.0; the products of other capabilities take up to 4
+# counts what the matrix products of capability 9.0 take; those of other capabilities take up to 4
 # KiB more.
 SHARED_MEMORY = 95 * 1024
 # Bytes by compute capability, where a program may use more; from the same source.
@@ -48,8 +48,8 @@ class Place(NamedTuple):
     """Where an affine layer lies in the vector of its network's parameters, row by row.
 
     Attributes:
-      kernel: Index of its first number.
-      bias: Index of its first number.
+      kernel: Index of the kernel's first number.
+      bias: Index of the bias's first number.
       shape: Numbers of inputs and outputs.
     """
 
@@ -77,7 +77,7 @@ class KernelLayout(NamedTuple):
 
     Attributes:
       layers: Hidden layers and output, in order.
-      vectors: Other parameters, by name: index of the first number, and width.
+      vectors: For each other parameter, by name, the index of its first number and its width.
       size: Length of the vector.
     """
 
@@ -314,7 +314,7 @@ def _forward(
 def _backward(
     activation: str, network: tuple[Layer, ...], seen: _Activations, slope: jax.Array
 ) -> tuple[Layer, ...]:
-    """Backpropagates, summed over the tile: Goodfellow et al. 2016, "Deep Learning", alg. 6.4.
+    """Backpropagates and sums over the tile (Goodfellow et al. 2016, "Deep Learning", alg. 6.4).
 
     With z = x W + b and g the derivative with respect to z, the derivatives with respect to W, b
     and x are x^T g, the sum of g over samples, and g W^T. If x = f(z') is the output of the layer
