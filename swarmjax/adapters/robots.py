@@ -58,7 +58,7 @@ class RobotRow:
 
     @property
     def action_size(self) -> int:
-        """Size of a robot's action, U: the command, then its message, if it sends one."""
+        """Size of a robot's action, U: the command, then the message, if the robot sends one."""
         return self.swarm.world.action_size
 
     def observe(self, state: SwarmState) -> Array:

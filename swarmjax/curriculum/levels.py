@@ -1,8 +1,8 @@
 """A buffer of levels: which levels are played again, and which are replaced.
 
 The curriculum's mode chooses the stage on which an episode begins. The buffer chooses the level of
-that stage. Each stage has an equal part of the buffer, so no stage displaces another, and the share
-of arenas on a stage stays its weight. The buffer stores the numbers that define a level.
+that stage. Each stage has an equal part of the buffer, so no stage displaces another. The share of
+arenas on a stage remains the stage's weight. The buffer stores the numbers that define a level.
 
 - Prioritised level replay: Jiang et al. 2021, "Prioritized Level Replay", arXiv:2010.03934.
 - Learnability: Rutherford et al. 2024, "No Regrets: Investigating and Improving Regret
@@ -25,8 +25,8 @@ from jax import Array
 
 from swarmjax.curriculum.config import LevelsConfig
 
-# Sources of an episode other than a level in the buffer: a level just drawn, a mutation of one in
-# the buffer, or a level that has since been replaced.
+# Sources of an episode that begins on no level of the buffer: a level just drawn, a mutation of a
+# level in the buffer, or a level that has since been replaced.
 FRESH, MUTATED, LOST = -1, -2, -3
 
 # Score of an empty place, below every real score.
@@ -147,8 +147,8 @@ def probabilities(buffer: LevelBuffer, options: LevelNumbers) -> Array:
     """Computes the probability of each level, given that a level of its stage is replayed.
 
     The probability is (1 - rho) P_score + rho P_stale. P_score is proportional to rank^(-1 /
-    temperature), and P_stale to the updates since the level was last begun (Jiang et al. 2021,
-    equations 2 to 5).
+    temperature). P_stale is proportional to the number of updates since an episode last began on
+    the level (Jiang et al. 2021, equations 2 to 5).
 
     Args:
       buffer: buffer of levels.

@@ -1,9 +1,9 @@
 """The modes of the curriculum: each decides which stages are trained, and how much.
 
-A mode is one pure function of the signature `engine.Mode`. After each update it gets the curriculum
-with its newest verdicts, and returns the newest stage, the share of the arenas on each stage, and
-the reason. It is also called before the first update, without verdicts, and then returns where a
-run begins.
+A mode is one pure function of the signature `engine.Mode`. After each update a mode gets the
+curriculum with its newest verdicts, and returns the newest stage, the share of the arenas on each
+stage, and the reason. A mode is also called before the first update, without verdicts, and then
+returns where a run begins.
 """
 
 import jax

@@ -73,8 +73,8 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
     Args:
       config: Settings of the evaluation.
       trained: The policy to judge.
-      half: [M, 2] half edges of the boxes in the coming levels, m; None: the half edges that stage
-        and `shape` give.
+      half: [M, 2] half edges of the boxes in the coming levels, m. None means the half edges that
+        stage and `shape` give.
 
     Returns:
       The judge.

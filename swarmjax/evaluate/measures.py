@@ -26,8 +26,8 @@ class Outcome(NamedTuple):
       clock: [A] control steps since the start.
       arrived: [A, R] whether the robot has arrived; with `task.arrival=hold`, whether it is
         within its target.
-      arrival: [A, R] control steps until the robot arrived, 0 if it has not; with `hold`, control
-        steps until it was within its target and stayed there.
+      arrival: [A, R] control steps until the robot arrived; 0 if it has not arrived. With `hold`,
+        control steps until it was within its target and stayed there.
       contacts: [A, R, 3] contacts of each kind of `gaps.KINDS`, also after arrival.
       touched: [A, R, 3] control steps at whose end the robot touched something, also after arrival.
       impulse: [A, R, 3] normal impulse of the contacts, N s; nan if the engine does not compute it.

@@ -134,9 +134,9 @@ def _arena(inside: float, obstacle: np.ndarray, hull: float) -> _Arena:
 def _way(arena: _Arena, start: np.ndarray, target: np.ndarray, reach: float) -> float:
     """Computes the length of the shortest path of one robot, m.
 
-    A path of a given length stays within an ellipse: the points whose distances to start and target
-    add up to at most that length. So the points in a small ellipse suffice if they give a path that
-    is no longer.
+    A path of a given length stays within an ellipse. The ellipse holds the points whose distances
+    to start and target add up to at most that length. So the points in a small ellipse suffice if
+    they give a path that is no longer.
     """
     boxes, place = arena.boxes, arena.outline.place
     begin = _see(start[None], boxes)

@@ -2,8 +2,8 @@
 
 Evaluation, benchmarks and studies compute their reported figures here, after Agarwal et al. 2021,
 "Deep Reinforcement Learning at the Edge of the Statistical Precipice": interquartile means (section
-4.3) with percentile intervals of a bootstrap (section 4.1). Values are [runs, tasks]: a run is a
-training seed, and a task is a level or a stage on which its policy was judged.
+4.3) with percentile intervals of a bootstrap (section 4.1). Values are [runs, tasks]. A run is a
+training seed, and a task is a level or a stage on which the run's policy was judged.
 
 A bootstrap draws with replacement the part of the data that its interval is about, and takes the
 rest as given. The right draw depends on how the values were produced:
@@ -29,7 +29,7 @@ Drawing dependent values independently makes an interval too narrow. For example
 the same levels, a hard level is hard for all of them, but `tasks_per_run` would average this
 difficulty out over the runs. The last two draws err on the wide side, because they count the spread
 of single values twice (Davison & Hinkley 1997, "Bootstrap Methods and their Application", section
-3.8; Owen 2007, "The pigeonhole bootstrap"). This matters little if there are many tasks.
+3.8; Owen 2007, "The pigeonhole bootstrap"). The error is small if there are many tasks.
 
 Values may be inf, for example the steps to a threshold that was never reached. Inf counts as larger
 than every number. A mean that includes inf is inf, and an end of an interval is inf if too many

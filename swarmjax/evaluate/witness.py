@@ -95,8 +95,10 @@ def load[C: Section](
     Args:
       cls: The command's dataclass, with `policy` and perhaps `compare`.
       typed: `key=value` arguments.
-      entrants: The policies, if they have been read already; None: the policies that `typed` names.
-      stage: Plain data of the stage if `typed` names none; None: the policies' last stage.
+      entrants: The policies, if they have been read already. None means the policies that `typed`
+        names.
+      stage: Plain data of the stage, used if `typed` names no stage. None means the policies' last
+        stage.
 
     Returns:
       The settings, and one line that describes what comes from the policies.

@@ -39,7 +39,7 @@ class LearnerState:
       params: `{"actor": .., "critic": ..}`.
       optimizer_state: State of the optimiser that `init` made.
       normalizer: Moments of the valid observations of all updates so far. A learner that does not
-        normalise keeps the initial ones.
+        normalise keeps the initial moments.
       explored: [], int32, control steps that the schedule of exploration has counted; None if
         exploration is learned.
     """
@@ -95,7 +95,8 @@ def init(
       config: Settings of networks and optimiser.
       observation_size: O.
       action_size: U.
-      updates: Number of updates of the whole run, at least 1: the learning rate's horizon.
+      updates: Number of updates of the whole run, at least 1; the learning rate's schedule spans
+        them.
       state_size: P, how many numbers the critic sees in addition.
 
     Returns:
@@ -137,7 +138,7 @@ def explore_anew(learner: LearnerState, config: AlgoConfig) -> LearnerState:
       config: The config that made the learner.
 
     Returns:
-      The learner with the exploration of a new one.
+      The learner with the exploration of a new learner.
     """
     begun = _with_log_std(learner, math.log(config.initial_std))
     return replace(begun, explored=jax.tree.map(jnp.zeros_like, learner.explored))

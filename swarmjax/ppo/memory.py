@@ -47,7 +47,7 @@ class Gru(nn.Module):
       uniform: Whether weights and biases begin within 1 / sqrt(H), as in PyTorch's GRU
         (`torch.nn.RNNBase.reset_parameters`).
       kernels: Module with `remember` and `remember_all`, which replace the functions of this file
-        on a GPU; None: XLA computes them.
+        on a GPU. None means that XLA computes them.
     """
 
     size: int

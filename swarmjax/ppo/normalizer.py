@@ -1,8 +1,8 @@
 """Running mean and variance of observations.
 
 Brax's `running_statistics` is unsuitable: importing it loads MuJoCo, MJX and Warp, which this
-package does not need. It also divides 0 by 0 if the first batch has no valid sample, as happens to
-a learner whose robots are still absent.
+package does not need. It also divides 0 by 0 if the first batch has no valid sample. That happens
+to a learner whose robots are still absent.
 """
 
 import chex

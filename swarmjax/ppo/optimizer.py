@@ -12,7 +12,7 @@ from swarmjax.ppo.networks import Params
 from swarmjax.shards import ALONE, Shards
 
 # The metrics of a step: those of `losses.ppo_loss`, the norm of the gradient before clipping, and
-# two flags that are 1 if the step was taken, or skipped.
+# two flags. One flag is 1 if the step was taken, the other if it was skipped.
 METRICS = (
     "approx_kl",
     "bound_loss",

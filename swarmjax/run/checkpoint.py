@@ -87,7 +87,7 @@ class Kept(NamedTuple):
 
     @property
     def has_arenas(self) -> bool:
-        """Whether the checkpoint holds the arenas. If not, a resumed run draws new ones."""
+        """Whether the checkpoint holds the arenas. If not, a resumed run draws new arenas."""
         return any(name.startswith(ARENAS) for name in self.leaves)
 
 

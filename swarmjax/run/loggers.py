@@ -1,8 +1,8 @@
 """Sends a run's figures to loggers: TensorBoard, W&B and Python functions.
 
-`metrics.jsonl` is the run's own record. It is written first, checkpoints record its length, and a
-run that cannot write it ends. A logger holds nothing beyond this record, so its failure does not
-end a run.
+`metrics.jsonl` is the run's own record. This file is written first, checkpoints record its length,
+and a run that cannot write it ends. A logger holds nothing beyond this record, so its failure does
+not end a run.
 """
 
 import contextlib
@@ -36,8 +36,8 @@ class Logger(Protocol):
       did not diverge, the later rows equal the earlier ones, except for times in seconds.
     - A logger that raises an error is not called again, except for `close`. The run prints a
       message and continues.
-    - A run waits for a logger that lags `MOST_PENDING` calls behind, and at its end for every
-      logger. After `PATIENCE_S` it continues without that logger.
+    - A run waits for a logger that lags `MOST_PENDING` calls behind. At its end, the run waits for
+      every logger. After `PATIENCE_S` it continues without that logger.
 
     Attributes:
       name: name of the logger in messages.
@@ -50,7 +50,7 @@ class Logger(Protocol):
 
         Args:
           rows: one for each update and seed, as `recorder.rows` makes them.
-          speeds: speeds of the call over all seeds: `arena_steps_per_s` and so on.
+          speeds: speeds of the call over all seeds, such as `arena_steps_per_s`.
         """
         ...
 

@@ -164,8 +164,8 @@ def line(
     Returns:
       Fixed bytes, and bytes per arena.
     """
-    # Each program does one update, so that the metrics of longer calls are not counted, and the
-    # compiled programs do not depend on the budget.
+    # Each program does one update. So the metrics of longer calls are not counted, and the compiled
+    # programs do not depend on the budget.
     control_steps = settings.algo.rollout_length
     needed = [measure(replace(settings, arenas=n, budget=n * control_steps)) for n in sizes]
     if len(sizes) == 1:

@@ -2,7 +2,7 @@
 
 `curriculum.levels` holds the buffer. This module deals the buffer's levels out to arenas, and reads
 the results of a rollout's episodes. The steps of a rollout do not carry an arena's level source
-along: the number of ended episodes in an arena tells which episode is under way.
+along. The number of ended episodes in an arena tells which episode is under way.
 
 Axes: W episodes that wait for each arena, J = 1 + W with the one under way, V numbers of a level.
 """
@@ -221,8 +221,9 @@ def gain(before: Gained, batch: Batch, over: Array) -> tuple[Array, Gained]:
       over: [T, A] whether the episode ended with the step.
 
     Returns:
-      [T, A] positive value loss of the episode up to the step, the mean of max(advantage, 0) over
-      its transitions; and [A] the sums of the episodes under way afterwards.
+      [T, A] positive value loss of the episode up to the step, and [A] the sums of the episodes
+      under way afterwards. The loss is the mean of max(advantage, 0) over the episode's
+      transitions.
     """
     steps = over.shape[0]
 

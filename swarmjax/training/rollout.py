@@ -413,7 +413,7 @@ def _judge(program: Program, learners: LearnerState, arenas: Arena) -> _Judged:
 
 
 def restart[S: EnvState](arenas: S, starts: S, done: Array) -> S:
-    """Replaces episodes that are over with waiting ones.
+    """Replaces episodes that are over with waiting episodes.
 
     Args:
       arenas: [A]; their `sim` is the data of the physics.

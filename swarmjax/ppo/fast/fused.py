@@ -11,8 +11,8 @@ b_s is how far the mean action lies beyond -1..1.
 
 The kernels sum over samples. Factors and terms that all samples share, such as 1/n, are applied
 afterwards. The kernels take tiles of samples in any order. So once the valid samples lie first, the
-kernels can read the batch in place: a minibatch is a choice of tiles, and tiles without a valid
-sample are never read.
+kernels can read the batch in place. A minibatch is then a choice of tiles, and tiles without a
+valid sample are never read.
 """
 
 import functools

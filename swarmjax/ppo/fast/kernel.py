@@ -20,8 +20,8 @@ from jax.experimental.pallas import triton
 
 # Least width of an operand of a matrix product on the tensor cores.
 LEAST_WIDTH = 16
-# Greatest width of a layer: the sums for a 128 x 128 matrix take 128 of the 255 registers of each
-# of 128 threads.
+# Greatest width of a layer. The sums for a 128 x 128 matrix occupy 128 threads, and take 128 of the
+# 255 registers of each thread.
 MOST_WIDTH = 128
 # Bytes of the chip's memory that a program may use. Compute capability 8 and later gives at least
 # 99 KiB (CUDA C++ Programming Guide, "Technical Specifications per Compute Capability"). `fits`
@@ -91,8 +91,7 @@ class Tiles(NamedTuple):
 
     Attributes:
       order: [K], int32, numbers of tiles.
-      span: [2], int32, the part of `order` to take: from the first index up to, but not
-        including, the second.
+      span: [2], int32, two indices of `order`: the first to take, and the first to leave out.
     """
 
     order: jax.Array
@@ -167,7 +166,7 @@ def sums(
         chip.
       layout: Layout of `parameters`. `padded_width` leaves the widths of the hidden layers
         unchanged.
-      activation: Activation of the hidden layers: `tanh`, `relu` or `swish`.
+      activation: Activation of the hidden layers, `tanh`, `relu` or `swish`.
       loss: Loss of the output. Its results must be 0 for samples that do not count. It gets the
         layout's vectors with padding, and returns their derivatives under the same names.
       samples: By name, each [B] or [B, width], float32. `observation` [B, O] is the network's
