@@ -144,7 +144,7 @@ def init(stages: int, size: int, numbers: int) -> LevelBuffer:
 
 
 def probabilities(buffer: LevelBuffer, options: LevelNumbers) -> Array:
-    """Computes the probability of each level, given that a level of its stage is replayed.
+    """Computes how probable each level is, given that a level of the same stage is replayed.
 
     The probability is (1 - rho) P_score + rho P_stale. P_score is proportional to rank^(-1 /
     temperature). P_stale is proportional to the number of updates since an episode last began on

@@ -33,7 +33,7 @@ class Logger(Protocol):
       the updates, with the seeds of an update together.
     - If a run resumes from a checkpoint, or goes back to one after it diverged, the rows after the
       checkpoint come again. Then `update` drops, and the later rows are the valid ones. If the run
-      did not diverge, the later rows equal the earlier ones, except for times in seconds.
+      did not diverge, the later rows equal the earlier rows, except for times in seconds.
     - A logger that raises an error is not called again, except for `close`. The run prints a
       message and continues.
     - A run waits for a logger that lags `MOST_PENDING` calls behind. At its end, the run waits for

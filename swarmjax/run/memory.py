@@ -50,7 +50,7 @@ def check_buffer(settings: TrainConfig, needed: int, available: int | None) -> N
     Args:
       settings: the run's config.
       needed: memory for the buffers of all seeds, bytes. A device holds each buffer whole.
-      available: memory of the device, bytes; None if unknown, and then nothing is refused.
+      available: memory of the device, bytes; None if it is unknown, so that nothing is refused.
 
     Raises:
       ConfigError: if the buffer cannot fit. The message names a size that is certainly too large.
@@ -71,7 +71,7 @@ def check_state(settings: TrainConfig, needed: int, available: int | None) -> No
     Args:
       settings: the run's config.
       needed: memory for the state, bytes.
-      available: memory of the device, bytes; None if unknown, and then nothing is refused.
+      available: memory of the device, bytes; None if it is unknown, so that nothing is refused.
 
     Raises:
       ConfigError: if the state cannot fit. The message names a number of arenas that is certainly
@@ -88,7 +88,7 @@ def check(settings: TrainConfig, needed: int, available: int | None) -> None:
     Args:
       settings: the run's config.
       needed: memory for the compiled program, bytes.
-      available: memory of the device, bytes; None if unknown, and then nothing is refused.
+      available: memory of the device, bytes; None if it is unknown, so that nothing is refused.
 
     Raises:
       ConfigError: if the program does not fit. The message names a number of arenas that should

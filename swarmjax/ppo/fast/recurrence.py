@@ -165,7 +165,7 @@ def remember(
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _through(weights: _Weights, sequences: _Sequences, interpret: bool) -> jax.Array:
-    """Takes memories through sequences; returns the memory after each step, [T, B, H]."""
+    """Runs the unit through sequences; returns the memory after each step, [T, B, H]."""
     count, size = sequences.memory.shape
     steps = len(sequences.seen) // count
     every = pl.pallas_call(
