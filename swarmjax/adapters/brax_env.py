@@ -33,8 +33,9 @@ class SwarmBraxEnv(_base.Env):
     targets reached.
 
     A robot that has arrived waits for the others, and nothing must be learned from its transitions
-    while it waits. Brax cannot mask transitions, so these are marked as truncated. They stay in
-    Brax's batch, but with zero advantage and zero value error. Absent robots are left out.
+    while it waits. Brax cannot mask transitions, so these are marked as truncated. Marked
+    transitions stay in Brax's batch, but with zero advantage and zero value error. Absent robots
+    are left out.
     """
 
     def __init__(self, swarm: Swarm) -> None:

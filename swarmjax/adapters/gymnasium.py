@@ -25,8 +25,8 @@ class SwarmVectorEnv(_vector.VectorEnv):
     still until then: its reward is 0, `info["valid"]` is False, and its actions are ignored. It is
     `terminated` in the last step of the episode. Robots that ran out of time are `truncated`.
 
-    Autoreset is `SAME_STEP`: when an episode ends, the returned observation belongs to the next
-    one, and `info["final_obs"]` holds the last observation of the old episode. Absent robots are
+    Autoreset is `SAME_STEP`. When an episode ends, the returned observation belongs to the next
+    episode, and `info["final_obs"]` holds the last observation of the old one. Absent robots are
     left out.
 
     Attributes:

@@ -86,7 +86,7 @@ class SwarmMultiAgentEnv(_base):
     ) -> tuple[_ByAgent, SwarmState, _ByAgent, _ByAgent, _ByAgent]:
         """Makes a step as `step` does.
 
-        If it ends the episode, it returns the episode's last observation.
+        If the step ends the episode, the returned observation is the episode's last one.
         """
         state, came = self.robots.step(state, self._stack(actions))
         info = {name: getattr(came, name) for name in ("valid", "terminated", "truncated")}

@@ -17,8 +17,8 @@ class RobotStep(NamedTuple):
     """The outcome of a control step, robot by robot.
 
     Attributes:
-      observation: [N, O] the observation to act on. Where `over` is True, it belongs to the next
-        episode.
+      observation: [N, O] the observation to act on. Where `over` is True, this observation belongs
+        to the next episode.
       last: [N, O] the observation after the step, before any reset.
       reward: [N] the reward; 0 for robots that had already arrived.
       terminated: [N] whether the robot arrived in this step.
@@ -58,7 +58,7 @@ class RobotRow:
 
     @property
     def action_size(self) -> int:
-        """Size of a robot's action, U: the command, then its message, if it sends one."""
+        """Size of a robot's action, U: the command, then the message, if the robot sends one."""
         return self.swarm.world.action_size
 
     def observe(self, state: SwarmState) -> Array:

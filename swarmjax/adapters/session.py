@@ -1,6 +1,6 @@
 """Steps the robots of a swarm from the host with NumPy arrays, for libraries that use them.
 
-All errors have Gymnasium's types, also those for PettingZoo and Stable-Baselines3.
+All errors have Gymnasium's types, even if PettingZoo or Stable-Baselines3 drives the robots.
 """
 
 from typing import Any

@@ -24,8 +24,8 @@ class SwarmTorchEnv:
     until its arena is `over` and starts the next episode automatically. Absent robots are left out.
 
     JAX assumes that its arrays never change. So do not write into a tensor that this class has
-    returned, or into an action before the next step has returned. Actions must lie on the device on
-    which JAX computes, and their gradients are ignored.
+    returned. Do not write into an action either, until the step that it was given to has returned.
+    Actions must lie on the device on which JAX computes. Gradients of actions are ignored.
 
     Attributes:
       arena: [N] the arena of each row.

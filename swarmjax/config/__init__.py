@@ -2,8 +2,8 @@
 
 `section.py` turns plain data into frozen dataclasses, and refuses each mistake in one sentence.
 `files.py` composes the files of configs/ with the words of a command line. Each section of settings
-lies in the `config.py` of the package that it configures. This package imports no other package of
-the project. Start with `section.build`.
+lies in `config.py` of the package that the section configures. This package imports no other
+package of the project. Start with `section.build`.
 """
 
 from swarmjax.config.section import ConfigError, Section, about, build, show, to_dict

@@ -1,7 +1,7 @@
 """Composes the files of configs/ and the words of a command line into plain data, with Hydra.
 
-Hydra only composes the YAML files with the `key=value` words. It sets up no logging, does not
-change the directory, and is imported on first use. `section.build` takes the result.
+Hydra only composes the YAML files with the `key=value` words. Here Hydra sets up no logging and
+does not change the directory. It is imported on first use. `section.build` takes the result.
 """
 
 import contextlib
@@ -25,8 +25,8 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 _MOST_KEY = 200  # letters
 _MOST_VALUE = 5000  # letters
 _MOST_DEPTH = 32  # nested brackets
-# In all words together. A reference may contain several others, so a few references more would fill
-# the memory.
+# In all words together. A reference may contain several others, so only a few more references would
+# fill the memory.
 _MOST_REFERENCES = 16
 
 # Takes the composed data and the choice of each group, and returns the keys and values to check.
@@ -172,7 +172,7 @@ def read_choice(group: str, choice: str) -> dict[str, Any]:
 
     Args:
       group: a folder of configs/.
-      choice: the name of a file in it, or the path of another file.
+      choice: the name of a file in that folder, or the path of another file.
 
     Raises:
       ConfigError: if the file cannot be read, or if it is a user's file that chooses other files.
@@ -250,7 +250,7 @@ def check_choice(group: str, choice: str, key: str) -> None:
 
     Args:
       group: a folder of configs/.
-      choice: the name of a file in it, or the path of another file.
+      choice: the name of a file in that folder, or the path of another file.
       key: name of the setting in messages.
 
     Raises:
@@ -283,8 +283,8 @@ def split_words(cls: type[Section], overrides: Sequence[str]) -> dict[str, str]:
       The words, with text quoted for Hydra's grammar.
 
     Raises:
-      ConfigError: if a word is not `key=value`, has a key that `cls` does not have, or sets a key
-        that only the choice of a file sets.
+      ConfigError: if a word is not `key=value`, if its key is not in `cls`, or if its key can only
+        be set by choosing a file.
     """
     roots, derived = section.names(cls), section.keys(cls, derived=True)
     words = {}

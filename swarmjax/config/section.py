@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
 MAX_COUNT = 2**31 - 1  # counts and seeds are int32 on the device
-# Other numbers are float32, which holds nothing beyond `_LARGEST`. A device rounds numbers nearer
-# to 0 than `_SMALLEST` to 0.
+# Other numbers are float32, which holds nothing beyond `_LARGEST`. A device replaces a number by 0
+# if the number is nearer to 0 than `_SMALLEST`.
 _LARGEST, _SMALLEST = 3.4e38, 1.2e-38
 _MOST_NAME = 255  # bytes in a file name, on Linux, macOS and Windows
 _MOST_PATH = 4095  # bytes in a path on Linux, which allows the most
@@ -91,7 +91,7 @@ def about(  # noqa: PLR0913  # most calls give two or three
       above: a number that the value must exceed.
       below: a number that the value must stay below.
       derived: whether the chosen files determine the value, so that the command line cannot set it.
-      stored: whether `to_dict` keeps it. Other fields are computed again.
+      stored: whether `to_dict` keeps the field. Fields that are not kept are computed again.
       renamed: new names of values, by old name.
       reason: why `high` is the limit and how to raise it, for the error message.
     """
@@ -102,7 +102,7 @@ def about(  # noqa: PLR0913  # most calls give two or three
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A group of settings. When it is made, its numbers are checked against their bounds.
+    """A group of settings. When a section is made, its numbers are checked against their bounds.
 
     Attributes:
       command: name of the command's file in configs/, if the section holds all keys of a command.
@@ -182,8 +182,8 @@ def build[C: Section](cls: type[C], mapping: Mapping[str, Any], where: str = "")
 
     Args:
       cls: the dataclass to make.
-      mapping: its keys and values, as `to_dict`, JSON or YAML give them.
-      where: the prefix of its keys in messages, such as `sim.`.
+      mapping: keys and values of the dataclass, as `to_dict`, JSON or YAML give them.
+      where: the prefix of the keys in messages, such as `sim.`.
 
     Returns:
       An instance of `cls`.
@@ -315,7 +315,8 @@ class KeyLine(NamedTuple):
 
     Attributes:
       key: the dotted key.
-      default: its default as it would be typed, or the source of its default in angle brackets.
+      default: the key's default as it would be typed, or the source of the default in angle
+        brackets.
       meaning: meaning and unit of the key; empty if the field states none.
       allowed: the type and bounds of its values.
     """

@@ -1,10 +1,10 @@
 """The curriculum's engine: it assigns stages to arenas, judges each stage, and times decisions.
 
 All of it runs on the device, for any mode of `modes.py`. Episodes are counted in cohorts: a cohort
-holds all episodes that began within one step limit. Its verdict falls another step limit later,
-when its last episode has ended. An earlier verdict would count only the short episodes, which are
-the lucky ones, and would promote too early. An episode counts for the stage and the cohort in which
-it began.
+holds all episodes that began within one step limit. The verdict on a cohort comes one step limit
+after that, when the cohort's last episode has ended. An earlier verdict would count only the short
+episodes, which are the lucky ones, and would promote too early. An episode counts for the stage and
+the cohort in which it began.
 """
 
 import math
@@ -35,11 +35,12 @@ NEVER = np.iinfo(np.int32).max  # as a deadline
 # The golden ratio in steps of 2**-32: no other number has multiples that fill the circle more
 # evenly (Knuth, The Art of Computer Programming 3, section 6.4, multiplicative hashing, theorem S).
 _GOLDEN = np.uint32(2654435769)
-# A verdict on n trials moves `fast` towards its success, by n / (n + 20) of the way: as if there
-# had been 20 earlier trials with the old result. A few episodes then cannot outweigh many earlier
-# ones.
+# A verdict on n trials moves `fast` towards the success in these trials, by n / (n + 20) of the
+# way. The old result then counts as much as 20 trials. A few episodes then cannot outweigh many
+# earlier ones.
 _PRIOR_TRIALS = 20.0
-# The success of these 20 trials before the first verdict: one half, where p (1 - p) is largest.
+# Before the first verdict, these 20 trials count with a success of one half, where p (1 - p) is
+# largest.
 _PRIOR_SUCCESS = 0.5
 # `slow` moves a fifth as fast, so it lags about five verdicts behind. |fast - slow| is how far
 # success has moved since then. This is the learning progress of Kanitscheider et al. 2021
@@ -96,7 +97,9 @@ class CohortTally(NamedTuple):
 
 
 class Record(NamedTuple):
-    """The record of each stage, [S] each; nan, and 0 episodes, before its first verdict.
+    """The record of each stage, [S] each.
+
+    Before a stage's first verdict, `episodes` is 0 and all other figures are nan.
 
     Attributes:
       episodes: episodes of the newest verdict, int32.
@@ -105,7 +108,7 @@ class Record(NamedTuple):
       contacts: per robot.
       reward: per robot.
       fast: running mean of the deciding success.
-      slow: running mean of the same success, which changes five times as slowly.
+      slow: another running mean of this success; it changes five times as slowly.
     """
 
     episodes: Array
@@ -155,7 +158,7 @@ class CohortVerdict(NamedTuple):
     """The findings of an update.
 
     Attributes:
-      over: [] whether a cohort is over, and therefore all episodes of the cohort before have ended.
+      over: [] whether a cohort is over. All episodes of the cohort before it have then ended.
       judged: [S] whether the cohort before had episodes on the stage; all False unless `over`.
       success: [S] deciding success of each stage's newest verdict; nan before the first.
     """
@@ -254,7 +257,7 @@ def last_begins(schedule: Schedule) -> int:
       schedule: the curriculum's numbers.
 
     Returns:
-      Updates; 0 for a single stage, `NEVER` or more if a stage has no deadline.
+      The update: 0 for a single stage, and `NEVER` or more if a stage has no deadline.
     """
     begins = 0
     for deadline in np.asarray(schedule.deadline)[:-1].tolist():
@@ -316,11 +319,12 @@ def begin_cohort(curriculum: Curriculum) -> Curriculum:
 def assign(curriculum: Curriculum, arenas: int) -> Array:
     """Chooses the stage [A] on which the next episode of each arena begins.
 
-    The weights divide a line into stages. Arena a is at the point (a + u) / A of this line, so that
-    the share of arenas, and of time, on a stage is its weight. From cohort to cohort, u moves by
-    the golden ratio. If there are few arenas, each then visits every stage over time. If there are
-    many, most stay on their stage. That matters because an arena that moves must wait for its
-    episode to end: if all arenas moved, stages with long episodes would get more than their share.
+    The weights divide a line into stages. Arena a is at the point (a + u) / A of this line. So a
+    stage's weight is its share of the arenas, and also its share of the time. From cohort to
+    cohort, u moves by the golden ratio. If there are few arenas, each arena visits every stage over
+    time. If there are many arenas, most of them stay on their stage. That matters because an arena
+    that moves must wait until its episode ends. If all arenas moved, stages with long episodes
+    would get more than their share.
 
     Args:
       curriculum: its current state.
@@ -334,7 +338,7 @@ def assign(curriculum: Curriculum, arenas: int) -> Array:
     ends = jnp.cumsum(curriculum.weights)
     inner = (ends / ends[-1])[:-1]
     stage = jnp.searchsorted(inner, point, side="right", method="compare_all")
-    # The last point may round to 1, and would otherwise fall behind all stages with a weight.
+    # The last point may round to 1. Without a limit it would lie behind all stages with a weight.
     last = jnp.max(jnp.where(curriculum.weights > 0.0, jnp.arange(ends.shape[0]), 0))
     return jnp.minimum(stage, last).astype(jnp.int32)
 

@@ -1,8 +1,8 @@
 """A buffer of levels: which levels are played again, and which are replaced.
 
 The curriculum's mode chooses the stage on which an episode begins. The buffer chooses the level of
-that stage. Each stage has an equal part of the buffer, so no stage displaces another, and the share
-of arenas on a stage stays its weight. The buffer stores the numbers that define a level.
+that stage. Each stage has an equal part of the buffer, so no stage displaces another. The share of
+arenas on a stage remains the stage's weight. The buffer stores the numbers that define a level.
 
 - Prioritised level replay: Jiang et al. 2021, "Prioritized Level Replay", arXiv:2010.03934.
 - Learnability: Rutherford et al. 2024, "No Regrets: Investigating and Improving Regret
@@ -25,8 +25,8 @@ from jax import Array
 
 from swarmjax.curriculum.config import LevelsConfig
 
-# Sources of an episode other than a level in the buffer: a level just drawn, a mutation of one in
-# the buffer, or a level that has since been replaced.
+# Sources of an episode that begins on no level of the buffer: a level just drawn, a mutation of a
+# level in the buffer, or a level that has since been replaced.
 FRESH, MUTATED, LOST = -1, -2, -3
 
 # Score of an empty place, below every real score.
@@ -34,8 +34,8 @@ _EMPTY = -1.0
 # Episodes after which a level's older results fade, because the policy changes. The number is this
 # project's choice.
 _MEMORY = 16.0
-# Weight of what is known before a level's first episode: as much as two episodes with the mean
-# success of its stage. The number is this project's choice.
+# Weight of what is known before a level's first episode. This knowledge counts as much as two
+# episodes with the mean success of the level's stage. The number is this project's choice.
 _PRIOR_EPISODES = 2.0
 _LARGEST_STEP = 0.25  # largest share of its range by which a mutation moves a number: our choice
 _BELOW_ONE = np.float32(1.0 - 2.0**-24)  # the largest float32 below 1
@@ -95,12 +95,12 @@ class Play(NamedTuple):
     """Episodes of an update, [N].
 
     Attributes:
-      slot: place in the buffer of the level on which the episode began, counted through all stages;
-        or `FRESH`, `MUTATED` or `LOST`.
+      slot: place of the episode's level in the buffer, counted through all stages; or `FRESH`,
+        `MUTATED` or `LOST`.
       stage: stage of the level.
       begun: whether the episode began in this update.
       ended: whether the episode ended in this update.
-      successes: number of successful trials, int32; 0 unless it ended.
+      successes: number of successful trials, int32; 0 unless the episode ended.
       trials: number of robots, or 1 if the episode counts as a whole, int32.
       loss: positive value loss, mean over the transitions of all robots.
       numbers: [.., V] numbers that define the level.
@@ -144,10 +144,11 @@ def init(stages: int, size: int, numbers: int) -> LevelBuffer:
 
 
 def probabilities(buffer: LevelBuffer, options: LevelNumbers) -> Array:
-    """Computes the probability of each level, given that a level of its stage is replayed.
+    """Computes how probable each level is, given that a level of the same stage is replayed.
 
-    It is (1 - rho) P_score + rho P_stale. P_score is proportional to rank^(-1 / temperature), and
-    P_stale to the updates since the level was last begun (Jiang et al. 2021, equations 2 to 5).
+    The probability is (1 - rho) P_score + rho P_stale. P_score is proportional to rank^(-1 /
+    temperature). P_stale is proportional to the number of updates since an episode last began on
+    the level (Jiang et al. 2021, equations 2 to 5).
 
     Args:
       buffer: buffer of levels.
@@ -166,7 +167,7 @@ def probabilities(buffer: LevelBuffer, options: LevelNumbers) -> Array:
 
 
 def _normal(weight: Array) -> Array:
-    """Divides weights [S, C] by their sum on each stage, unless that is 0."""
+    """Divides weights [S, C] by their sum on each stage, unless that sum is 0."""
     total = jnp.sum(weight, axis=1, keepdims=True)
     return weight / jnp.where(total > 0.0, total, 1.0)
 
@@ -191,8 +192,8 @@ def choose(buffer: LevelBuffer, options: LevelNumbers, stage: Array, picks: Arra
     share = options.replay * jnp.mean(held.astype(jnp.float32), axis=1)
     ends = jnp.cumsum(probabilities(buffer, options), axis=1)
     ends = ends / jnp.maximum(ends[:, -1:], np.finfo(np.float32).tiny)
-    # Puts the cumulative shares of all stages on one line, each shifted by its stage's index, so
-    # that one search suffices.
+    # Puts the cumulative shares of all stages on one line, so that one search suffices. The shares
+    # of a stage are shifted by the stage's index.
     line = (ends + jnp.arange(stages)[:, None]).ravel()
     found = jnp.searchsorted(line, stage + picks[:, 1], side="right")
     # Rounding may lead past a stage's last level, or to the end of the stage before.
@@ -268,9 +269,9 @@ def _mode(config: LevelsConfig) -> str:
 def _learnability(episodes: Array, successes: Array, loss: Array, usual: Array) -> Array:
     """Returns the expected p (1 - p) of a level, given its episodes alone.
 
-    If p has a beta distribution with parameters a and b, this is a b / ((a + b) (a + b + 1)). It
-    grows with the number of episodes: one episode is too little evidence to displace a level with p
-    near 1/2.
+    If p has a beta distribution with parameters a and b, this is a b / ((a + b) (a + b + 1)). The
+    result grows with the number of episodes: one episode is too little evidence to displace a level
+    with p near 1/2.
     """
     a = successes + _PRIOR_EPISODES * usual
     b = episodes - successes + _PRIOR_EPISODES * (1.0 - usual)
@@ -362,7 +363,7 @@ def describe(buffer: LevelBuffer, plays: Play) -> dict[str, Any]:
 
 
 def mutate(numbers: Array, movable: Array, picks: Array) -> Array:
-    """Changes one thing of a level: moves one of its numbers by at most a quarter of its range.
+    """Changes one thing in a level: moves one number by at most a quarter of that number's range.
 
     Args:
       numbers: [V] numbers that define the level.

@@ -20,8 +20,8 @@ def log(rows: Sequence[dict], names: Sequence[str], seed: int) -> list[dict]:
       One entry for each decision: `update`, `seed` and `why`. A promotion or demotion also has
       `from`, `to` and the results on the stage that was left (`targets_reached`, `all_reached`,
       `episodes`). New weights have `weights` and `success`, by stage. With a curriculum over
-      levels, `levels` gives, by stage, how many levels the buffer has (`held`) and their mean
-      `success` and `score`.
+      levels, the entry also has `levels`. For each stage it gives the number of levels in the
+      buffer (`held`), and the mean `success` and `score` of these levels.
     """
     return [
         {"update": row["update"], "seed": seed, **_entry(row, names), **_levels(row, names)}

@@ -1,9 +1,9 @@
 """The modes of the curriculum: each decides which stages are trained, and how much.
 
-A mode is one pure function of the signature `engine.Mode`. After each update it gets the curriculum
-with its newest verdicts, and returns the newest stage, the share of the arenas on each stage, and
-the reason. It is also called before the first update, without verdicts, and then returns where a
-run begins.
+A mode is one pure function of the signature `engine.Mode`. After each update a mode gets the
+curriculum with its newest verdicts, and returns the newest stage, the share of the arenas on each
+stage, and the reason. A mode is also called before the first update, without verdicts, and then
+returns where a run begins.
 """
 
 import jax
@@ -38,9 +38,8 @@ def sequential(
     """Puts all arenas on the newest stage, and moves all of them on to the next stage or back.
 
     The next stage begins when a whole cohort of the current stage has reached `threshold`, or at
-    the stage's deadline. The previous stage returns when a whole cohort has stayed below
-    `demotion`, unless the previous stage's deadline is past. At least one step limit lies between
-    two decisions.
+    the stage's deadline. If a whole cohort has stayed below `demotion`, the previous stage returns,
+    unless its deadline is past. At least one step limit lies between two decisions.
 
     Args:
       curriculum: state of the curriculum; its record has the newest verdicts.
@@ -95,13 +94,14 @@ def adaptive(
     """Trains all stages at once, with weights from their `score` and a floor for every stage.
 
     The weights are computed again after every cohort. The score `learnability` is p (1 - p), where
-    p is the success: nothing is learned where every episode succeeds or none does (Tzannetos et al.
-    2023, "Proximal Curriculum for Reinforcement Learning Agents", arXiv:2304.12877; Rutherford et
-    al. 2024, "No Regrets: Investigating and Improving Regret Approximations for Curriculum
-    Discovery", arXiv:2408.15099). `progress` is how far success has recently risen or fallen, so
-    that forgotten stages come back (Kanitscheider et al. 2021, arXiv:2106.14876). `failure` is 1 -
-    p: a stage that never succeeds is practised most, whereas `learnability` gives such a stage only
-    the floor. `failure` is useful if all stages can be solved.
+    p is the success. The reason is that nothing is learned where every episode succeeds or none
+    does (Tzannetos et al. 2023, "Proximal Curriculum for Reinforcement Learning Agents",
+    arXiv:2304.12877; Rutherford et al. 2024, "No Regrets: Investigating and Improving Regret
+    Approximations for Curriculum Discovery", arXiv:2408.15099). `progress` is how far success has
+    recently risen or fallen, so that forgotten stages come back (Kanitscheider et al. 2021,
+    arXiv:2106.14876). `failure` is 1 - p, so a stage that never succeeds is practised most.
+    `learnability` gives such a stage only the floor. `failure` is useful if all stages can be
+    solved.
 
     With `prerequisites` the first stages of the sequence are practised alone, until all of them
     reach `threshold` or the deadline is past. Their skills are then learned before the other stages

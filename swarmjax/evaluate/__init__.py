@@ -1,4 +1,4 @@
-"""Judges policies on levels that they never trained on, in another engine than that of training.
+"""Judges policies on levels that they never trained on, in an engine that did not train them.
 
 It imports `task`, `sim` and policy files, and no JAX. Two modules import more: `engine_mjx.py`
 judges on the device and imports `training` and `ppo` too, and `trials.py` stores its programs in

@@ -52,7 +52,10 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _say(sentence: str, keep: Path | None, done: int, cells: int) -> None:
-    """Prints which settings come from the policies, before the judging, which takes a minute."""
+    """Prints which settings come from the policies, before judging starts.
+
+    Judging takes a minute.
+    """
     sys.stdout.write(f"swarmjax.evaluate: {sentence}\n")
     if done:
         sys.stdout.write(f"swarmjax.evaluate: {done} of {cells} cells were judged before, {keep}\n")

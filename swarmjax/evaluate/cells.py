@@ -1,8 +1,8 @@
 """Cells: sets of levels for judging policies, drawn from numbers or read from a file.
 
-A suite is a list of cells. Each cell has a digest of its levels, so that everybody who draws them
-can check that they are the same to the last bit. Levels of a suite are drawn for the nominal
-e-puck.
+A suite is a list of cells. Each cell has a digest of its levels. By comparing digests, everybody
+who draws the levels can check that every bit is the same. Levels of a suite are drawn for the
+nominal e-puck.
 """
 
 import io
@@ -33,7 +33,7 @@ _TARGET_RADIUS = TaskConfig().target_radius
 _LARGEST_HALF = 2.5  # m, largest half edge of a box: longer than half the largest arena
 MAX_BYTES = 2**30  # bytes of all levels of a file; a thousand levels of s6 take 0.2 MB
 _LEAST_ROOM = 2**22  # bytes to which any file may unpack, plus `_PACKED` times its own size
-_PACKED = 20  # most times by which packing may shrink a file: random numbers only halve
+_PACKED = 20  # greatest factor by which packing may shrink a file; for random numbers it is 2
 
 
 class Cell(NamedTuple):
@@ -210,7 +210,7 @@ def _arrays(cell: Cell) -> dict[str, np.ndarray]:
 
 
 def write(path: Path, suite: Suite) -> None:
-    """Writes levels for other tools, whole or not at all; docs/evaluation.md lists the fields.
+    """Writes levels for other tools, completely or not at all; docs/evaluation.md lists the fields.
 
     Args:
       path: Path of the .npz file.

@@ -37,8 +37,8 @@ def steps_to(steps: ArrayLike, values: ArrayLike, threshold: float) -> np.ndarra
       threshold: threshold to reach from below, in the same unit.
 
     Returns:
-      [...] in the unit of steps: the first step if a curve begins at the threshold, inf if it never
-      reaches it. `iqm`, `np.median` and `probability_of_improvement` accept inf.
+      [...] in the unit of steps: the first step if a curve begins at the threshold, inf if a curve
+      never reaches the threshold. `iqm`, `np.median` and `probability_of_improvement` accept inf.
 
     Raises:
       ValueError: There are fewer than two points, steps do not rise, or a number is not finite.

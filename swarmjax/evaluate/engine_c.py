@@ -280,8 +280,8 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
     Args:
       judge: Data that the arenas share.
       arenas: Their state before.
-      action: [A, R, U] actions of the robots, -1..1; None: the policy, which must have no memory,
-        chooses them.
+      action: [A, R, U] actions of the robots, -1..1; None: the policy chooses them, and must have
+        no memory.
 
     Returns:
       Their state after.
@@ -345,7 +345,7 @@ def _hear(
 
 
 class _Step(NamedTuple):
-    """The events of a control step: [A, R], and for contacts [A, R, 3] by kind, for rays [A, R, K].
+    """The events of a control step, [A, R]. Contacts are [A, R, 3] by kind, and rays are [A, R, K].
 
     `arrived` tells which robots have arrived after the step, and `near` which rays met something.
     """
@@ -441,7 +441,8 @@ def _push(model: mujoco.MjModel, data: mujoco.MjData) -> _Pushes:
     """Reads the normal forces of all contacts from the solver's rows.
 
     A contact without friction has one row, its normal force. With an elliptic cone the first row is
-    the normal force. With a pyramid, all edges push along the normal, and their sum is the force.
+    the normal force. With a pyramid, all edges push along the normal, and the sum of their forces
+    is the normal force.
     """
     contact = data.contact
     # MuJoCo lists a contact at a distance of exactly 0, but does not solve for it.

@@ -1,9 +1,9 @@
 """Judges policies on the training device and in the training engine, many arenas at once.
 
-The levels are the same as in `swarmjax.evaluate`, drawn by the same function from the same seed,
-and the rules and figures are the same. The engine differs: it is the training engine, with its
-analytic sensors and few solver steps. Published results come from MuJoCo C. This engine is cheap,
-which suits studies that judge their policies again and again while they learn.
+The levels are the same as in `swarmjax.evaluate`: the same function draws them from the same seed.
+The rules and figures are the same too. The engine differs: it is the training engine, with its
+analytic sensors and few solver steps. Published results come from MuJoCo C. This engine is cheap.
+That suits studies that judge policies again and again while the policies learn.
 """
 
 import functools
@@ -53,7 +53,7 @@ class Outcomes(NamedTuple):
       all_reached: 1 if every robot arrived, else 0.
       contacts_per_robot: contacts of all kinds per robot.
       episode_time_s: time until all robots arrived or the time was out, s.
-      broken: 1 if the physics stopped being finite, which ended the episode, else 0.
+      broken: 1 if the episode ended because the physics stopped being finite, else 0.
     """
 
     targets_reached: Array
@@ -67,8 +67,8 @@ def draw_levels(world: World, stage: StageConfig, seed: int, episodes: int) -> L
     """Draws the levels of `swarmjax.evaluate`, padded to the world's robots and obstacles.
 
     Args:
-      world: the compiled environment. Its config has this stage, or a stage with obstacles as
-        large.
+      world: the compiled environment. Its config has this stage, or a stage with obstacles of the
+        same size.
       stage: stage of the levels.
       seed: seed of the evaluation.
       episodes: E.
@@ -108,7 +108,7 @@ def _make_room(drawn: Level, spacing: Spacing) -> Level:
         start=widened(drawn.start, robots),
         target=widened(drawn.target, robots),
         obstacle_present=widened(drawn.obstacle_present, obstacles),
-        # Parked obstacles need edges too; no robot meets them.
+        # Parked obstacles need edges too, although no robot meets these obstacles.
         obstacle=widened(drawn.obstacle, obstacles, (0, 0, 0, placement.MARGIN, placement.MARGIN)),
     )
     return level.park(wider, np)
@@ -312,8 +312,8 @@ def outcomes(
       sampled: whether to draw the actions from the policies; otherwise they are their means.
 
     Returns:
-      [E] outcomes. An episode whose physics breaks ends at that step, with its robots where they
-      were before it.
+      [E] outcomes. If the physics of an episode breaks, the episode ends at that step, and its
+      robots stay where they were before the step.
     """
     act = partial(_choose, config, learners, sampled=sampled)
     memory = networks.begin_memory(config, levels.present.shape)
@@ -344,7 +344,7 @@ def _choose(
 
 
 class _Counts(NamedTuple):
-    """Counts of `Outcome` that training does not need, [E, R, ...]; `anchor` as in the judge."""
+    """Counts of `Outcome` that training does not need, [E, R, ...]; `anchor` is as in the judge."""
 
     arrival: Array
     touched: Array
@@ -360,7 +360,7 @@ _Actor = Callable[[Any, EnvState], tuple[Any, Array]]
 def _run(
     world: World, act: _Actor, levels: Level, steps: int, memory: Array | None
 ) -> tuple[EnvState, _Counts, Array]:
-    """Runs an episode of each level; returns the final arenas, counts and which arenas broke."""
+    """Runs an episode of each level; returns final arenas, counts, and whether each arena broke."""
     robots, obstacles = world.spacing.robots, world.spacing.obstacles
     chex.assert_shape(levels.present, (None, robots))
     chex.assert_shape(levels.obstacle, (len(levels.side), obstacles, 5))

@@ -42,8 +42,8 @@ def evaluate(
     Args:
       settings: Settings of the evaluation.
       progress: Progress display; None shows nothing.
-      announce: Called once all inputs are checked, before the first episode, with two numbers: of
-        the cells already judged, and of all cells.
+      announce: Called before the first episode, once all inputs are checked. Its arguments are the
+        number of cells already judged and the number of all cells.
       keep: Folder to save each finished cell in, from which the same evaluation resumes; None
         saves nothing.
 

@@ -27,7 +27,7 @@ from swarmjax.task.electronics import Electronics
 from swarmjax.task.observation import View
 from swarmjax.task.stage_config import StageConfig
 
-SOLVER_ITERATIONS = 100  # at most, MuJoCo's default; the solver stops at its tolerance of 1e-8
+SOLVER_ITERATIONS = 100  # MuJoCo's default limit; the solver stops earlier at its tolerance of 1e-8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,8 +73,8 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
     Args:
       config: Settings of the evaluation.
       trained: The policy to judge.
-      half: [M, 2] half edges of the boxes in the coming levels, m; None: the half edges that stage
-        and `shape` give.
+      half: [M, 2] half edges of the boxes in the coming levels, m. None means the half edges that
+        stage and `shape` give.
 
     Returns:
       The judge.
@@ -126,11 +126,11 @@ def neighbours(trained: Policy) -> NeighboursConfig:
 
 
 def substeps(config: EvaluateConfig) -> int:
-    """Returns the physics steps of a control step; by default they are half as long as in training.
+    """Returns the physics steps of a control step; by default each is half as long as in training.
 
-    When a robot is blocked, its slipping wheels hop, because MuJoCo's contacts, like all convex
-    ones, separate sliding surfaces. They hop by 1.3 mm in steps of 16 ms, and by 0.8 mm in steps of
-    8 ms or less.
+    When a robot is blocked, its slipping wheels hop, because MuJoCo's contacts separate sliding
+    surfaces, as all convex contacts do. The wheels hop by 1.3 mm with physics steps of 16 ms, and
+    by 0.8 mm with steps of 8 ms or less.
     """
     finer = 2 if config.robot.body == "wheeled" and config.substeps is None else 1
     return finer * physics_substeps(config.robot, config.substeps)
@@ -144,7 +144,7 @@ def _compile(config: EvaluateConfig, half: np.ndarray) -> tuple[mujoco.MjModel, 
     robot = task_factors.largest(config.robot, config.realism)
     spec = sim_model.build(robot, size, timestep, ray_geoms=True)
     spec.option.iterations = SOLVER_ITERATIONS
-    # Numbers that are not finite are better than a robot silently reset to its first place.
+    # If numbers are not finite, MuJoCo would silently reset the robots to their first places.
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     # The half edges are compiled in, not set later, so that MuJoCo derives its bounds from them.
     for i, edges in enumerate(half):
@@ -154,7 +154,7 @@ def _compile(config: EvaluateConfig, half: np.ndarray) -> tuple[mujoco.MjModel, 
 
 
 def _geoms(compiled: mujoco.MjModel, ids: sim_model.Ids) -> tuple[np.ndarray, np.ndarray]:
-    """Returns each geom's robot, if it is a contact geom, and its kind of contact."""
+    """Returns for each geom the robot whose contact geom it is, if any, and the kind of contact."""
     robot = np.full(compiled.ngeom, -1)
     kind = np.full(compiled.ngeom, gaps.KINDS.index("wall"))
     kind[ids.obstacle_geom] = gaps.KINDS.index("obstacle")
@@ -194,7 +194,7 @@ def check_policy(
       trained: The policy.
 
     Raises:
-      PolicyError: It has other observations, or too few learners.
+      PolicyError: The policy has other observations, or too few learners.
       ConfigError: The policy needs a part of an extension that is missing.
     """
     extensions, needs = extension.load(config.extensions), trained.meta.get("extensions", {})

@@ -10,11 +10,11 @@ import numpy as np
 
 from swarmjax.sim import gaps
 
-# A robot is in a deadlock if, at the time-out, it is within STILL_RADIUS of the place where it was
-# STILL_TIME earlier: it has not arrived and does not move (Grover, Liu & Sycara 2020, "Deadlock
-# Analysis and Resolution in Multi-Robot Systems"). The authors require speed 0, but a robot that
-# turns on the spot or pushes never has exactly that speed. Both numbers are this project's choice:
-# at full speed a robot drives 0.63 m in that time.
+# A robot is in a deadlock if, at the time-out, it has not arrived and does not move (Grover, Liu &
+# Sycara 2020, "Deadlock Analysis and Resolution in Multi-Robot Systems"). It does not move if it is
+# within STILL_RADIUS of the place where it was STILL_TIME earlier. The authors require speed 0, but
+# a robot that turns on the spot or pushes never has exactly that speed. Both numbers are this
+# project's choice: at full speed a robot drives 0.63 m in STILL_TIME.
 STILL_RADIUS = 0.02  # m
 STILL_TIME = 5.0  # s
 
@@ -26,8 +26,8 @@ class Outcome(NamedTuple):
       clock: [A] control steps since the start.
       arrived: [A, R] whether the robot has arrived; with `task.arrival=hold`, whether it is
         within its target.
-      arrival: [A, R] control steps until the robot arrived, 0 if it has not; with `hold`, control
-        steps until it was within its target and stayed there.
+      arrival: [A, R] control steps until the robot arrived; 0 if it has not arrived. With `hold`,
+        control steps until it was within its target and stayed there.
       contacts: [A, R, 3] contacts of each kind of `gaps.KINDS`, also after arrival.
       touched: [A, R, 3] control steps at whose end the robot touched something, also after arrival.
       impulse: [A, R, 3] normal impulse of the contacts, N s; nan if the engine does not compute it.
@@ -35,8 +35,8 @@ class Outcome(NamedTuple):
       moving: [A, R] control steps before arrival; with `hold`, control steps that began outside the
         target.
       path: [A, R] distance driven before arrival, m; with `hold`, in the steps of `moving`.
-      still: [A, R] control steps for which the robot, before its arrival, has stayed within
-        STILL_RADIUS of one place.
+      still: [A, R] for how many control steps the robot has now stayed within STILL_RADIUS of one
+        place; 0 if it has arrived.
     """
 
     clock: np.ndarray
@@ -56,7 +56,8 @@ class Measure(NamedTuple):
 
     Attributes:
       label: Name of the measure in a table.
-      unit: Unit of the number; `%` is a share of 0 to 1, shown in per cent; a count has none.
+      unit: Unit of the number. `%` means a share of 0 to 1 that is shown in per cent. A count has
+        no unit.
       is_good: Whether larger numbers are better.
     """
 

@@ -1,6 +1,6 @@
 """Plans: proof that the robots of a level can all arrive if one moves at a time.
 
-A plan is found on a grid, for discs of the hull's radius. `check` tests it against the exact
+A plan is found on a grid, for discs of the hull's radius. `check` tests the plan against the exact
 shapes, with independent arithmetic. If no robot can reach its target, one robot first steps aside
 to let another pass: into a bay, or off another robot's target. A robot stops for good as soon as it
 has reached its target. NumPy only.
@@ -14,7 +14,7 @@ import numpy as np
 
 from swarmjax.task.level import Level
 
-CELL = 0.015  # m, of the grid; in the narrowest door, 0.10 m, a hull's centre can move by 0.023 m
+CELL = 0.015  # m, of a grid cell; in the narrowest door, 0.1 m, a hull's centre can move by 0.023 m
 _SPARE = 0.0016  # m, added to the hull: between two cells a disc comes up to 1.5 mm nearer a corner
 _NEVER = np.iinfo(np.int32).max // 2
 _ORDERS = 30  # orders of robots to try: a robot that parks first may block others
@@ -205,7 +205,7 @@ def _descend(grid: _Grid, far: np.ndarray, place: np.ndarray) -> np.ndarray | No
 
 
 def _walk(far: np.ndarray, cell: tuple[int, ...], place: np.ndarray) -> list[np.ndarray]:
-    """Lists the places on the way from a cell to a goal, where `far` is 0."""
+    """Lists the places on the way from a cell to a goal; `far` is 0 at a goal."""
     found = []
     while far[cell]:
         around = [(cell[0] + i, cell[1] + j) for i, j in _STEPS]

@@ -101,8 +101,8 @@ def hidden(
     along = place[:, None] - place[:, :, None]
     distance = np.linalg.norm(along, axis=-1)
     middle = 0.5 * (place[:, None] + place[:, :, None])
-    # First compares circles around line and box, because most pairs of robots then need no ray at
-    # all.
+    # First compares a circle around the line with one around the box. Most pairs of robots then
+    # need no ray at all.
     near = _apart(middle, obstacle[..., :2]) <= half[:, None, None] + 0.5 * distance[..., None]
     asked = (distance <= reach) & np.triu(np.ones(distance.shape[1:], bool), 1)
     found = np.zeros(distance.shape, bool)
@@ -145,7 +145,7 @@ def brightness(scene: RayScene, shades: infrared.Reflectance, geom: np.ndarray) 
 def _near(
     scene: RayScene, middle: np.ndarray, place: np.ndarray, obstacle: np.ndarray
 ) -> np.ndarray:
-    """Tells which rays [A, R, K] may meet anything, from circles around the rays and all things.
+    """Tells which rays [A, R, K] may meet anything, by comparing circles around rays and things.
 
     Casting rays is the slowest part, and most rays meet nothing. For the walls, the stage's
     smallest arena is assumed.

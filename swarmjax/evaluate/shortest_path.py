@@ -2,8 +2,8 @@
 
 If the straight line is free and ends inside the walls, it is the path. Otherwise the path follows
 the outlines of obstacles, widened by the disc's radius. `CORNER` points outside each round corner
-replace the arc. They lengthen a path by at most 0.8 mm for each right angle that it turns (tan(x) /
-x - 1 = 1.3 % of a quarter circle of 0.037 m, x = 11.25 degrees). NumPy only.
+replace the arc. They lengthen a path by at most 0.8 mm for each right angle that the path turns
+(tan(x) / x - 1 = 1.3 % of a quarter circle of 0.037 m, x = 11.25 degrees). NumPy only.
 
 The robots of an arena share these points. Each line between two points is tested at most once, and
 only if it could be part of a shortest path.
@@ -19,7 +19,7 @@ GOAL = 24  # points on the circle around a target, used if the straight way to i
 _SLACK = 1e-6  # m; touching does not block
 _SIGNS = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
 # These three numbers change the computing time, never the result.
-_DETOUR = 1.1  # times the straight line: paths up to this length are tried first, most are shorter
+_DETOUR = 1.1  # times the straight line's length; most paths are shorter, and these are tried first
 _NEAREST = 8  # each line is tested first against this many nearest boxes, which block most lines
 # With more pairs of a line and a box than this, testing the nearest boxes first is faster.
 _MANY = 1000
@@ -99,7 +99,7 @@ def shortest(
       target: [A, R, 2] m.
       obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m); absent ones stand far away.
       hull_radius: Radius of the disc, m.
-      target_radius: Required distance of its centre from the target, m.
+      target_radius: Required distance of the disc's centre from the target, m.
 
     Returns:
       [A, R] m; inf where there is no path.
@@ -134,9 +134,9 @@ def _arena(inside: float, obstacle: np.ndarray, hull: float) -> _Arena:
 def _way(arena: _Arena, start: np.ndarray, target: np.ndarray, reach: float) -> float:
     """Computes the length of the shortest path of one robot, m.
 
-    A path of a given length stays within an ellipse: the points whose distances to start and target
-    add up to at most that length. So the points in a small ellipse suffice if they give a path that
-    is no longer.
+    A path of a given length stays within an ellipse. The ellipse holds the points whose distances
+    to start and target add up to at most that length. So the points in a small ellipse suffice if
+    they give a path that is no longer.
     """
     boxes, place = arena.boxes, arena.outline.place
     begin = _see(start[None], boxes)
@@ -174,7 +174,7 @@ def _divide(arena: _Arena) -> None:
 
 
 def _flood(arena: _Arena, first: int) -> None:
-    """Marks all points that are connected to a point with its number."""
+    """Gives a point's number to all points that are connected to this point."""
     arena.part[first], waiting = first, [first]
     while waiting:
         here, others = waiting.pop(), np.flatnonzero(arena.part < 0)

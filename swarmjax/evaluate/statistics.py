@@ -2,8 +2,8 @@
 
 Evaluation, benchmarks and studies compute their reported figures here, after Agarwal et al. 2021,
 "Deep Reinforcement Learning at the Edge of the Statistical Precipice": interquartile means (section
-4.3) with percentile intervals of a bootstrap (section 4.1). Values are [runs, tasks]: a run is a
-training seed, and a task is a level or a stage on which its policy was judged.
+4.3) with percentile intervals of a bootstrap (section 4.1). Values are [runs, tasks]. A run is a
+training seed, and a task is a level or a stage on which the run's policy was judged.
 
 A bootstrap draws with replacement the part of the data that its interval is about, and takes the
 rest as given. The right draw depends on how the values were produced:
@@ -29,7 +29,7 @@ Drawing dependent values independently makes an interval too narrow. For example
 the same levels, a hard level is hard for all of them, but `tasks_per_run` would average this
 difficulty out over the runs. The last two draws err on the wide side, because they count the spread
 of single values twice (Davison & Hinkley 1997, "Bootstrap Methods and their Application", section
-3.8; Owen 2007, "The pigeonhole bootstrap"). This matters little if there are many tasks.
+3.8; Owen 2007, "The pigeonhole bootstrap"). The error is small if there are many tasks.
 
 Values may be inf, for example the steps to a threshold that was never reached. Inf counts as larger
 than every number. A mean that includes inf is inf, and an end of an interval is inf if too many
@@ -52,8 +52,8 @@ _LAST_TWO = (-2, -1)
 type RunDraw = Literal["runs_per_task", "runs"]
 type SharedDraw = Literal["tasks", "runs_and_tasks"]
 type Draw = RunDraw | SharedDraw | Literal["tasks_per_run", "runs_then_tasks"]
-# How a draw treats runs and tasks: it keeps them, draws them whole, or draws runs separately for
-# each task, and tasks separately for each run.
+# How a draw treats runs and tasks. It may keep them, or draw them whole. It may also draw runs
+# separately for each task, or tasks separately for each run.
 _DRAWS = {
     "runs_per_task": ("each", "kept"),
     "runs": ("whole", "kept"),
@@ -87,10 +87,10 @@ class Interval[T](NamedTuple):
 
 
 def iqm(x: ArrayLike, axis: int | tuple[int, ...] | None = None) -> np.float64 | np.ndarray:
-    """Computes the interquartile mean: the mean without the lowest and the highest quarter.
+    """Computes the interquartile mean: the mean without the lowest and highest quarter of values.
 
-    A quarter is rounded down to whole values, as in `scipy.stats.trim_mean(x, 0.25)`. In rliable
-    this mean is called the IQM. Three values or fewer are therefore not trimmed.
+    A quarter is rounded down to whole values, as in `scipy.stats.trim_mean(x, 0.25)`. So three
+    values or fewer are not trimmed. In rliable this mean is called the IQM.
 
     Args:
       x: [...] values in any unit; if more than a quarter of them are inf, the result is inf.
@@ -119,8 +119,8 @@ def cvar(
     """Computes the conditional value at risk: the mean of the worst share of the values.
 
     It follows Rockafellar & Uryasev 2000, "Optimization of conditional value-at-risk". The share is
-    rounded up to whole values, so it is never empty. The result also reflects chance: if each level
-    was tried only once, it is worse than if it were computed from the levels' expected values.
+    rounded up to whole values, so it is never empty. If each level was tried only once, the result
+    is worse than a result from the levels' expected values, because it also reflects chance.
 
     Args:
       x: [...] of any unit.
@@ -160,8 +160,8 @@ def bootstrap(
     `draw` names the part that is drawn with replacement; see the table at the top of the module.
 
     With few runs the interval is too narrow: an interval of 95 % for the mean of 3, 5 or 10 normal
-    values holds the truth in 75, 84 or 90 % of cases. Its ends are statistics of resamples; if a
-    percentile falls between two resamples, the outer one is used.
+    values holds the truth in 75, 84 or 90 % of cases. The ends of the interval are statistics of
+    resamples. If a percentile falls between two resamples, the outer one is used.
 
     Args:
       values: [runs, tasks] values in any unit; at least three runs if runs are drawn, and at least
@@ -247,10 +247,10 @@ def probability_of_improvement(
 ) -> Interval[float]:
     """Computes the interval of the probability that a beats b: P(a > b) + P(a = b) / 2.
 
-    The probability is averaged over tasks. On each task it is U / (n m) of the Mann-Whitney test,
-    as in Agarwal et al. 2021, section 4.3. The runs of a and b are resampled independently; drawn
-    tasks are the same for both. Only the order of values matters, so inf is a value like any other.
-    If small values are good, exchange a and b.
+    The probability is averaged over tasks. On each task the probability is U / (n m) of the
+    Mann-Whitney test, as in Agarwal et al. 2021, section 4.3. The runs of a and b are resampled
+    independently; drawn tasks are the same for both. Only the order of values matters, so inf is a
+    value like any other. If small values are good, exchange a and b.
 
     Args:
       a: [n, tasks] values in any unit; at least three runs if runs are drawn, and at least three
@@ -410,7 +410,8 @@ def _apply(statistic: Statistic, x: np.ndarray) -> np.ndarray:
 def _interval(estimate: float, draws: np.ndarray, confidence: float) -> Interval[float]:
     """Computes the percentile interval of draws [resamples].
 
-    Its ends are draws, never mixtures of two draws, because a mixture of inf and inf would be nan.
+    The interval's ends are draws, never mixtures of two draws, because a mixture of inf and inf
+    would be nan.
     """
     last = len(draws) - 1
     low = math.floor((1 - confidence) / 2 * last)

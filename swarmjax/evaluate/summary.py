@@ -123,8 +123,8 @@ def summarize(found: Found, strata: Sequence[int] | None = None) -> dict[str, di
 
     Returns:
       For each measure `mean`, `iqm` and `cvar` (mean over the worst 5 % of the levels and
-      policies). Each has its interval under the same name with `_interval`, null if there are too
-      few values.
+      policies). Each of the three has an interval, under its name with `_interval` appended. The
+      interval is null if there are too few values.
     """
     return {name: _summary(table, MEASURES[name], strata) for name, table in found.items()}
 
@@ -194,10 +194,10 @@ def compare(a: Found, b: Found, strata: Sequence[int] | None = None) -> dict[str
       strata: As in `summarize`.
 
     Returns:
-      For each measure that both have: the means `a` and `b`, `difference` of the means and
-      `difference_iqm` of the interquartile means (b - a), and `improvement`, the probability that b
-      is better on a level. The last three each have an interval, under the same name with
-      `_interval`.
+      For each measure that both have, the means `a` and `b`; `difference`, b - a of the means;
+      `difference_iqm`, b - a of the interquartile means; and `improvement`, the probability that b
+      is better on a level. Each of the last three has an interval, under its name with `_interval`
+      appended.
     """
     return {name: _comparison(name, a[name], b[name], strata) for name in a if name in b}
 

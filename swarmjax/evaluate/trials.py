@@ -138,8 +138,8 @@ def specialise(config: EvaluateConfig, cell: Cell, path: str | None = None) -> E
 
     Args:
       config: Settings of the evaluation.
-      cell: Cell that sets the stage, shape and seed. It also sets realism and hull friction if it
-        has values for them, and the step limit if it has one and `config` has none.
+      cell: Cell that sets the stage, shape and seed. A cell with values for realism or hull
+        friction sets these too. A cell with a step limit sets it if `config` has none.
       path: Path of the policy.
 
     Returns:

@@ -103,7 +103,7 @@ def read(folder: Path, judged: Mapping[str, Any], cells: Sequence[Cell]) -> dict
 
 
 def write(folder: Path, judged: Mapping[str, Any], row: int, trial: Trial) -> None:
-    """Writes a finished cell, whole or not at all.
+    """Writes a finished cell, completely or not at all.
 
     Args:
       folder: Result of `place`; it is made if it is missing.

@@ -1,7 +1,8 @@
 """The robot and the task that a policy was trained with, from its file.
 
 Commands that run a policy take hull, sensors, speeds, task, realism and stage from its file, unless
-the command line sets them. The judge's body does not come from the file: it has wheels by default.
+the command line sets them. The judge's body does not come from the file. By default this body has
+wheels.
 """
 
 import operator
@@ -94,8 +95,10 @@ def load[C: Section](
     Args:
       cls: The command's dataclass, with `policy` and perhaps `compare`.
       typed: `key=value` arguments.
-      entrants: The policies, if they have been read already; None: the policies that `typed` names.
-      stage: Plain data of the stage if `typed` names none; None: the policies' last stage.
+      entrants: The policies, if they have been read already. None means the policies that `typed`
+        names.
+      stage: Plain data of the stage, used if `typed` names no stage. None means the policies' last
+        stage.
 
     Returns:
       The settings, and one line that describes what comes from the policies.
@@ -130,7 +133,10 @@ def _paths(cls: type[Section], typed: Sequence[str]) -> list[str]:
 
 
 def _words(cls: type[Section], found: Trained, typed: Sequence[str]) -> list[str]:
-    """Converts the training's settings to arguments. Wheels stay if a robot file names no body."""
+    """Converts the training's settings to arguments.
+
+    The judge's body keeps its wheels if a robot file names no body.
+    """
     choice = files.split_words(cls, typed).get("robot")
     own = {"body": BODY} if choice is None else files.read_choice("robot", files.choice_of(choice))
     return [
@@ -160,7 +166,7 @@ def _check_alike(
 def _check_own(settings: Any, found: Mapping[str, Trained]) -> None:
     """Refuses settings with another history or hearing than the first policy's.
 
-    Each policy is judged with its own values, since its network accepts no others.
+    Each policy is judged with its own history and hearing, since its network accepts no others.
     """
     for path, each in list(found.items())[:1]:
         for key in _OWN:

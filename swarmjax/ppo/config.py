@@ -28,10 +28,11 @@ _TIME_OUTS = {"gae": ("bootstrap", "terminal"), "monte_carlo": ("terminal", "lea
 
 @dataclass(frozen=True, kw_only=True)
 class AlgoConfig(Section):
-    """PPO; quotes hold the names that Table 1 of the paper uses.
+    """Settings of PPO; names in quotes are those in Table 1 of the paper.
 
-    Some options belong to one choice of another key, as their meanings say. Such an option is null
-    with the other choices. With its own choice, null means its default.
+    Some options belong to one choice of another key; the meanings of the options name this choice.
+    Such an option is null with the other choices. With the choice that the option belongs to, null
+    means the option's default.
     """
 
     removed: ClassVar[Mapping[str, str]] = dict.fromkeys(

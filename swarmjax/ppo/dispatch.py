@@ -29,8 +29,8 @@ Learn = Callable[
 def resolve(config: AlgoConfig, observation_size: int, action_size: int) -> Backend:
     """Chooses how updates are computed on the device that JAX computes on.
 
-    `auto` means `fused` on an NVIDIA GPU that supports the layers, unless JAX computes matrix
-    products in full precision: without tensor cores the kernels are slower than XLA's code. A CPU
+    `auto` means `fused` on an NVIDIA GPU that supports the layers, but not if JAX computes matrix
+    products in full precision. Without tensor cores the kernels are slower than XLA's code. A CPU
     processes a whole batch in `blocks`; an accelerator processes it at once. A policy with memory
     is trained in `sequences` on any device.
 

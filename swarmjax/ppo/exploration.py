@@ -9,7 +9,7 @@ from swarmjax.ppo.config import AlgoConfig
 
 
 def levels(config: AlgoConfig) -> tuple[float, ...]:
-    """Lists the deviations of the schedule, from `initial_std` to the last one.
+    """Lists the deviations of the schedule, from `initial_std` to the last deviation.
 
     Each deviation is the previous one minus `std_decrement`, rounded to four digits. If the result
     is not above `std_floor`, the deviation is `std_floor`, and the list ends. This is

@@ -39,7 +39,7 @@ class LearnerState:
       params: `{"actor": .., "critic": ..}`.
       optimizer_state: State of the optimiser that `init` made.
       normalizer: Moments of the valid observations of all updates so far. A learner that does not
-        normalise keeps the initial ones.
+        normalise keeps the initial moments.
       explored: [], int32, control steps that the schedule of exploration has counted; None if
         exploration is learned.
     """
@@ -59,14 +59,14 @@ class Batch:
       action: [G, N, U], as drawn.
       log_prob: [G, N], as `act` returned it.
       advantage: [G, N]. With `config.normalize_advantages`, the update normalises the advantages
-        over the valid samples, unless they are from Monte-Carlo returns, which are normalised
-        already.
+        over the valid samples, unless the advantages come from Monte-Carlo returns, which are
+        normalised already.
       return_: [G, N], target of the critic.
       valid: [G, N], bool or 0/1.
       memory: [G, S, H], memory of the S robots of a group before the rollout; None without
         memory. The N samples of a group are then ordered by step, [T S].
       begins: [G, N], whether an episode begins with the step; None without memory.
-      state: [G, N, P], of order 1, what the critic sees in addition; None if nothing.
+      state: [G, N, P], numbers of order 1 that the critic sees in addition; None if there are none.
     """
 
     observation: jax.Array
@@ -95,7 +95,8 @@ def init(
       config: Settings of networks and optimiser.
       observation_size: O.
       action_size: U.
-      updates: Number of updates of the whole run, at least 1: the learning rate's horizon.
+      updates: Number of updates of the whole run, at least 1; the learning rate's schedule spans
+        them.
       state_size: P, how many numbers the critic sees in addition.
 
     Returns:
@@ -137,7 +138,7 @@ def explore_anew(learner: LearnerState, config: AlgoConfig) -> LearnerState:
       config: The config that made the learner.
 
     Returns:
-      The learner with the exploration of a new one.
+      The learner with the exploration of a new learner.
     """
     begun = _with_log_std(learner, math.log(config.initial_std))
     return replace(begun, explored=jax.tree.map(jnp.zeros_like, learner.explored))
@@ -231,7 +232,7 @@ def recall_values(
       config: The config that made the learner.
       observation: [..., O], raw.
       memory: [..., H], memory of the critic before; None without memory.
-      state: [..., P], of order 1, what the critic sees in addition; None if nothing.
+      state: [..., P], numbers of order 1 that the critic sees in addition; None if there are none.
 
     Returns:
       The expected discounted return, [...], and the memory after.

@@ -27,7 +27,7 @@ class Minibatch:
       memory: [B', H], memory before the first step of B' sequences; None without memory. Samples
         are then ordered by step, [T B'].
       begins: [B], whether an episode begins with the step; None without memory.
-      state: [B, P], of order 1, what the critic sees in addition; None if nothing.
+      state: [B, P], numbers of order 1 that the critic sees in addition; None if there are none.
     """
 
     observation: jax.Array
@@ -51,18 +51,18 @@ def ppo_loss(
     The policy term is the clipped surrogate of Schulman et al. 2017, "Proximal Policy Optimization
     Algorithms", equation 7, negated.
 
-    The value term is half the squared error against the return. It is not clipped, because clipping
-    hurts (Andrychowicz et al. 2021, "What Matters in On-Policy Reinforcement Learning?", section
-    3.4).
+    The value term is half the squared error against the return. This term is not clipped, because
+    clipping hurts (Andrychowicz et al. 2021, "What Matters in On-Policy Reinforcement Learning?",
+    section 3.4).
 
-    The bound term is the squared distance of the mean action from -1..1, summed over the action. It
-    follows `bounds_loss` of rl_games, which begins at 1.1. If the mean lies several deviations
-    beyond the range, all drawn actions have the same effect, and the policy learns nothing from
-    them.
+    The bound term is the squared distance of the mean action from -1..1, summed over the action.
+    This term follows `bounds_loss` of rl_games, which begins at 1.1. If the mean lies several
+    deviations beyond the range, all drawn actions have the same effect, and the policy learns
+    nothing from them.
 
     Each term is a sum over the valid samples divided by `expected_valid`. Every valid sample of a
-    batch then has the same weight however unevenly its minibatches are filled, and the mean over
-    the minibatches is exactly the mean over the batch.
+    batch then has the same weight, even if the minibatches are filled unevenly. The mean over the
+    minibatches is exactly the mean over the batch.
 
     Args:
       params: Parameters of the actor and the critic.

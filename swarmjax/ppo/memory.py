@@ -22,8 +22,8 @@ from flax import linen as nn
 _INPUT = nn.initializers.lecun_normal()
 
 # Steps of a sequence in one iteration of its loop: on a GPU each iteration launches its own
-# kernels. With 4 an update compiles at most half a second slower than with 1, with 8 a second
-# slower.
+# kernels. Compared with 1 step, an update takes at most half a second longer to compile with 4
+# steps, and a second longer with 8 steps.
 _UNROLL = 4
 
 
@@ -47,7 +47,7 @@ class Gru(nn.Module):
       uniform: Whether weights and biases begin within 1 / sqrt(H), as in PyTorch's GRU
         (`torch.nn.RNNBase.reset_parameters`).
       kernels: Module with `remember` and `remember_all`, which replace the functions of this file
-        on a GPU; None: XLA computes them.
+        on a GPU. None means that XLA computes them.
     """
 
     size: int
@@ -86,7 +86,7 @@ class Gru(nn.Module):
     def _by_kernels(
         self, features: jax.Array, memory: jax.Array, begins: jax.Array | None
     ) -> tuple[jax.Array, jax.Array]:
-        """Does the same as a call, with the kernels."""
+        """Does what a call does, but with the kernels."""
         layers = self.variables["params"]
         if begins is None:
             memory = self.kernels.remember(layers, features, memory)

@@ -18,7 +18,7 @@ def monte_carlo_returns(reward: jax.Array, boundary: jax.Array, *, discount: flo
 
     Args:
       reward: [T, ...], reward of step t.
-      boundary: [T, ...], bool: the return of step t ends with its reward.
+      boundary: [T, ...], bool: the return of step t ends with the reward of this step.
       discount: Per step, 0..1.
 
     Returns:

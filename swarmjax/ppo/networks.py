@@ -27,9 +27,9 @@ _OUTPUTS = {"linear": lambda mean: mean, "tanh": nn.tanh}
 
 # Gains of the orthogonal initialisation: Huang et al. 2022, "The 37 Implementation Details of
 # Proximal Policy Optimization", core detail 2. Their gain is 1 for the critic, because they scale
-# rewards to a return of about 1. Our returns are metres: a critic that begins between -1 and 1 is
-# wrong by more than a robot can earn, and the policy follows its errors (docs/results.md, "Why
-# seeds were slow").
+# rewards to a return of about 1. Our returns are metres. A critic that begins between -1 and 1 is
+# wrong by more than a robot can earn, and the policy follows the critic's errors (docs/results.md,
+# "Why seeds were slow").
 _HIDDEN_GAIN = math.sqrt(2.0)
 _HEAD_GAIN = 0.01
 
@@ -302,8 +302,8 @@ def recall_value(
     Args:
       params: Result of `init_params`.
       config: The config that made `params`.
-      observation: [B, O + P] or [T, B, O + P], normalised: the policy's observation, followed by
-        the state that the critic sees in addition, if any.
+      observation: [B, O + P] or [T, B, O + P], normalised. It is the policy's observation, followed
+        by the state that the critic sees in addition, if any.
       memory: [B, H], memory of the critic before; None without memory.
       begins: As in `recall_action`.
 
@@ -320,7 +320,7 @@ def critic_input(observation: jax.Array, state: jax.Array | None) -> jax.Array:
 
     Args:
       observation: [B, O], normalised.
-      state: [B, P], what the critic sees in addition; None if nothing.
+      state: [B, P], numbers that the critic sees in addition; None if there are none.
 
     Returns:
       [B, O + P], for `recall_value`.
@@ -372,7 +372,7 @@ def entropy(std: jax.Array) -> jax.Array:
 
 
 def _check_input(network: Params, observation: jax.Array, config: AlgoConfig) -> None:
-    """Checks that an observation has the size of the hidden layers; other networks check theirs."""
+    """Checks an observation's size for the hidden layers; other networks check it themselves."""
     first = network.get("torso", {}).get("hidden_0", {})
     if "kernel" in first:
         size = first["kernel"].shape[-2]

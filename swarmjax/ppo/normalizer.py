@@ -1,8 +1,8 @@
 """Running mean and variance of observations.
 
 Brax's `running_statistics` is unsuitable: importing it loads MuJoCo, MJX and Warp, which this
-package does not need. It also divides 0 by 0 if the first batch has no valid sample, as happens to
-a learner whose robots are still absent.
+package does not need. It also divides 0 by 0 if the first batch has no valid sample. That happens
+to a learner whose robots are still absent.
 """
 
 import chex
@@ -21,8 +21,9 @@ class Normalizer:
     """Mean and variance of the observations seen so far.
 
     Attributes:
-      count: [], float32, number of observations. It rounds beyond 2**24. This is harmless: the
-        count only weighs a batch against the past, and a relative error of 2**-24 is negligible.
+      count: [], float32, number of observations. Beyond 2**24 it is rounded. This is harmless,
+        because the count only weighs a batch against the past, and a relative error of 2**-24 is
+        negligible.
       mean: [O].
       variance: [O], of the population; 1 before the first observation.
     """

@@ -12,7 +12,7 @@ from swarmjax.ppo.networks import Params
 from swarmjax.shards import ALONE, Shards
 
 # The metrics of a step: those of `losses.ppo_loss`, the norm of the gradient before clipping, and
-# two flags that are 1 if the step was taken, or skipped.
+# two flags. One flag is 1 if the step was taken, the other if it was skipped.
 METRICS = (
     "approx_kl",
     "bound_loss",
@@ -27,9 +27,9 @@ METRICS = (
 
 Progress = tuple[Params, optax.OptState]
 
-# The rule of `learning_rates`. Runs of 128 to 8,192 arenas ended well when their rates, summed over
-# the gradient steps, equalled those of 6,000 to 15,000 steps that fall from 3e-4 to 0. Larger sums
-# ended worse (docs/results.md, "Why more training made the swarm worse").
+# The rule of `learning_rates`. Runs of 128 to 8,192 arenas ended well if the sum of their rates
+# over all gradient steps equalled that of 6,000 to 15,000 steps whose rates fall from 3e-4 to 0.
+# Larger sums ended worse (docs/results.md, "Why more training made the swarm worse").
 _RATES = {"actor": 3e-4, "critic": 1e-3}
 _FULL_RATE_STEPS = 15_000
 # Mean over the run of the factor that a schedule applies to a rate.
@@ -50,8 +50,8 @@ def learning_rates(config: AlgoConfig, updates: int) -> dict[str, float]:
     """Chooses the learning rates that a run begins with.
 
     A rate that is null in the config becomes its value in `_RATES` times a share of at most 1. The
-    share keeps the sum of rates over the run at or below that of `_FULL_RATE_STEPS` steps that fall
-    linearly to 0.
+    share limits the sum of the rates over the run. The limit is the sum over `_FULL_RATE_STEPS`
+    steps whose rates fall linearly to 0.
 
     Args:
       config: Learning rates, or None for the rule; their schedule.
@@ -140,7 +140,7 @@ def take(
 
 
 def _is_finite(tree: Any) -> jax.Array:
-    """Tells whether all numbers of a tree are finite: otherwise their sum is not finite either."""
+    """Tells whether all numbers of a tree are finite: if one is not, their sum is not either."""
     return jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves(tree)))
 
 
@@ -151,8 +151,8 @@ def mean_of_taken(metrics: Metrics) -> Metrics:
       metrics: Metrics of the update's steps, any shape, from `take`.
 
     Returns:
-      The means over the steps taken, [], and the number of `skipped_steps`. If no step was taken,
-      the means are NaN if one was skipped, and 0 otherwise.
+      The means over the steps taken, [], and the number of `skipped_steps`. If no step was taken
+      but some were skipped, the means are NaN. If none was skipped either, the means are 0.
     """
     taken, skipped = jnp.sum(metrics["taken_steps"]), jnp.sum(metrics["skipped_steps"])
     # Exactly 1 if all steps of the update were taken.

@@ -87,7 +87,7 @@ class Kept(NamedTuple):
 
     @property
     def has_arenas(self) -> bool:
-        """Whether the checkpoint holds the arenas. If not, a resumed run draws new ones."""
+        """Whether the checkpoint holds the arenas. If not, a resumed run draws new arenas."""
         return any(name.startswith(ARENAS) for name in self.leaves)
 
 
@@ -113,9 +113,10 @@ class Checkpoints:
     def __init__(self, run: Path, keep: int, update: int | None = None) -> None:
         """Opens `run`/checkpoints, to keep the `keep` newest.
 
-        A resumed run gives the `update` that it continues from. Checkpoints after it were skipped
-        as damaged. They are moved aside, because Orbax would save nothing before them. Nothing else
-        is done until the first save, so that a run need not wait for Orbax to begin.
+        A resumed run gives the `update` that it continues from. Checkpoints after `update` were
+        skipped as damaged. They are moved aside, because Orbax would save no update that comes
+        before theirs. Nothing else is done until the first save, so that a run need not wait for
+        Orbax to begin.
         """
         self._run, self._keep = run, keep
         self._folder = (run / FOLDER).resolve()

@@ -87,7 +87,7 @@ def _train(run: Path, settings: TrainConfig, stop: Stop) -> int:
 
 
 def _tell(text: str) -> None:
-    """Writes to standard output. Ignores it if the reader of a pipe is gone."""
+    """Writes to standard output. Ignores the error if the reader of a pipe is gone."""
     try:
         sys.stdout.write(text)
         sys.stdout.flush()
@@ -97,7 +97,7 @@ def _tell(text: str) -> None:
 
 
 def _success(settings: TrainConfig, tally: Tally) -> str:
-    """Describes how good the swarm is on the furthest measured stage."""
+    """Describes how good the swarm is on the furthest stage that has been measured."""
     last = settings.stage[-1].name
     for stage in reversed(settings.stage):
         found = spread([of_seed.get(stage.name) for of_seed in tally.targets_reached.values()])

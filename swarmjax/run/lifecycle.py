@@ -264,7 +264,7 @@ def _first_state(
 ) -> tuple[TrainState, list[str]]:
     """Makes the first state, from the seed or from the checkpoint of the resumed run.
 
-    A start from the seed takes the networks and normalisers of `source`, if there is one.
+    A start from the seed takes the networks and normalisers of `source`, if `source` is given.
 
     Returns:
       The state, and a sentence for each item that was skipped.

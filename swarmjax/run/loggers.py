@@ -1,8 +1,8 @@
 """Sends a run's figures to loggers: TensorBoard, W&B and Python functions.
 
-`metrics.jsonl` is the run's own record. It is written first, checkpoints record its length, and a
-run that cannot write it ends. A logger holds nothing beyond this record, so its failure does not
-end a run.
+`metrics.jsonl` is the run's own record. This file is written first, checkpoints record its length,
+and a run that cannot write it ends. A logger holds nothing beyond this record, so its failure does
+not end a run.
 """
 
 import contextlib
@@ -17,7 +17,8 @@ from typing import Any, Protocol, runtime_checkable
 from swarmjax.run.directory import Row
 
 MOST_PENDING = 100  # how many calls of the program a logger may lag behind
-# Seconds that a run waits for a logger that lags further behind, and for each at the run's end.
+# Seconds that a run waits for a logger that lags further behind. At its end, the run waits as long
+# for each logger.
 PATIENCE_S = 60.0
 
 
@@ -32,11 +33,11 @@ class Logger(Protocol):
       the updates, with the seeds of an update together.
     - If a run resumes from a checkpoint, or goes back to one after it diverged, the rows after the
       checkpoint come again. Then `update` drops, and the later rows are the valid ones. If the run
-      did not diverge, the later rows equal the earlier ones, except for times in seconds.
+      did not diverge, the later rows equal the earlier rows, except for times in seconds.
     - A logger that raises an error is not called again, except for `close`. The run prints a
       message and continues.
-    - A run waits for a logger that lags `MOST_PENDING` calls behind, and at its end for every
-      logger. After `PATIENCE_S` it continues without that logger.
+    - A run waits for a logger that lags `MOST_PENDING` calls behind. At its end, the run waits for
+      every logger. After `PATIENCE_S` it continues without that logger.
 
     Attributes:
       name: name of the logger in messages.
@@ -49,7 +50,7 @@ class Logger(Protocol):
 
         Args:
           rows: one for each update and seed, as `recorder.rows` makes them.
-          speeds: speeds of the call over all seeds: `arena_steps_per_s` and so on.
+          speeds: speeds of the call over all seeds, such as `arena_steps_per_s`.
         """
         ...
 

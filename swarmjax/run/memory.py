@@ -50,7 +50,7 @@ def check_buffer(settings: TrainConfig, needed: int, available: int | None) -> N
     Args:
       settings: the run's config.
       needed: memory for the buffers of all seeds, bytes. A device holds each buffer whole.
-      available: memory of the device, bytes; None if unknown, and then nothing is refused.
+      available: memory of the device, bytes; None if it is unknown, so that nothing is refused.
 
     Raises:
       ConfigError: if the buffer cannot fit. The message names a size that is certainly too large.
@@ -71,7 +71,7 @@ def check_state(settings: TrainConfig, needed: int, available: int | None) -> No
     Args:
       settings: the run's config.
       needed: memory for the state, bytes.
-      available: memory of the device, bytes; None if unknown, and then nothing is refused.
+      available: memory of the device, bytes; None if it is unknown, so that nothing is refused.
 
     Raises:
       ConfigError: if the state cannot fit. The message names a number of arenas that is certainly
@@ -88,7 +88,7 @@ def check(settings: TrainConfig, needed: int, available: int | None) -> None:
     Args:
       settings: the run's config.
       needed: memory for the compiled program, bytes.
-      available: memory of the device, bytes; None if unknown, and then nothing is refused.
+      available: memory of the device, bytes; None if it is unknown, so that nothing is refused.
 
     Raises:
       ConfigError: if the program does not fit. The message names a number of arenas that should
@@ -126,8 +126,8 @@ def fill(
     Args:
       settings: the run's config, with any number of arenas.
       measure: returns the memory that training with a config needs, bytes.
-      available: memory of the accelerator, bytes. The share `run.memory_share` of it is filled.
-        None on a CPU, or if the memory is unknown; at most ON_CPU arenas are chosen then.
+      available: memory of the accelerator, bytes. The share `run.memory_share` of this memory is
+        filled. None on a CPU, or if the memory is unknown; at most ON_CPU arenas are chosen then.
 
     Returns:
       The config with that number, and a sentence that gives the reason.
@@ -164,8 +164,8 @@ def line(
     Returns:
       Fixed bytes, and bytes per arena.
     """
-    # Each program does one update, so that the metrics of longer calls are not counted, and the
-    # compiled programs do not depend on the budget.
+    # Each program does one update. So the metrics of longer calls are not counted, and the compiled
+    # programs do not depend on the budget.
     control_steps = settings.algo.rollout_length
     needed = [measure(replace(settings, arenas=n, budget=n * control_steps)) for n in sizes]
     if len(sizes) == 1:

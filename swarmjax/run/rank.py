@@ -1,7 +1,7 @@
 """Supervises a process that trains together with others.
 
 If the other processes are gone, JAX aborts a process from inside and prints pages of stack trace.
-So each process trains in a child. Its parent does not load JAX, and reports in one sentence how the
+So each process trains in a child. The parent does not load JAX, and reports in one sentence how the
 child ended.
 """
 

@@ -35,7 +35,7 @@ def rows(
 
     Returns:
       Rows of plain numbers, ordered by update, then by seed. Counts are unchanged. Shares and means
-      are over the episodes that ended in the update on its stage; None if none ended.
+      are over the episodes that ended on the row's stage in the update; None if none ended.
     """
     # [n, N] flattened, so that the seeds of an update are adjacent.
     columns = {

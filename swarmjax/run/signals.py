@@ -45,7 +45,7 @@ class Stop:
         Args:
           until: time to stop without a signal, on the clock `time.monotonic`.
           patient: whether to ignore a second signal. A scheduler sends each signal to a process and
-            to its parent, which passes it on, so the process receives it twice.
+            to its parent. The parent passes the signal on, so the process receives it twice.
           last: whether the process ends after the `with` block. Then everything is saved, and later
             signals must not change the exit code.
         """

@@ -37,7 +37,8 @@ class Boards:
         """Writes rows, and the speeds to the first folder.
 
         Writing a row takes a millisecond, as long as an update of a few arenas. So with N folders,
-        each receives only every N-th update, and all together take no more time than one.
+        each folder receives only every N-th update. All folders together then take no more time
+        than one.
         """
         boards = self._boards()
         for row in rows:

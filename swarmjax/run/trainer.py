@@ -79,8 +79,8 @@ class Tally:
       earlier_s: seconds of training before this process began.
       seconds: seconds of training in this process, without compilation.
       decisions: promotions and demotions.
-      barren: how many of the newest updates in a row taught nothing, by seed. Such an update
-        skipped every gradient step, or every arena broke at every step.
+      barren: how many of the newest updates in a row taught nothing, by seed. In such an update
+        every gradient step was skipped, or every arena broke at every step.
     """
 
     update: int
@@ -258,10 +258,10 @@ def _saved_part(state: TrainState, *, arenas: bool) -> Any:
 class Saves:
     """Decides when to write a checkpoint, by time and by share of the budget, and when to wait.
 
-    A run that is killed while it writes a checkpoint goes back to the previous one. A kill should
-    cost at most one interval of training. So each checkpoint begins early: its lead is the time
-    that the last checkpoint took to write plus the length of the next call, but at most half the
-    interval. If writing takes longer than that, the run waits until it is done.
+    A run that is killed while it writes a checkpoint goes back to the previous checkpoint. A kill
+    should cost at most one interval of training. So each checkpoint begins early. Its lead is the
+    time that the last checkpoint took to write, plus the length of the next call. The lead is at
+    most half the interval. If writing takes longer than that, the run waits until it is done.
     """
 
     def __init__(self, settings: TrainConfig, done: int) -> None:
@@ -311,8 +311,8 @@ def _pace(tally: Tally) -> float:
 def score(settings: TrainConfig, tally: Tally) -> float | None:
     """Rates what a run has learned, so that its best checkpoint can be kept.
 
-    A seed scores the index of its furthest measured stage, from 0, plus the share of targets
-    reached there.
+    A seed's score is the index of its furthest measured stage, counted from 0, plus the share of
+    targets reached there.
 
     Returns:
       The mean score over the seeds; None until every seed has been measured.
@@ -523,7 +523,7 @@ def _broke(settings: TrainConfig, row: Row) -> bool:
 def _speeds(program: Built, rows: list[Row], seconds: float) -> dict[str, float]:
     """Returns a call's speeds per second, over all seeds.
 
-    They count arena steps, robot steps, physics steps and transitions.
+    The speeds count arena steps, robot steps, physics steps and transitions.
     """
     settings = program.config
     arena_steps = len(rows) * settings.arenas * settings.algo.rollout_length

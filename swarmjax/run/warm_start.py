@@ -4,8 +4,8 @@ Optimiser, learning rate, curriculum, arenas, keys and counters start fresh, wit
 number of robots that have trained is kept, so that a promotion does not copy one learner over
 another that has already learned.
 
-If the other run has as many seeds, each seed starts from its counterpart. If it has one seed, all
-seeds start from that one.
+If the other run has as many seeds, each seed starts from its counterpart. If the other run has one
+seed, all seeds start from that seed.
 """
 
 from dataclasses import dataclass, replace
@@ -85,8 +85,8 @@ def carry(source: Source, state: TrainState, settings: TrainConfig) -> TrainStat
       settings: the config of the new run. `init_from_std` selects the exploration to start with.
 
     Returns:
-      The state with the networks and normalisers of the source. Its curriculum records how many
-      robots have trained them.
+      The state with the networks and normalisers of the source. The curriculum in this state
+      records how many robots have trained them.
 
     Raises:
       ConfigError: if the checkpoint does not match the config in its directory.

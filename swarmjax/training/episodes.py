@@ -43,9 +43,9 @@ class EpisodeLog(NamedTuple):
 def room(config: ProgramConfig) -> int:
     """Returns the most episodes of one update and seed that are kept.
 
-    For each arena this is the larger of two numbers: the waiting episodes plus the one under way,
-    and the episodes that the step limit ends. No arena ends more than one episode at each control
-    step.
+    For each arena this is the larger of two numbers. One is the waiting episodes plus the one under
+    way. The other is the number of episodes that the step limit ends. No arena ends more than one
+    episode at each control step.
     """
     steps, limit = config.algo.rollout_length, config.task.step_limit
     return config.arenas * min(steps, max(config.waiting, steps // limit) + 1)

@@ -70,7 +70,7 @@ def load[C: ProgramConfig](config: C, *, by_robot: bool = False) -> tuple[Progra
       by_robot: whether to report each episode robot by robot.
 
     Returns:
-      The program, and its argument, the curriculum's numbers.
+      The program, and the curriculum's numbers, which are an argument of the program.
 
     Raises:
       ConfigError: Warp is required but not installed, the gradient's backend is not available, or a

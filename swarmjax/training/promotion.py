@@ -17,11 +17,11 @@ def carry_over(
 ) -> LearnerState:
     """Prepares the learners for the stage that begins with a promotion.
 
-    If each robot has a learner and the swarm grows beyond its largest size so far,
-    `newcomers=copy` lets the new robots copy the others' learners in turn: parameters, optimiser
-    and normaliser. Otherwise they begin untrained. Then the optimiser, the normaliser and the
-    exploration of all learners are reset or kept, as `config.curriculum` says. Keeping them has no
-    cost.
+    If each robot has a learner and the swarm grows beyond its largest size so far, `newcomers=copy`
+    lets the new robots copy the others' learners in turn: parameters, optimiser and normaliser.
+    Without `copy` the new robots begin untrained. Then the optimiser, the normaliser and the
+    exploration of all learners are reset or kept, as `config.curriculum` says. Keeping these three
+    has no cost.
 
     Args:
       learners: [L].

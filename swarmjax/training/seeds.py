@@ -101,7 +101,7 @@ def each(config: ProgramConfig, function: Callable[[Any], Any], lanes: Any) -> A
 
 
 def split(lanes: Any, parts: int) -> list[Any]:
-    """Cuts a tree with a leading axis N into trees with N / parts each."""
+    """Cuts a tree with a leading axis N into `parts` trees with a leading axis N / parts."""
 
     def cut(x: Array, i: int) -> Array:
         size = x.shape[0] // parts

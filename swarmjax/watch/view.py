@@ -20,7 +20,7 @@ from swarmjax.watch.newest import Newest
 from swarmjax.watch.standing import stand
 
 LOOKED_AT_S = 15.0  # the page counts as open for this long after its last request
-PAUSE_S = 0.5  # between two checks of the directory
+PAUSE_S = 0.5  # seconds between two checks of the directory
 # Drawing takes at most this share of a core, so that it hardly slows down the run.
 SHARE = 0.2
 

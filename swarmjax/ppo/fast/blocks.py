@@ -2,7 +2,7 @@
 
 The loss is a sum over samples, so its gradient is the sum of the blocks' gradients. The activations
 of a block stay in a core's cache, and blocks without a valid sample are left out. Learners and
-seeds run one after the other: a vectorised loop would take as long for every learner as for the one
+seeds run one after the other. In a vectorised loop every learner would take as long as the learner
 with the most samples.
 """
 

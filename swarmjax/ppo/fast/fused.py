@@ -11,8 +11,8 @@ b_s is how far the mean action lies beyond -1..1.
 
 The kernels sum over samples. Factors and terms that all samples share, such as 1/n, are applied
 afterwards. The kernels take tiles of samples in any order. So once the valid samples lie first, the
-kernels can read the batch in place: a minibatch is a choice of tiles, and tiles without a valid
-sample are never read.
+kernels can read the batch in place. A minibatch is then a choice of tiles, and tiles without a
+valid sample are never read.
 """
 
 import functools
@@ -223,8 +223,8 @@ def flat_gradient(
       interpret: Whether to run them as ordinary JAX, on any device.
 
     Returns:
-      The gradient, in the shape of `flat`; `METRICS`, each []; and how many samples of the tiles
-      are valid, [].
+      The gradient, in the shape of `flat`; `METRICS`, each []; and the number of valid samples in
+      the tiles, [].
 
     Raises:
       ValueError: `fits` refuses the layers.
@@ -273,7 +273,7 @@ def _critic_sums(
 def _with_entropy(
     gradient: jax.Array, config: AlgoConfig, weight: jax.Array, first: int, width: int
 ) -> jax.Array:
-    """Adds the entropy cost's derivative with respect to `log_std`, which starts at `first`.
+    """Adds the entropy cost's derivative with respect to `log_std`, which begins at index `first`.
 
     The entropy is the sum of log_std and a constant, so the derivative is 1. The gradient never
     moves a deviation that follows a schedule.

@@ -1,7 +1,7 @@
 """A kernel that takes samples forward through a network and a loss, and back, on the chip.
 
 XLA writes the activations of every layer to memory and reads them again. Here a program of the grid
-keeps the activations of a tile of samples on the chip, and writes only its sums, at its end.
+keeps the activations of a tile of samples on the chip. It writes only its sums, once it ends.
 Programs share nothing, so the same samples give the same bits. A network is one vector, and so is
 its gradient: the optimiser then handles one array instead of a dozen.
 
@@ -20,12 +20,12 @@ from jax.experimental.pallas import triton
 
 # Least width of an operand of a matrix product on the tensor cores.
 LEAST_WIDTH = 16
-# Greatest width of a layer: the sums for a 128 x 128 matrix take 128 of the 255 registers of each
-# of 128 threads.
+# Greatest width of a layer. The sums for a 128 x 128 matrix occupy 128 threads, and take 128 of the
+# 255 registers of each thread.
 MOST_WIDTH = 128
 # Bytes of the chip's memory that a program may use. Compute capability 8 and later gives at least
 # 99 KiB (CUDA C++ Programming Guide, "Technical Specifications per Compute Capability"). `fits`
-# counts for the matrix products of capability 9.0; the products of other capabilities take up to 4
+# counts what the matrix products of capability 9.0 take; those of other capabilities take up to 4
 # KiB more.
 SHARED_MEMORY = 95 * 1024
 # Bytes by compute capability, where a program may use more; from the same source.
@@ -48,8 +48,8 @@ class Place(NamedTuple):
     """Where an affine layer lies in the vector of its network's parameters, row by row.
 
     Attributes:
-      kernel: Index of its first number.
-      bias: Index of its first number.
+      kernel: Index of the kernel's first number.
+      bias: Index of the bias's first number.
       shape: Numbers of inputs and outputs.
     """
 
@@ -77,7 +77,7 @@ class KernelLayout(NamedTuple):
 
     Attributes:
       layers: Hidden layers and output, in order.
-      vectors: Other parameters, by name: index of the first number, and width.
+      vectors: For each other parameter, by name, the index of its first number and its width.
       size: Length of the vector.
     """
 
@@ -91,8 +91,7 @@ class Tiles(NamedTuple):
 
     Attributes:
       order: [K], int32, numbers of tiles.
-      span: [2], int32, the part of `order` to take: from the first index up to, but not
-        including, the second.
+      span: [2], int32, two indices of `order`: the first to take, and the first to leave out.
     """
 
     order: jax.Array
@@ -167,7 +166,7 @@ def sums(
         chip.
       layout: Layout of `parameters`. `padded_width` leaves the widths of the hidden layers
         unchanged.
-      activation: Activation of the hidden layers: `tanh`, `relu` or `swish`.
+      activation: Activation of the hidden layers, `tanh`, `relu` or `swish`.
       loss: Loss of the output. Its results must be 0 for samples that do not count. It gets the
         layout's vectors with padding, and returns their derivatives under the same names.
       samples: By name, each [B] or [B, width], float32. `observation` [B, O] is the network's
@@ -314,7 +313,7 @@ def _forward(
 def _backward(
     activation: str, network: tuple[Layer, ...], seen: _Activations, slope: jax.Array
 ) -> tuple[Layer, ...]:
-    """Backpropagates, summed over the tile: Goodfellow et al. 2016, "Deep Learning", alg. 6.4.
+    """Backpropagates and sums over the tile (Goodfellow et al. 2016, "Deep Learning", alg. 6.4).
 
     With z = x W + b and g the derivative with respect to z, the derivatives with respect to W, b
     and x are x^T g, the sum of g over samples, and g W^T. If x = f(z') is the output of the layer

@@ -19,16 +19,16 @@ from jax.experimental.pallas import triton
 
 from swarmjax.ppo.fast.kernel import logistic
 
-# Sequences of a tile. In the backward pass on an H100, 64 sequences took 8 warps twice as long, and
-# 4 warps were slower than 8 for 32 sequences (docs/performance.md).
+# Sequences of a tile. In the backward pass on an H100, 8 warps took twice as long with 64
+# sequences. With 32 sequences, 4 warps were slower than 8 (docs/performance.md).
 TILE = 32
 _WARPS, _BACKWARD_WARPS = 4, 8
 # The GRU's inputs and their gradient are the largest arrays. With half as many bytes, training took
 # 8 % less time on an H100. The rollout rounds in the same way, so that ratios of probabilities
 # begin at 1.
 _SEEN = jnp.bfloat16
-# Supported widths of a memory: 16 is the least operand of a tensor core, and wider weight matrices
-# than 64 do not fit the chip.
+# Supported widths of a memory. An operand of a tensor core is at least 16 wide, and weight matrices
+# wider than 64 do not fit on the chip.
 _SIZES = (16, 32, 64)
 
 _Three = tuple[jax.Array, ...]  # arrays of reset, update and candidate
@@ -165,7 +165,7 @@ def remember(
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _through(weights: _Weights, sequences: _Sequences, interpret: bool) -> jax.Array:
-    """Takes memories through sequences; returns the memory after each step, [T, B, H]."""
+    """Runs the unit through sequences; returns the memory after each step, [T, B, H]."""
     count, size = sequences.memory.shape
     steps = len(sequences.seen) // count
     every = pl.pallas_call(

@@ -147,7 +147,7 @@ def gradient(
       params: Parameters of the actor and the critic.
       rows: Result of `arrange`.
       order: [Q], result of `deal`.
-      span: [2], int32, of the minibatch.
+      span: [2], int32, where in `order` the minibatch begins and ends.
       config: Clip range and costs.
       expected_valid: [], valid samples of the whole batch / number of minibatches.
 

@@ -36,7 +36,8 @@ def learn(
     of devices as well as on the random streams.
 
     Here each network is one vector, and the optimiser's state for each network is also one vector.
-    Otherwise most kernels of a minibatch would handle one of two dozen small arrays each.
+    With two dozen small arrays instead, most kernels of a minibatch would handle only one array
+    each.
 
     Args:
       config: Settings of networks that `fused.fits` accepts.
