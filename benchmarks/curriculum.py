@@ -34,11 +34,13 @@ from benchmarks.curriculum_arms import StudyConfig
 from swarmjax import command, provenance
 from swarmjax.config import to_dict
 from swarmjax.evaluate import engine_mjx
+from swarmjax.evaluate.engine_mjx import Outcomes
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.run import trainer
 from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import dispatch
 from swarmjax.task import env
+from swarmjax.task.env import World
 from swarmjax.task.level import Level
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import mesh, seeds
@@ -70,20 +72,43 @@ def load_judge(study: StudyConfig, trained: TrainConfig, judged: dict[str, Stage
         trained.sim,
         arenas=arenas * trained.seeds,
     )
-    drawn = [engine_mjx.draw_levels(world, s, study.level_seed, study.levels) for s in stages]
-    levels = Level(*(np.concatenate(fields) for fields in zip(*drawn, strict=True)))
+    levels = draw_levels(world, stages, study.level_seed, study.levels)
     run = partial(engine_mjx.outcomes, world, trained.algo, steps=trained.task.step_limit)
     call = jax.jit(jax.vmap(run, in_axes=(0, None)))
+    return lambda learners: means(call(learners, levels), list(judged))
 
-    def judge(learners: LearnerState) -> dict[str, dict[str, np.ndarray]]:
-        found = call(learners, levels)._asdict()
-        by_stage = {name: np.split(np.asarray(x), len(stages), 1) for name, x in found.items()}
-        return {
-            role: {name: parts[i].mean(axis=1) for name, parts in by_stage.items()}
-            for i, role in enumerate(judged)
-        }
 
-    return judge
+def draw_levels(world: World, stages: Sequence[StageConfig], seed: int, count: int) -> Level:
+    """Draws the same number of levels for each stage, one stage after another.
+
+    Args:
+      world: the compiled environment.
+      stages: S stages.
+      seed: seed of the levels.
+      count: E levels for each stage.
+
+    Returns:
+      [S E] levels.
+    """
+    drawn = [engine_mjx.draw_levels(world, stage, seed, count) for stage in stages]
+    return Level(*(np.concatenate(fields) for fields in zip(*drawn, strict=True)))
+
+
+def means(found: Outcomes, names: Sequence[str]) -> dict[str, dict[str, np.ndarray]]:
+    """Averages outcomes over the levels of each stage.
+
+    Args:
+      found: [N, S E] outcomes of N seeds on levels that `draw_levels` drew.
+      names: S names of the stages.
+
+    Returns:
+      For each name the means [N], by measure.
+    """
+    split = {name: np.split(np.asarray(x), len(names), 1) for name, x in found._asdict().items()}
+    return {
+        name: {measure: parts[i].mean(axis=1) for measure, parts in split.items()}
+        for i, name in enumerate(names)
+    }
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -11,7 +11,7 @@ takes the keys of `Study` and of `swarmjax.train`; `seeds` is 10 by default.
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
@@ -24,10 +24,8 @@ from swarmjax import command, provenance
 from swarmjax.config import ConfigError, Section, about, to_dict
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate import engine_mjx
-from swarmjax.ppo.learner import LearnerState
 from swarmjax.run.settings import TrainConfig, load_train
 from swarmjax.task import env
-from swarmjax.task.level import Level
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import program as programs
 from swarmjax.training import seeds
@@ -96,8 +94,6 @@ HARDEST: dict[str, dict[str, Any]] = {
     "door": {"gap": 0.13},
 }
 
-Judge = Callable[[LearnerState], dict[str, dict[str, np.ndarray]]]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Study(Section):
@@ -156,7 +152,7 @@ def points(study: Study, trained: TrainConfig) -> np.ndarray:
     return np.linspace(0, trained.updates, study.points + 1).round().astype(int)[1:]
 
 
-def load_judge(study: Study, trained: TrainConfig) -> Judge:
+def load_judge(study: Study, trained: TrainConfig) -> curriculum.Judge:
     """Makes the judge of one arm.
 
     Args:
@@ -177,20 +173,11 @@ def load_judge(study: Study, trained: TrainConfig) -> Judge:
         trained.sim,
         arenas=len(stages) * study.levels,
     )
-    drawn = [engine_mjx.draw_levels(world, s, study.level_seed, study.levels) for s in stages]
-    levels = Level(*(np.concatenate(fields) for fields in zip(*drawn, strict=True)))
+    levels = curriculum.draw_levels(world, stages, study.level_seed, study.levels)
     run = partial(engine_mjx.outcomes, world, config, steps=study.steps, sampled=True)
     call = jax.jit(lambda learners: jax.lax.map(lambda one: run(one, levels), learners))
-
-    def judge(learners: LearnerState) -> dict[str, dict[str, np.ndarray]]:
-        found = call(learners)._asdict()
-        split = {name: np.split(np.asarray(x), len(stages), 1) for name, x in found.items()}
-        return {
-            stage.name: {name: parts[i].mean(axis=1) for name, parts in split.items()}
-            for i, stage in enumerate(stages)
-        }
-
-    return judge
+    names = [stage.name for stage in stages]
+    return lambda learners: curriculum.means(call(learners), names)
 
 
 def results(study: Study, words: Sequence[str]) -> Iterator[dict[str, Any]]:

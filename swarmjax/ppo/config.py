@@ -157,7 +157,8 @@ class AlgoConfig(Section):
     critic_learning_rate: float | None = field(
         default=None,
         metadata=about(
-            "rate of the critic: 'optimizer learning rate critic'; null: 1e-3, reduced likewise",
+            "rate of the critic: 'optimizer learning rate critic'; null: 1e-3, reduced in the same "
+            "way",
             above=0.0,
             high=1.0,
         ),
