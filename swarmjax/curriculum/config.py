@@ -6,15 +6,15 @@ from typing import Literal
 from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.config.section import MAX_COUNT
 
-# Options that only some modes accept: these modes, and the default that null means.
 _STEPWISE = ("sequential", "mixed")
-
-
+_PREPARED = "adaptive with prerequisites"
+_PROMOTING = (*_STEPWISE, _PREPARED)
+# Options that only some modes accept: these modes, and the default that null means.
 _MODE_OPTIONS: dict[str, tuple[tuple[str, ...], float | str | None]] = {
     "prerequisites": (("adaptive",), 0),
-    "threshold": (_STEPWISE, 0.8),
+    "threshold": (_PROMOTING, 0.8),
     "demotion": (_STEPWISE, None),
-    "budget_share": (_STEPWISE, 0.5),
+    "budget_share": (_PROMOTING, 0.5),
     "earlier_share": (("mixed",), 0.2),
     "score": (("adaptive",), "learnability"),
     "floor": (("adaptive",), 0.1),
@@ -24,10 +24,6 @@ _MODE_OPTIONS: dict[str, tuple[tuple[str, ...], float | str | None]] = {
     "exploration": (_STEPWISE, "keep"),
     "newcomers": (_STEPWISE, "copy"),
 }
-# Options for when to leave a stage. The adaptive mode accepts them if it has prerequisites.
-_LEAVING = ("threshold", "budget_share")
-
-
 _BUFFERED = ("learnability", "value_loss")
 
 
@@ -248,20 +244,18 @@ class CurriculumConfig(Section):
     levels: LevelsConfig = field(default_factory=LevelsConfig)
 
     def _check(self) -> None:
+        kinds = {self.mode, _PREPARED} if self.prerequisites else {self.mode}
         for key, (modes, default) in _MODE_OPTIONS.items():
             value = getattr(self, key)
             plain = getattr(CurriculumConfig, key)
-            takes = modes
-            if key in _LEAVING:
-                takes = (*modes, "adaptive with prerequisites")
-                modes = (*modes, "adaptive") if self.prerequisites else modes
-            if self.mode not in modes and value != plain:
+            accepted = not kinds.isdisjoint(modes)
+            if not accepted and value != plain:
                 raise ConfigError(
                     f"{key} is {show(value, quote='')}, but mode is {self.mode}: {key} is an "
-                    f"option of {' and '.join(takes)}, so give {show(plain, quote='')} or "
+                    f"option of {' and '.join(modes)}, so give {show(plain, quote='')} or "
                     f"mode={modes[0]}."
                 )
-            if self.mode in modes and value is None:
+            if accepted and value is None:
                 object.__setattr__(self, key, default)
         if self.demotion is None or self.threshold is None:
             return

@@ -99,13 +99,17 @@ def ppo_loss(
         "approx_kl": mean(ratio - 1.0 - log_ratio),
         "clip_fraction": mean(jnp.abs(ratio - 1.0) > config.clip_epsilon),
     }
-    loss = (
+    return _total(metrics, config), metrics
+
+
+def _total(metrics: Metrics, config: AlgoConfig) -> jax.Array:
+    """Returns the sum [] of the loss's terms, weighted by their costs."""
+    return (
         metrics["policy_loss"]
         + config.value_cost * metrics["value_loss"]
         - config.entropy_cost * metrics["entropy"]
         + config.bound_cost * metrics["bound_loss"]
     )
-    return loss, metrics
 
 
 def evaluate(

@@ -285,15 +285,12 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
       The new state, and the outcome of the step.
     """
     chex.assert_shape(action, (state.level.present.shape[0], world.action_size))
-    level, rule = state.level, world.task.arrival
-    active = level.present & arrival.drives(rule, state.arrived)
+    level = state.level
+    active = level.present & arrival.drives(world.task.arrival, state.arrived)
     clock = state.clock + 1
     data, memory, pose, sound = _move(world, state, action, active)
     sight = _look(world, pose, level, state.factors, _speak(world, action, active))
-    within = active & (sight.distance <= world.task.target_radius)
-    arrived = arrival.arrived(rule, state.arrived, within)
-    complete = jnp.all(arrived | ~level.present)
-    arrives = level.present & complete if rule == "hold" else within
+    arrived, arrives, complete = _arrive(world, state, active, sight)
     sight = _look_by_extension(world, sight, pose, level, arrived, clock)
     memory, seen = task_electronics.sense(
         world.electronics, memory, state.factors, sight, clock, jnp
@@ -332,6 +329,23 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
         done=complete | timeout | ~sound,
         sound=sound,
     )
+
+
+def _arrive(
+    world: World, state: EnvState, active: Array, sight: Sight
+) -> tuple[Array, Array, Array]:
+    """Finds out who has arrived.
+
+    Returns:
+      [R] robots that have arrived, [R] robots whose episode ends at this step because they did,
+      and [] whether all robots of the level have arrived.
+    """
+    rule = world.task.arrival
+    within = active & (sight.distance <= world.task.target_radius)
+    arrived = arrival.arrived(rule, state.arrived, within)
+    complete = jnp.all(arrived | ~state.level.present)
+    arrives = state.level.present & complete if rule == "hold" else within
+    return arrived, arrives, complete
 
 
 def _count_contacts(world: World, state: EnvState, pose: Array) -> tuple[Array, Array]:
