@@ -69,5 +69,6 @@ def test_the_notebook_runs(tmp_path: Path) -> None:
     nbclient = pytest.importorskip("nbclient", reason=_NOTEBOOK_NEEDS)
     nbformat = pytest.importorskip("nbformat", reason=_NOTEBOOK_NEEDS)
     notebook = nbformat.read(_ROOT / "examples" / "first_swarm.ipynb", as_version=4)
-    nbclient.NotebookClient(notebook, timeout=900, cwd=str(tmp_path)).execute()
+    where = {"metadata": {"path": str(tmp_path)}}
+    nbclient.NotebookClient(notebook, timeout=900, resources=where).execute()
     assert "targets reached" in str(notebook.cells)
